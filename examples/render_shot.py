@@ -1,0 +1,175 @@
+"""Render a noisy shot, and a reference of it, with Cycles through ``bpy`` 5.0.1.
+
+    python examples/render_shot.py scene.blend out/shot --spp 32 --reference 512
+
+Writes one multi-layer EXR per frame and noise level, in the layout that Blender's own
+"OpenEXR MultiLayer" output has: ``out/shot/noisy.0008.exr``, ``out/shot/reference.0008.exr``.
+The image is a crop (render border) of a film-size camera, so that motion and texture have the
+statistics of a real shot and not those of a thumbnail. Frames that exist are left alone, so a run
+that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import sys
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+
+def parse_arguments(argv: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--camera", default="Camera_move")
+    parser.add_argument("--frames", default="8-14", help="first-last")
+    parser.add_argument("--size", default="320x180", help="of the crop that is rendered")
+    parser.add_argument("--film", default="1920x1080", help="of the whole camera")
+    parser.add_argument("--center", default="0.5,0.5", help="of the crop, as fractions, x right, y down")
+    parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
+    parser.add_argument("--reference", type=int, default=0, help="samples of the reference; 0: none")
+    parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=2)
+    return parser.parse_args(argv)
+
+
+def set_crop(render: bpy.types.RenderSettings, film: str, size: str, center: str) -> None:
+    """Render only `size` pixels of a `film`-sized camera, around `center`."""
+    (film_w, film_h), (w, h) = (map(int, text.split("x")) for text in (film, size))
+    cx, cy = map(float, center.split(","))
+    left = min(max(round(cx * film_w - w / 2), 0), film_w - w)
+    top = min(max(round(cy * film_h - h / 2), 0), film_h - h)
+    render.resolution_x, render.resolution_y, render.resolution_percentage = film_w, film_h, 100
+    render.use_border = render.use_crop_to_border = True
+    render.border_min_x, render.border_max_x = left / film_w, (left + w) / film_w
+    render.border_min_y, render.border_max_y = 1 - (top + h) / film_h, 1 - top / film_h
+
+
+def random_material(rng: random.Random) -> bpy.types.Material:
+    """A two-tone noise-textured surface, diffuse to glossy, sometimes metal."""
+    material = bpy.data.materials.new("mover")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    surface = nodes["Principled BSDF"]
+    surface.inputs["Roughness"].default_value = rng.uniform(0.1, 0.9)
+    surface.inputs["Metallic"].default_value = float(rng.random() < 0.25)
+    texture, ramp = nodes.new("ShaderNodeTexNoise"), nodes.new("ShaderNodeValToRGB")
+    texture.inputs["Scale"].default_value = 10 ** rng.uniform(0.3, 1.4)
+    for stop in ramp.color_ramp.elements:
+        stop.color = (*(rng.uniform(0.05, 0.85) for _ in range(3)), 1)
+    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.4, 0.6
+    links.new(texture.outputs["Fac"], ramp.inputs["Fac"])
+    links.new(ramp.outputs["Color"], surface.inputs["Base Color"])
+    return material
+
+
+def add_mover(scene: bpy.types.Scene, rng: random.Random, film: str, size: str, center: str, mid: int) -> None:
+    """Add an object that crosses the crop at a few pixels per frame, half way to what lies behind it."""
+    (film_w, film_h), (w, h) = (map(int, text.split("x")) for text in (film, size))
+    cx, cy = map(float, center.split(","))
+    scene.frame_set(mid)
+    camera = scene.camera
+    frame = [camera.matrix_world @ corner for corner in camera.data.view_frame(scene=scene)]
+    top_right, bottom_right, _, top_left = frame
+    right, down = top_right - top_left, bottom_right - top_right
+    x = cx + rng.uniform(-0.35, 0.35) * w / film_w
+    y = cy + rng.uniform(-0.35, 0.35) * h / film_h
+    eye = camera.matrix_world.translation
+    direction = (top_left + x * right + y * down - eye).normalized()
+    hit, position, *_ = scene.ray_cast(bpy.context.evaluated_depsgraph_get(), eye, direction)
+    distance = (position - eye).length if hit else 10.0
+    depth = rng.uniform(0.4, 0.8) * distance
+    plane = (top_left + x * right + y * down - eye).length
+    pixel = right.length / film_w * depth / plane  # world units per film pixel there
+    add = rng.choice([bpy.ops.mesh.primitive_monkey_add, bpy.ops.mesh.primitive_torus_add,
+                      bpy.ops.mesh.primitive_cube_add, bpy.ops.mesh.primitive_uv_sphere_add])
+    add(location=eye + direction * depth)
+    mover = bpy.context.active_object
+    mover.scale = Vector((1, 1, 1)) * pixel * rng.uniform(0.12, 0.3) * h
+    mover.data.materials.clear()
+    mover.data.materials.append(random_material(rng))
+    if mover.data.polygons and rng.random() < 0.7:
+        bpy.ops.object.shade_smooth()
+    speed = 10 ** rng.uniform(0.2, 1.1)  # 1.6 to 12.6 film pixels per frame
+    along = Vector((rng.gauss(0, 1), rng.gauss(0, 0.6)))
+    along.normalize()
+    velocity = (right.normalized() * along.x + down.normalized() * along.y) * pixel * speed
+    start, turn = mover.location.copy(), [rng.gauss(0, 0.06) for _ in range(3)]
+    # Keys one window beyond the shot, so that the vectors are valid on its first and last frame.
+    for frame_number in range(mid - 12, mid + 13):
+        step = frame_number - mid
+        mover.location = start + velocity * step
+        mover.rotation_euler = [angle * step for angle in turn]
+        mover.keyframe_insert("location", frame=frame_number)
+        mover.keyframe_insert("rotation_euler", frame=frame_number)
+
+
+def configure(scene: bpy.types.Scene, threads: int) -> None:
+    render, view_layer = scene.render, scene.view_layers[0]
+    render.engine = "CYCLES"
+    render.use_persistent_data = True
+    render.threads_mode, render.threads = "FIXED", threads
+    for name in dir(render):
+        if name.startswith("use_stamp"):
+            setattr(render, name, False)  # the stamps hold paths of the machine
+    render.image_settings.media_type = "MULTI_LAYER_IMAGE"
+    render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+    render.image_settings.color_depth = "16"
+    render.image_settings.exr_codec = "ZIP"
+    render.image_settings.use_exr_interleave = True
+    scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
+    scene.cycles.use_animated_seed = False
+    for name in ("position", "normal", "z", "vector"):
+        setattr(view_layer, f"use_pass_{name}", name in ("z", "vector"))
+    view_layer.cycles.denoising_store_passes = True
+    view_layer.cycles.pass_debug_sample_count = False
+
+
+def render_level(scene: bpy.types.Scene, folder: Path, name: str, spp: int, frames: range, seed: int) -> None:
+    scene.cycles.samples = spp
+    for frame in frames:
+        path = folder / f"{name}.{frame:04d}.exr"
+        if path.exists():
+            continue
+        scene.cycles.seed = seed * 100_003 + frame  # another seed for every frame and level
+        scene.frame_set(frame)
+        partial = path.with_name(f".{os.getpid()}-{path.name}")
+        scene.render.filepath = str(partial)
+        bpy.ops.render.render(write_still=True)
+        partial.rename(path)
+
+
+def main(argv: list[str]) -> int:
+    options = parse_arguments(argv)
+    if not options.scene.is_file():
+        print(f"error: no scene {options.scene}", file=sys.stderr)
+        return 1
+    bpy.ops.wm.open_mainfile(filepath=str(options.scene.resolve()))
+    scene = bpy.context.scene
+    scene.camera = bpy.data.objects[options.camera]
+    configure(scene, options.threads)
+    set_crop(scene.render, options.film, options.size, options.center)
+    first, last = map(int, options.frames.split("-"))
+    frames = range(first, last + 1)
+    rng = random.Random(options.seed)
+    for _ in range(options.movers):
+        add_mover(scene, rng, options.film, options.size, options.center, (first + last) // 2)
+    options.out.mkdir(parents=True, exist_ok=True)
+    out = options.out.resolve()
+    for number, level in enumerate(options.levels.split(",")):
+        name, spp = level.split("=")
+        render_level(scene, out, name, int(spp), frames, options.seed * 10 + number)
+    if options.reference:
+        scene.view_layers[0].cycles.denoising_store_passes = False
+        scene.view_layers[0].use_pass_z = scene.view_layers[0].use_pass_vector = False
+        render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The learned average: Robust Average blocks, kernel prediction, losses, training."""

@@ -1,0 +1,1 @@
+"""Which pixels may be averaged? Robust average, variance, non-local means, guided filter."""
