@@ -1,0 +1,295 @@
+"""How far a denoised shot is from its reference, in space and in time.
+
+Every measure takes linear radiance and says in its docstring what it computes. The tone curve, where one
+is used, is x / (1 + x) at one exposure for the whole shot, so that frames can be compared. Agreed throughout:
+
+- A reference may be given as two independent halves ``(a, b)``: every squared error (x − r)² becomes the
+  product (x − a)(x − b), whose expectation is free of the reference's own noise.
+- A frame with a non-finite pixel scores NaN: one lost pixel must not be averaged away, and must not stop the
+  comparison of the others either. A non-finite *reference* is the caller's mistake and raises ValueError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.metrics import structural_similarity
+
+from flow.warp import warp
+
+Array = NDArray[np.floating]
+Reference = Array | tuple[Array, Array]
+
+
+def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
+    """Map linear radiance to [0, 1) by the curve T(x) = e·x / (1 + e·x).
+
+    Parameters
+    ----------
+    x : (...) array, linear radiance. Negative values count as 0: the curve has a pole at −1/e.
+    exposure : the factor e, one for a whole shot.
+
+    Returns
+    -------
+    (...) float64 array in [0, 1).
+    """
+    scaled = np.maximum(np.asarray(x, np.float64) * exposure, 0.0)
+    with np.errstate(invalid="ignore"):  # inf / inf: NaN is what a non-finite pixel is to become
+        return scaled / (1.0 + scaled)
+
+
+def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
+    """Peak signal-to-noise ratio of the tone-mapped image, in dB.
+
+    Parameters
+    ----------
+    image : (H, W, 3) array, linear radiance.
+    reference : the same, or two independent halves.
+    exposure : factor before the tone curve, one for a whole shot.
+
+    Returns
+    -------
+    −10 log₁₀ mean (T(x) − T(r))², with peak 1. Infinite where the error is zero or, with a reference in
+    halves, where it cannot be told from zero. NaN if the image is not finite everywhere.
+    """
+    x, a, b = (tone_map(v, exposure) for v in _checked(image, reference))
+    return _decibels(np.mean((x - a) * (x - b)))
+
+
+def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
+    """Mean structural similarity of the tone-mapped image, 1 at best.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) arrays, linear radiance, at least 11 × 11 pixels.
+    exposure : factor before the tone curve, one for a whole shot.
+
+    Notes
+    -----
+    As in the paper: Gaussian window with σ = 1.5 (11 × 11), K = (0.01, 0.03), population covariance,
+    mean over the channels. Computed by scikit-image.
+
+    References
+    ----------
+    Wang et al. 2004, doi:10.1109/TIP.2003.819861
+    """
+    x, r, _ = (tone_map(v, exposure) for v in _checked(image, reference))
+    settings = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(r, x, channel_axis=-1, **settings))
+
+
+def relmse(
+    image: Array, reference: Reference, *, eps: float = 1e-2, trim: float = 0.0, exposure: float = 1.0
+) -> float:
+    """Relative mean squared error: mean (x − r)² / (r² + ε).
+
+    Parameters
+    ----------
+    image : (H, W, 3) array, linear radiance.
+    reference : the same, or two independent halves, whose mean is then the r of the denominator.
+    eps : ε; it keeps black from dividing by zero, and assumes radiance around 1 after `exposure`.
+    trim : share of the pixels, those with the largest error, that are left out; 0.001 is usual, since a
+        single firefly can outweigh the rest of the frame.
+    exposure : factor on image and reference, one for a whole shot.
+    """
+    if not 0.0 <= trim < 1.0:
+        raise ValueError(f"trim must be in [0, 1), is {trim}")
+    x, a, b = (v * exposure for v in _checked(image, reference))
+    errors = np.mean((x - a) * (x - b) / ((a + b) ** 2 / 4 + eps), axis=-1).ravel()
+    kept = errors.size - int(trim * errors.size)
+    return float(np.mean(np.partition(errors, kept - 1)[:kept]))
+
+
+def smape(image: Array, reference: Array, *, eps: float = 1e-2, exposure: float = 1.0) -> float:
+    """Symmetric mean absolute percentage error: mean |x − r| / (|x| + |r| + ε), in [0, 1].
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) arrays, linear radiance.
+    eps : ε; as in `relmse`, it assumes radiance around 1 after `exposure`.
+    exposure : factor on image and reference, one for a whole shot.
+    """
+    x, r, _ = (v * exposure for v in _checked(image, reference))
+    return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + eps)))
+
+
+def mean_bias(image: Array, reference: Array) -> float:
+    """Relative error of the mean radiance: (mean x − mean r) / mean r; negative where light was lost.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) arrays, linear radiance. A black reference gives NaN.
+    """
+    x, r, _ = _checked(image, reference)
+    return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
+
+
+def flip(image: Array, reference: Array) -> float:
+    """Mean HDR-FLIP error, 0 at best and 1 at worst, by the authors' own code.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) arrays, linear radiance in sRGB primaries; negative values count as 0.
+
+    Raises
+    ------
+    ImportError : flip-evaluator is not installed.
+
+    Notes
+    -----
+    The range of exposures is derived from the reference frame, the viewing distance is the default of
+    67 pixels per degree.
+
+    References
+    ----------
+    Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images,
+    doi:10.2312/egs.20211015
+    """
+    try:
+        import flip_evaluator  # an optional peer, only for comparisons
+    except ImportError as error:
+        message = "FLIP needs the package flip-evaluator: install the extra ravg[compare]"
+        raise ImportError(message) from error
+    x, r, _ = _checked(image, reference)
+    if np.isnan(x).any():
+        return float("nan")
+    linear = (np.ascontiguousarray(np.maximum(v, 0.0), np.float32) for v in (r, x))
+    return float(flip_evaluator.evaluate(*linear, "HDR", applyMagma=False)[1])
+
+
+def temporal_psnr(
+    frames: Iterable[Array],
+    references: Iterable[Reference],
+    flows: Iterable[Array],
+    valid: Iterable[NDArray[np.bool_]],
+    *,
+    exposure: float = 1.0,
+) -> NDArray[np.float64]:
+    """PSNR of motion-compensated frame differences against the reference's own, for each pair of frames.
+
+    Parameters
+    ----------
+    frames : N images (H, W, 3), linear radiance, consecutive in time.
+    references : N references, each an image or two independent halves.
+    flows : N − 1 flows (H, W, 2) in pixels; flow k leads from frame k + 1 back to frame k.
+    valid : N − 1 masks (H, W); True where that flow leads to the same point of the scene.
+    exposure : factor before the tone curve, one for a whole shot.
+
+    Returns
+    -------
+    (N − 1,) PSNR in dB. Infinite where the differences are the reference's, NaN where a frame is not
+    finite or no pixel is valid.
+
+    Raises
+    ------
+    ValueError : numbers of frames, references, flows and masks that do not belong together.
+
+    Notes
+    -----
+    With W the (bilinear) warp of frame t − 1 to frame t and T the tone curve,
+    D_t(x) = T(x_t) − W T(x_{t−1}), and the value is −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels.
+    The reference subtracts what really changes (light, reflections, the interpolation itself). Without it,
+    blur would score above the truth. What is wrong in the same way on every frame is no flicker and is not
+    seen: read this figure beside the PSNR. Arguments are consumed a pair at a time, so generators will do.
+    """
+    series = zip(frames, references, strict=True)
+    values = []
+    for ((previous, r0), (current, r1)), flow, mask in zip(pairwise(series), flows, valid, strict=True):
+        before, after = _tone_errors(previous, r0, exposure), _tone_errors(current, r1, exposure)
+        if mask.shape != current.shape[:2]:
+            raise ValueError(f"valid must have the shape {current.shape[:2]} of the frames, is {mask.shape}")
+        # W is linear: the difference of the differences is the change of the error.
+        change = [e1 - warp(e0, flow)[0] for e0, e1 in zip(before, after, strict=True)]
+        product = np.multiply(*change, dtype=np.float64)[mask]
+        values.append(_decibels(np.mean(product)) if product.size else float("nan"))
+    return np.array(values)
+
+
+def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> float:
+    """Standard deviation over time of the pixels that stand still, on the tone curve.
+
+    Parameters
+    ----------
+    frames : N ≥ 2 images (H, W, 3), linear radiance.
+    static : (H, W) mask; True where neither the scene nor its light changes in the picture.
+    exposure : factor before the tone curve, one for a whole shot.
+
+    Returns
+    -------
+    The square root of the mean over pixels and channels of the unbiased variance over time. NaN where no
+    pixel is static, there are less than two frames, or one is not finite.
+    """
+    count, mean, squares = 0, np.zeros(1), np.zeros(1)
+    for frame in frames:
+        if frame.shape[:2] != static.shape:
+            raise ValueError(f"static must have the shape {frame.shape[:2]} of the frames, is {static.shape}")
+        value = tone_map(frame[static], exposure)
+        count += 1
+        step = value - mean  # Welford's update: one pass, whatever the length of the shot
+        mean = mean + step / count
+        squares = squares + step * (value - mean)
+    if count < 2 or not squares.size:
+        return float("nan")
+    return float(np.sqrt(np.mean(squares) / (count - 1)))
+
+
+def bootstrap_interval(
+    values: Sequence[float] | Array, seed: int = 0, *, level: float = 0.95, resamples: int = 2000
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean of `values`.
+
+    Parameters
+    ----------
+    values : N ≥ 1 figures, one per frame (or per shot). For "is A better than B" pass the differences
+        A − B frame by frame: the frames are the same, and most of their spread cancels. An interval
+        that contains 0 is a tie.
+    seed : of the resampling.
+    level : coverage of the interval.
+    resamples : number of bootstrap samples.
+
+    Returns
+    -------
+    (low, high); NaN if a value is NaN.
+
+    References
+    ----------
+    Efron 1979, doi:10.1214/aos/1176344552
+    """
+    data = np.asarray(values, np.float64)
+    if data.ndim != 1 or data.size == 0:
+        raise ValueError(f"values must be one-dimensional and not empty, have shape {data.shape}")
+    if np.isnan(data).any():
+        return float("nan"), float("nan")
+    picks = np.random.default_rng(seed).integers(0, data.size, (resamples, data.size))
+    # An order statistic and no interpolation, which would make NaN of two infinite PSNRs.
+    tails = [(1 - level) / 2, (1 + level) / 2]
+    low, high = np.quantile(data[picks].mean(axis=1), tails, method="inverted_cdf")
+    return float(low), float(high)
+
+
+def _checked(image: Array, reference: Reference) -> tuple[NDArray[np.float64], ...]:
+    """The image, all NaN if any of it is not finite, and the halves of the reference; a whole one is both."""
+    halves = reference if isinstance(reference, tuple) else (reference, reference)
+    for half in halves:
+        if half.shape != image.shape or image.ndim != 3:
+            raise ValueError(f"image and reference must be (H, W, C) alike: {image.shape}, {half.shape}")
+        lost = half.size - int(np.isfinite(half).sum())
+        if lost:
+            raise ValueError(f"reference must be finite, {lost} of its {half.size} values are not")
+    if not np.isfinite(image).all():
+        image = np.full(image.shape, np.nan)
+    return tuple(np.asarray(x, np.float64) for x in (image, *halves))
+
+
+def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[NDArray[np.float32]]:
+    """The tone-mapped errors against the two halves, whose product is the squared error."""
+    x, a, b = (tone_map(v, exposure) for v in _checked(image, reference))
+    return [(x - half).astype(np.float32) for half in (a, b)]
+
+
+def _decibels(mse: np.floating) -> float:
+    """−10 log₁₀ of a mean squared error; infinite at zero and below, where an unbiased estimate may lie."""
+    return float("inf") if mse <= 0 else float(-10.0 * np.log10(mse))

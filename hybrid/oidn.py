@@ -1,0 +1,114 @@
+"""Intel Open Image Denoise, frame by frame: the peer to compare with, and a source of estimates.
+
+Needs the optional package ``pyoidn`` (extra ``ravg[compare]``), imported at the first call.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Quality = Literal["high", "balanced", "fast"]
+
+
+def denoise_oidn(
+    color: NDArray[np.float32],
+    albedo: NDArray[np.float32] | None = None,
+    normal: NDArray[np.float32] | None = None,
+    *,
+    quality: Quality = "high",
+    prefilter: bool = False,
+    threads: int = 0,
+) -> NDArray[np.float32]:
+    """Denoise one frame with OIDN's ray-tracing filter in HDR mode, on the CPU.
+
+    Parameters
+    ----------
+    color : (H, W, 3) array, linear radiance, finite; OIDN counts negative values as 0.
+    albedo : (H, W, 3) array in [0, 1] (OIDN clips the rest), or None.
+    normal : (H, W, 3) array in [−1, 1], any fixed space, or None; OIDN takes it only beside an albedo.
+    quality : "high", "balanced" or "fast".
+    prefilter : denoise albedo and normal with filters of their own first and declare them clean
+        (``cleanAux``). This is OIDN's best mode and Blender's default, at several times the cost.
+    threads : 0 leaves the choice to OIDN (all cores).
+
+    Returns
+    -------
+    (H, W, 3) float32 array, linear radiance.
+
+    Raises
+    ------
+    ImportError : pyoidn is not installed.
+    ValueError : shapes that differ, values that are not finite, an unknown quality, a normal alone.
+    RuntimeError : OIDN reported an error.
+
+    References
+    ----------
+    Áfra 2025, "Intel Open Image Denoise", https://www.openimagedenoise.org
+    """
+    guides = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
+    images = {name: _as_input(image, name, color) for name, image in {"color": color, **guides}.items()}
+    if albedo is None and normal is not None:
+        raise ValueError("normal without albedo: OIDN has no such filter; pass both, or neither")
+    if prefilter:
+        for name in guides:
+            images[name] = _execute({name: images[name]}, quality, threads)
+    return _execute(images, quality, threads, hdr=True, cleanAux=prefilter and bool(guides))
+
+
+def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np.float32]:
+    """A contiguous float32 image, checked: OIDN reads raw memory."""
+    if image.shape != color.shape or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise ValueError(f"{name} must be (H, W, 3) like color, is {image.shape}; color is {color.shape}")
+    lost = image.size - int(np.isfinite(image).sum())
+    if lost:
+        raise ValueError(f"{name} must be finite, {lost} of its {image.size} values are not")
+    return np.ascontiguousarray(image, np.float32)
+
+
+def _execute(
+    images: dict[str, NDArray[np.float32]], quality: str, threads: int, **flags: bool
+) -> NDArray[np.float32]:
+    """Run one filter over `images`."""
+    oidn, device = _device(threads)
+    qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,
+                 "fast": oidn.OIDN_QUALITY_FAST}  # fmt: skip
+    if quality not in qualities:
+        raise ValueError(f"quality must be one of {', '.join(qualities)}, is {quality!r}")
+    output = np.empty_like(next(iter(images.values())))
+    rt = oidn.Filter(device, oidn.OIDN_FILTER_TYPE_RT)
+    try:  # not `with`: pyoidn 2.5.1's __exit__ returns true, which swallows the exception
+        for name, image in {**images, "output": output}.items():
+            rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3)
+        for flag, value in flags.items():
+            rt.set_bool(flag, value)
+        rt.set_quality(qualities[quality])
+        rt.commit()
+        rt.execute()
+        _check(device)
+    finally:
+        rt.release()
+    return output
+
+
+@lru_cache(maxsize=2)
+def _device(threads: int) -> tuple[Any, Any]:
+    """The module and a device with that many threads; making one costs as much as a small frame."""
+    try:
+        import pyoidn  # an optional peer
+    except ImportError as error:
+        raise ImportError("OIDN needs the package pyoidn: install the extra ravg[compare]") from error
+    device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
+    device.set_int("numThreads", threads)
+    device.commit()
+    _check(device)
+    return pyoidn, device
+
+
+def _check(device: Any) -> None:
+    message = device.get_error()
+    if message is not None:
+        raise RuntimeError(f"OIDN: {message}")

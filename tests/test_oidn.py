@@ -1,0 +1,115 @@
+"""OIDN as we call it: right modes, checked input, clear errors."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hybrid import oidn
+from hybrid.oidn import denoise_oidn
+
+Image = NDArray[np.float32]
+needs_oidn = [
+    pytest.mark.oidn,
+    pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed"),
+]
+
+
+@pytest.fixture
+def scene() -> tuple[Image, Image, Image, Image]:
+    """A textured plane under smooth light: clean radiance, noisy radiance, albedo, normal, 64 × 96."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:64, :96].astype(np.float32)
+    albedo = np.where(((x // 12 + y // 12) % 2 == 0)[..., None], [0.8, 0.3, 0.2], [0.2, 0.4, 0.7])
+    normal = np.zeros((64, 96, 3))
+    normal[..., 2] = 1
+    clean = albedo * (0.5 + np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 800))[..., None]
+    color = clean * rng.gamma(4, 0.25, (64, 96, 1))  # mean 1, standard deviation 0.5, white light
+    clean, color, albedo, normal = (v.astype(np.float32) for v in (clean, color, albedo, normal))
+    return clean, color, albedo, normal
+
+
+def rms(a: Image, b: Image) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+class TestDenoise:
+    pytestmark = needs_oidn
+
+    @pytest.mark.parametrize("quality", ["high", "balanced", "fast"])
+    def test_removes_noise_and_leaves_the_input_alone(self, scene, quality) -> None:
+        clean, *images = scene
+        before = [v.copy() for v in images]
+        result = denoise_oidn(*images, quality=quality, threads=1)
+        assert result.shape == clean.shape
+        assert result.dtype == np.float32
+        # Measured over three seeds and all qualities: 0.22 to 0.25.
+        assert rms(result, clean) < 0.35 * rms(images[0], clean)
+        for now, then in zip(images, before, strict=True):
+            np.testing.assert_array_equal(now, then)
+
+    def test_hdr_is_scale_equivariant(self, scene) -> None:
+        _, color, albedo, normal = scene
+        result = denoise_oidn(color, albedo, normal, threads=1)
+        scaled = denoise_oidn(64 * color, albedo, normal, threads=1)
+        # Its exposure comes from the picture; an LDR filter would clip at 1.
+        np.testing.assert_allclose(scaled, 64 * result, rtol=2e-3)
+
+    def test_prefilter_pays_when_guides_are_noisy(self, scene) -> None:
+        clean, color, albedo, normal = scene
+        rng = np.random.default_rng(4)
+        albedo = np.clip(albedo + 0.4 * rng.normal(size=albedo.shape), 0, 1).astype(np.float32)
+        normal = (normal + 0.4 * rng.normal(size=normal.shape)).astype(np.float32)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        given = denoise_oidn(color, albedo, normal, threads=1)
+        best = denoise_oidn(color, albedo, normal, prefilter=True, threads=1)
+        # Measured over three seeds: 0.84 to 0.91.
+        assert rms(best, clean) < 0.95 * rms(given, clean)
+
+    def test_guides_are_optional(self, scene) -> None:
+        clean, color, albedo, _ = scene
+        errors = [rms(denoise_oidn(color, *guides, threads=1), clean) for guides in ([], [albedo])]
+        assert errors[1] < errors[0] < rms(color, clean)
+        np.testing.assert_array_equal(
+            denoise_oidn(color, prefilter=True, threads=1), denoise_oidn(color, threads=1)
+        )
+
+    @pytest.mark.parametrize("size", [(1, 1), (3, 5), (17, 33)])
+    def test_any_size_and_layout(self, scene, size) -> None:
+        images = [cv2.flip(v, 1)[: size[0], : size[1]][:, ::-1] for v in scene[1:]]
+        result = denoise_oidn(*images, threads=1)
+        assert result.shape == (*size, 3)
+        assert np.isfinite(result).all()
+
+    def test_error_of_the_library_is_raised(self, scene) -> None:
+        with pytest.raises(RuntimeError, match="OIDN: unsupported combination"):
+            oidn._execute({"color": scene[1], "normal": scene[3]}, "high", 1, hdr=True)
+
+    def test_unknown_quality_is_an_error(self, scene) -> None:
+        with pytest.raises(ValueError, match="quality must be one of high, balanced, fast"):
+            denoise_oidn(scene[1], quality="best")  # type: ignore[arg-type]
+
+
+def test_bad_images_are_errors(scene) -> None:
+    _, color, albedo, normal = scene
+    with pytest.raises(ValueError, match="albedo must be"):
+        denoise_oidn(color, albedo[1:], normal)
+    with pytest.raises(ValueError, match="color must be"):
+        denoise_oidn(color[..., :2])
+    with pytest.raises(ValueError, match="normal without albedo"):
+        denoise_oidn(color, None, normal)
+    color[1, 2, 0] = np.inf
+    with pytest.raises(ValueError, match="color must be finite, 1 of"):
+        denoise_oidn(color, albedo, normal)
+
+
+def test_missing_package_names_the_extra(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    oidn._device.cache_clear()
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(ImportError, match=r"ravg\[compare\]"):
+        denoise_oidn(scene[1])
