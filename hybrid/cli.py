@@ -1,0 +1,277 @@
+"""The command ``ravg``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
+    from hybrid.frames import Shot
+    from hybrid.pipeline import Estimator
+    from hybrid.plan import Plan
+    from hybrid.timing import Timings
+
+Thing = TypeVar("Thing")
+
+app = typer.Typer(
+    help="Denoise rendered animation, in time as well as in space.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+ShotArgument = Annotated[str, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")]
+OutputOption = Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="OUT.####.exr, or a folder")]
+FramesOption = Annotated[str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2")]
+LayerOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--layer", metavar="ROLE=LAYER", help="take a layer for color, albedo, normal, depth, motion, variance"
+    ),
+]
+OnOption = Annotated[
+    list[str] | None, typer.Option("--effects", metavar="NAME", help="run a stage, whatever the plan says")
+]
+OffOption = Annotated[list[str] | None, typer.Option("--no-effects", metavar="NAME", help="do not run a stage")]
+AovOption = Annotated[
+    list[str] | None, typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels")
+]
+
+
+@app.command()
+def inspect(
+    shot: ShotArgument,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    effects: OnOption = None,
+    no_effects: OffOption = None,
+) -> None:
+    """Show which channels are taken for what, and which stages the shot calls for."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from hybrid.frames import describe_layers
+    from hybrid.plan import EFFECTS
+
+    console = Console()
+    opened = _open(shot, frames, layer)
+    first = opened.numbers[0]
+    height, width = opened.read(first).color.shape[:2]
+    console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
+    table = Table("role", "taken from", "note", title="Layers", title_justify="left")
+    for row in describe_layers(opened.layers(first)):
+        table.add_row(*row)
+    console.print(table)
+    plan = _plan(opened, effects, no_effects)
+    table = Table("stage", "", "measured", "threshold", "why", title="Plan", title_justify="left")
+    for decision in plan.decisions:
+        figure = "–" if decision.figure is None else f"{decision.figure:.4g}"
+        threshold = "–" if decision.figure is None else f"{decision.threshold:.4g}"
+        state = "on" if decision.on else "off"
+        why = f"{decision.reason} ({EFFECTS[decision.effect]})"
+        table.add_row(decision.effect, state, figure, threshold, why)
+    console.print(table)
+
+
+@app.command()
+def pseudoref(
+    shot: ShotArgument,
+    output: OutputOption,
+    preset: Annotated[str, typer.Option(help="draft, balanced or final")] = "balanced",
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    effects: OnOption = None,
+    no_effects: OffOption = None,
+) -> None:
+    """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too."""
+    from hybrid.pipeline import Denoised
+    from hybrid.pseudo_reference import PRESETS, estimate
+    from hybrid.timing import Timings
+
+    chosen = _choose(PRESETS, preset, "preset")
+    opened = _open(shot, frames, layer)
+    plan = _plan(opened, effects, no_effects)
+    timings = Timings()
+    _run(
+        opened,
+        output,
+        lambda aligned: Denoised(estimate(aligned, chosen, timings=timings)),
+        plan,
+        timings,
+        command="pseudoref",
+        preset=preset,
+    )
+
+
+@app.command()
+def denoise(
+    shot: ShotArgument,
+    output: OutputOption,
+    preset: Annotated[str, typer.Option(help="of the weights that come with ravg: fast")] = "fast",
+    weights: Annotated[Path | None, typer.Option(help="a weights file of your own, instead of a preset")] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
+    ] = None,
+    aov: AovOption = None,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    effects: OnOption = None,
+    no_effects: OffOption = None,
+    tile: Annotated[int, typer.Option(help="pixels on a side that the network sees at once")] = 256,
+    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+) -> None:
+    """Denoise with the Robust Average network."""
+    neural = _neural()
+    from hybrid.timing import Timings
+
+    opened = _open(shot, frames, layer, aov)
+    plan = _plan(opened, effects, no_effects)
+    timings = Timings()
+    path = weights or neural.shipped_weights(preset)
+    denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
+    _run(
+        opened, output, denoiser, plan, timings, command="denoise", preset=preset if weights is None else str(path.name)
+    )
+
+
+@app.command()
+def compare(
+    shot: ShotArgument,
+    reference: Annotated[str, typer.Option(help="the same frames at many samples: a pattern or a folder")],
+    methods: Annotated[str | None, typer.Option(help="names, separated by commas; all without")] = None,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
+    from rich.console import Console
+
+    from hybrid.compare import METHODS, compare_shot, result_table
+
+    chosen = METHODS if methods is None else {name: _choose(METHODS, name, "methods") for name in methods.split(",")}
+    results = compare_shot(_open(shot, frames, layer), _open(reference, frames, None), chosen)
+    Console().print(result_table(results))
+
+
+def _neural():  # type: ignore[no-untyped-def]
+    """The boundary to torch, or a clear word on how to get it."""
+    try:
+        from hybrid import neural
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "safetensors"):
+            raise
+        raise ValueError(
+            f"{error.name} is not installed; expected: pip install 'ravg[neural]' (`ravg pseudoref` works without)"
+        ) from None
+    return neural
+
+
+def _open(shot: str, frames: str | None, layer: Sequence[str] | None, aovs: Sequence[str] | None = None) -> Shot:
+    from hybrid.frames import open_shot
+
+    overrides = {}
+    for item in layer or ():
+        role, separator, name = item.partition("=")
+        if not separator:
+            raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER")
+        overrides[role] = name
+    opened = open_shot(shot, frames=frames, layers=overrides, aovs=tuple(aovs or ()))
+    for warning in opened.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    return opened
+
+
+def _plan(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Plan:
+    from hybrid.plan import plan_shot
+
+    return plan_shot(shot).force(_split(on), _split(off))
+
+
+def _split(names: Sequence[str] | None) -> list[str]:
+    """Names may be given one by one or separated by commas."""
+    return [name for item in names or () for name in item.split(",")]
+
+
+def _choose(table: dict[str, Thing], name: str, option: str) -> Thing:
+    if name not in table:
+        raise typer.BadParameter(f"--{option} is {name!r}, expected one of {', '.join(table)}")
+    return table[name]
+
+
+def _run(
+    shot: Shot, output: str, estimator: Estimator, plan: Plan, timings: Timings, *, command: str, preset: str
+) -> None:
+    """Denoise the shot with a progress bar, say what was met on the way, and leave the timings beside the output."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.table import Table
+
+    from hybrid.pipeline import denoise_shot
+
+    console = Console(stderr=True)
+    console.print("stages: " + ", ".join(d.effect for d in plan.decisions if d.on), highlight=False)
+    for decision in plan.decisions:
+        if not decision.on:
+            console.print(f"  not run: {decision.effect} ({decision.reason})", highlight=False)
+    attributes = {"ravg/command": command, "ravg/preset": preset, "ravg/effects": " ".join(sorted(plan.effects))}
+    pixels, finished = 0, None
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(command, total=len(shot))
+        for finished in denoise_shot(shot, output, estimator, plan, attributes=attributes, timings=timings):
+            progress.advance(task)
+            frame = shot.read(finished.number).color
+            pixels += frame.shape[0] * frame.shape[1]
+            if finished.repaired:
+                console.print(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
+            if finished.clamped:
+                console.print(
+                    f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504"
+                )
+    if finished is None:
+        return
+    table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
+    for row in timings.rows(pixels):
+        table.add_row(*row)
+    console.print(table)
+    report = finished.path.parent / "ravg.json"
+    timings.write(
+        report,
+        command=command,
+        preset=preset,
+        frames=len(shot),
+        pixels=pixels,
+        plan=[vars(decision) for decision in plan.decisions],
+    )
+    console.print(f"wrote {len(shot)} frames to {finished.path.parent} and their timings to {report}", highlight=False)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; 0: done, 1: bad data (one line on standard error), 2: bad usage. A bug shows its traceback.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; the process's own without.
+    """
+    try:
+        app(args=None if argv is None else list(argv), prog_name="ravg")
+    except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
+        return stop.code if isinstance(stop.code, int) else 0
+    except (ValueError, OSError) as error:
+        typer.echo(f"error: {_one_line(error)}", err=True)
+        return 1
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

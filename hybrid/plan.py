@@ -1,0 +1,295 @@
+"""The plan: what a shot calls for, measured before anything runs.
+
+No effect is paid for that the shot does not have, and nothing is skipped silently: each decision carries the
+figure that was measured, the threshold it was held against, and the reason in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from nlm.gate import color_gate
+from numpy.typing import NDArray
+
+from flow.warp import warp
+from hybrid.frames import Shot
+from hybrid.pseudo_reference import Aligner, PreparedFrame, prepare, rendered_flow
+from hybrid.transfer import compress, measure_exposure
+from nlm.average import reject_outliers
+
+Array = NDArray[np.float32]
+
+EFFECTS = {
+    "demodulate": "filter light instead of light times texture",
+    "outliers": "reject fireflies",
+    "warp": "move side frames along the motion",
+    "dense-flow": "find the motion in the pictures",
+    "refine": "correct the renderer's vectors by TV-L1",
+    "gate": "do not average over time where the light itself changes",
+    "prefilter": "filter noisy albedo and normals before they guide anything",
+    "alpha": "filter the alpha channel too",
+    "skip": "leave tiles without noise as they are",
+}
+
+# Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
+STILL = 0.05
+# Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
+# reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
+REFINE_ABOVE = 0.01
+GATE_ABOVE = 0.002
+# One firefly in a hundred thousand pixels is twenty in a 1080p frame: visible.
+OUTLIERS_ABOVE = 1e-5
+# Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
+# under depth of field or behind glass they differ by several per cent.
+GUIDE_NOISE_ABOVE = 0.01
+# A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
+NOISE_FREE = 1e-4
+TILE = 32
+SAMPLES = 3
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One stage, whether it runs, and why.
+
+    Attributes
+    ----------
+    effect : str
+        A key of `EFFECTS`.
+    on : bool
+        Whether the stage runs.
+    figure : float or None
+        What was measured; None where there was nothing to measure.
+    threshold : float
+        What it was held against.
+    reason : str
+        The same in words.
+    forced : bool
+        True where the user, not the figure, decided.
+    """
+
+    effect: str
+    on: bool
+    figure: float | None
+    threshold: float
+    reason: str
+    forced: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The decisions for one shot."""
+
+    decisions: tuple[Decision, ...]
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """Names of the stages that run."""
+        return frozenset(decision.effect for decision in self.decisions if decision.on)
+
+    def force(self, on: Collection[str] = (), off: Collection[str] = ()) -> Plan:
+        """Switch stages on or off whatever was measured.
+
+        Raises
+        ------
+        ValueError
+            An effect that does not exist, or one that is to be both on and off.
+        """
+        for name in [*on, *off]:
+            if name not in EFFECTS:
+                raise ValueError(f"effect is {name!r}, expected one of {', '.join(EFFECTS)}")
+        if both := set(on) & set(off):
+            raise ValueError(f"effect {sorted(both)[0]!r} is both forced on and forced off")
+        return Plan(
+            tuple(
+                replace(d, on=d.effect in on, forced=True, reason=f"forced; measured: {d.reason}")
+                if d.effect in on or d.effect in off
+                else d
+                for d in self.decisions
+            )
+        )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two neighbouring frames of the shot, prepared."""
+
+    here: PreparedFrame
+    there: PreparedFrame
+
+
+def plan_shot(shot: Shot) -> Plan:
+    """Measure a shot on a few pairs of frames and decide which stages it calls for.
+
+    Parameters
+    ----------
+    shot : Shot
+        Up to `SAMPLES` pairs of neighbouring frames, spread over it, are read.
+
+    Returns
+    -------
+    Plan
+        One decision for each of `EFFECTS`.
+    """
+    pairs = _sample_pairs(shot)
+    if not pairs:
+        only = prepare(shot.read(shot.numbers[0]), {"demodulate"})
+        pairs, single = [_Pair(only, only)], True
+    else:
+        single = False
+    first = pairs[0].here
+    has_vectors = rendered_flow(first, pairs[0].there) is not None
+    still = [_unexplained(pair, None) for pair in pairs]
+    if has_vectors:
+        speed = max(_speed(pair) for pair in pairs)
+        unexplained = max(_unexplained(pair, rendered_flow(pair.here, pair.there)) for pair in pairs)
+    else:
+        speed, unexplained = float("nan"), max(still)
+    moves = not single and (speed > STILL if has_vectors else unexplained > GATE_ABOVE)
+    decisions = [
+        _decide_demodulate(first),
+        _decide(
+            "outliers",
+            max(_outlier_share(pair.here) for pair in pairs),
+            OUTLIERS_ABOVE,
+            "{:.2g} of the pixels stand alone far above their neighbours",
+        ),
+        _decide_warp(single, has_vectors, moves, speed, max(still)),
+        Decision(
+            "dense-flow",
+            moves and not has_vectors,
+            None,
+            0,
+            "no motion vectors in the file: the motion has to be found in the pictures"
+            if moves and not has_vectors
+            else "motion vectors are there"
+            if has_vectors
+            else "nothing moves",
+        ),
+        _decide_refine(moves, has_vectors, unexplained),
+        _decide(
+            "gate",
+            0.0 if single else unexplained,
+            GATE_ABOVE,
+            "{:.2%} of the picture changes its light between frames" + ("" if has_vectors else " (motion included)"),
+        ),
+        _decide_prefilter(pairs),
+        _decide_alpha(shot),
+        _decide(
+            "skip",
+            min(_noise_free_share(pair.here) for pair in pairs),
+            0.0,
+            "{:.1%} of the tiles hold no noise",
+        ),
+    ]
+    return Plan(tuple(decisions))
+
+
+def _sample_pairs(shot: Shot) -> list[_Pair]:
+    numbers = list(shot.numbers)
+    count = min(SAMPLES, len(numbers))
+    picked = sorted({numbers[(2 * i + 1) * len(numbers) // (2 * count)] for i in range(count)})
+    aligner = Aligner(shot, {"demodulate"}, radius=1)
+    pairs = []
+    for number in picked:
+        previous, _, following = aligner.load(number, 1)
+        here = aligner.frame(number)
+        there = aligner.frame(following) or aligner.frame(previous)
+        if here is not None and there is not None:
+            pairs.append(_Pair(here, there))
+    return pairs
+
+
+def _decide(effect: str, figure: float, threshold: float, words: str) -> Decision:
+    return Decision(effect, figure > threshold, figure, threshold, words.format(figure))
+
+
+def _decide_demodulate(frame: PreparedFrame) -> Decision:
+    if frame.albedo is None:
+        return Decision("demodulate", False, None, 0, "no albedo in the file")
+    spread = float(frame.albedo.std())
+    words = "the albedo varies by {:.3g}" if spread > 0 else "the albedo is the same everywhere"
+    return _decide("demodulate", spread, 0, words)
+
+
+def _decide_warp(single: bool, has_vectors: bool, moves: bool, speed: float, still: float) -> Decision:
+    if single:
+        return Decision("warp", False, None, STILL, "no two neighbouring frames")
+    if has_vectors:
+        words = "the fastest thousandth moves {:.2f} px per frame" if moves else "nothing moves: at most {:.3f} px"
+        return Decision("warp", moves, speed, STILL, words.format(speed))
+    words = "{:.2%} of the picture changes between frames" if moves else "nothing changes between frames but {:.2%}"
+    return Decision("warp", moves, still, GATE_ABOVE, words.format(still))
+
+
+def _decide_refine(moves: bool, has_vectors: bool, unexplained: float) -> Decision:
+    if not has_vectors:
+        return Decision("refine", False, None, REFINE_ABOVE, "no vectors to refine; see dense-flow")
+    if not moves:
+        return Decision("refine", False, None, REFINE_ABOVE, "nothing moves")
+    return _decide("refine", unexplained, REFINE_ABOVE, "the vectors leave {:.2%} of the picture unexplained")
+
+
+def _decide_prefilter(pairs: list[_Pair]) -> Decision:
+    if pairs[0].here.guide is None:
+        return Decision("prefilter", False, None, GUIDE_NOISE_ABOVE, "no guides in the file")
+    noise = max(_guide_noise(pair) for pair in pairs)
+    return _decide("prefilter", noise, GUIDE_NOISE_ABOVE, "the guides differ by {:.3f} between frames")
+
+
+def _decide_alpha(shot: Shot) -> Decision:
+    alpha = shot.read(shot.numbers[0]).alpha
+    if alpha is None:
+        return Decision("alpha", False, None, 0, "no alpha in the file")
+    clear = float(np.mean(alpha < 0.999))
+    return _decide("alpha", clear, 0, "{:.1%} of the picture is transparent")
+
+
+def _speed(pair: _Pair) -> float:
+    vectors = rendered_flow(pair.here, pair.there)
+    if vectors is None:
+        return 0.0
+    length = np.hypot(vectors[0][..., 0], vectors[0][..., 1])
+    return float(np.quantile(length, 0.999))
+
+
+def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -> float:
+    """Share of the picture whose estimate differs between two frames by more than its noise, along `vectors`."""
+    here, there = pair.here, pair.there
+    exposure = measure_exposure(here.estimate)
+    if vectors is None:
+        other, inside = there.estimate, np.ones(here.valid.shape, bool)
+    else:
+        other, inside = warp(there.estimate, vectors[0])
+        inside &= vectors[1]
+    window = np.stack([other, here.estimate, other])
+    weight = color_gate(window, here.irradiance, exposure)[0]
+    # The gate is e^-1 where the means of 9×9 pixels differ by the noise of the estimate.
+    return float(np.mean(weight[inside] < np.exp(-1))) if inside.any() else 0.0
+
+
+def _outlier_share(frame: PreparedFrame) -> float:
+    _, rejected = reject_outliers(frame.irradiance[None])
+    return float(np.mean(rejected))
+
+
+def _guide_noise(pair: _Pair) -> float:
+    here, there = pair.here.guide, pair.there.guide
+    if here is None or there is None:
+        return 0.0
+    vectors = rendered_flow(pair.here, pair.there)
+    warped = there if vectors is None else warp(there, vectors[0])[0]
+    return float(np.quantile(np.abs(here - warped).max(axis=-1), 0.75))
+
+
+def _noise_free_share(frame: PreparedFrame) -> float:
+    exposure = measure_exposure(frame.estimate)
+    removed = np.abs(compress(frame.irradiance, exposure) - compress(frame.estimate, exposure)).max(axis=-1)
+    tiles = [
+        removed[y : y + TILE, x : x + TILE].max() < NOISE_FREE
+        for y in range(0, removed.shape[0], TILE)
+        for x in range(0, removed.shape[1], TILE)
+    ]
+    return float(np.mean(tiles))

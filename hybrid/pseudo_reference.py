@@ -1,0 +1,545 @@
+"""The pseudo-reference: align a window of frames to its centre, and estimate the clean centre from it.
+
+`Aligner.align` is the hinge of the toolkit. It runs once per frame; the classical `estimate` and the network
+both read the `AlignedWindow` that it returns, and nothing after it warps again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from flow.confidence import estimate_confidence, mix_centre
+from nlm.gate import color_gate
+from nlm.guided import guided_filter
+from nlm.variance import prefilter_guides, variance_from_window
+from numpy.typing import NDArray
+
+from flow.motion import Motion, compose_flow, invert_flow, normalize_motion
+from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.warp import warp
+from hybrid.frames import Frame, Shot
+from hybrid.timing import Timings
+from hybrid.transfer import compress, demodulate, measure_exposure, remodulate
+from nlm.average import reject_outliers, replace_nonfinite, robust_average
+from nlm.nonlocal_means import joint_nlm
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Rec. 709 luminance; the weights only have to be the same everywhere.
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """One frame, made safe to filter: finite, divided by its albedo, with a first spatial estimate.
+
+    Attributes
+    ----------
+    number : int
+        The frame's number.
+    irradiance : (H, W, 3) array
+        Color divided by albedo (`hybrid.transfer.demodulate`); the color itself without an albedo.
+    estimate : (H, W, 3) array
+        A denoised picture of this frame alone, as irradiance: the one that came with the frame, or a guided filter's.
+    albedo, normal : (H, W, 3) array or None
+        Guides, finite.
+    valid : (H, W) bool array
+        False where the renderer's color was not finite.
+    repaired : int
+        How many pixels of any layer were not finite and have been filled in.
+    motion : Motion or None
+        The renderer's vectors in our convention.
+    depth : (H, W) array or None
+        Distance; only its order is used.
+    variance : (H, W, 3) array or None
+        Of the irradiance, where the renderer gave one of the color.
+    aovs : dict of str to (H, W, C) array
+        Further layers to be warped along, demodulated like the color.
+    """
+
+    number: int
+    irradiance: Array
+    estimate: Array
+    albedo: Array | None
+    normal: Array | None
+    valid: Mask
+    repaired: int
+    motion: Motion | None
+    depth: Array | None
+    variance: Array | None
+    aovs: dict[str, Array]
+
+    @property
+    def guide(self) -> Array | None:
+        """Albedo and normal side by side (H, W, G), or None."""
+        guides = [layer for layer in (self.albedo, self.normal) if layer is not None]
+        return np.concatenate(guides, axis=-1) if guides else None
+
+    def flow_guide(self, exposure: float) -> Array:
+        """Tone-mapped luminance (H, W) of the estimate, in [0, 1)."""
+        radiance = self.estimate if self.albedo is None else remodulate(self.estimate, self.albedo)
+        return compress(radiance @ _LUMINANCE, exposure)
+
+
+@dataclass(frozen=True)
+class AlignedWindow:
+    """A window of 2k + 1 frames, every one warped to the centre.
+
+    Attributes
+    ----------
+    number : int
+        The centre frame's number.
+    color : (T, H, W, 3) array
+        Irradiance. A missing frame holds the centre's, with confidence 0.
+    estimates : (T, H, W, 3) array
+        Each frame's own estimate, as irradiance.
+    albedo, normal : (T, H, W, 3) array or None
+        Guides.
+    confidence : (T, H, W) array
+        In [0, 1]; the centre's is 1 wherever its own color was finite.
+    modulation : (H, W, 3) array
+        What irradiance is multiplied by to give radiance: the centre's prefiltered albedo plus the floor, or 1.
+    guide : (H, W, G) array or None
+        The centre's albedo and normal, prefiltered.
+    variance : (T, H, W, 3) array
+        Of `color`.
+    exposure : float
+        Brightness of the window's irradiance; scales with it.
+    aovs : dict of str to (T, H, W, C) array
+        Further layers, warped and demodulated like the color.
+    flows : (T, H, W, 2) array
+        Where the centre's pixels lie in each frame, pixels.
+    repaired : int
+        Pixels of the centre frame that were not finite.
+    outliers : int
+        Pixels of the window that were rejected as fireflies.
+    """
+
+    number: int
+    color: Array
+    estimates: Array
+    albedo: Array | None
+    normal: Array | None
+    confidence: Array
+    modulation: Array
+    guide: Array | None
+    variance: Array
+    exposure: float
+    aovs: dict[str, Array]
+    flows: Array
+    repaired: int
+    outliers: int
+
+    @property
+    def centre(self) -> int:
+        """Index of the centre frame."""
+        return len(self.color) // 2
+
+    def mixed(self, layer: Array) -> Array:
+        """Mix the centre into the side frames of `layer` (T, H, W, C), in inverse proportion to confidence."""
+        centre = layer[self.centre]
+        return np.stack([mix_centre(warped, centre, c) for warped, c in zip(layer, self.confidence, strict=True)])
+
+
+def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
+    """Make one frame safe to filter, divide it by its albedo, and estimate it by itself.
+
+    Parameters
+    ----------
+    frame : Frame
+        As read.
+    effects : collection of str
+        The plan's; "demodulate" and "outliers" matter here.
+    """
+    color, bad = replace_nonfinite(frame.color)
+    repaired = bad
+    layers: dict[str, Array | None] = {}
+    for name in ("albedo", "normal", "estimate", "variance"):
+        layer = getattr(frame, name)
+        if layer is not None:
+            layer, bad_here = replace_nonfinite(layer)
+            repaired = repaired | bad_here
+        layers[name] = layer
+    albedo, normal, given, variance = layers.values()
+    albedo = None if albedo is None else np.maximum(albedo, 0)
+    motion = None
+    if frame.motion is not None and frame.motion_convention is not None:
+        motion = normalize_motion(frame.motion, frame.motion_convention)
+    divisor = albedo if "demodulate" in effects else None
+    irradiance = color if divisor is None else demodulate(color, divisor)
+    if variance is not None and divisor is not None:
+        variance = demodulate(demodulate(np.maximum(variance, 0), divisor), divisor)
+    if given is None:
+        estimate = _estimate_alone(irradiance, albedo, normal)
+    else:
+        estimate = given if divisor is None else demodulate(given, divisor)
+    aovs = {}
+    for name, layer in frame.aovs.items():
+        layer, _ = replace_nonfinite(layer)
+        aovs[name] = layer if divisor is None else demodulate(layer, divisor)
+    return PreparedFrame(
+        number=frame.number,
+        irradiance=irradiance,
+        estimate=estimate,
+        albedo=albedo,
+        normal=normal,
+        valid=~bad,
+        repaired=int(np.count_nonzero(repaired)),
+        motion=motion,
+        depth=frame.depth,
+        variance=variance,
+        aovs=aovs,
+    )
+
+
+def _estimate_alone(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
+    """Estimate one frame cheaply: what the gate and the flow compare must not be noise."""
+    clean, _ = reject_outliers(irradiance[None])
+    guides = [layer for layer in (albedo, normal) if layer is not None]
+    if guides:
+        return guided_filter(clean[0], np.concatenate(guides, axis=-1), radius=5, eps=1e-3, subsample=2)
+    guide = compress(clean[0], measure_exposure(clean[0]))
+    return guided_filter(clean[0], guide, radius=5, eps=1e-2, subsample=2)
+
+
+class Aligner:
+    """Aligns the windows of one shot, keeping what neighbouring windows share while they slide.
+
+    Parameters
+    ----------
+    shot : Shot
+        Read lazily.
+    effects : collection of str
+        Which stages to run; see `hybrid.plan`.
+    radius : int
+        Frames on each side of the centre; the window has 2 · radius + 1.
+    interpolation : str
+        Of the warp, "bilinear" or "bicubic".
+    timings : Timings, optional
+        Where to count the stages "read", "prepare", "flow" and "warp".
+    """
+
+    def __init__(
+        self,
+        shot: Shot,
+        effects: Collection[str],
+        *,
+        radius: int = 2,
+        interpolation: str = "bilinear",
+        timings: Timings | None = None,
+    ) -> None:
+        self.shot = shot
+        self.effects = frozenset(effects)
+        self.radius = radius
+        self.interpolation = interpolation
+        self.timings = timings or Timings()
+        self._frames: dict[int, tuple[Frame, PreparedFrame]] = {}
+        self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
+
+    def align(self, number: int) -> AlignedWindow:
+        """Align the window around frame `number`.
+
+        Parameters
+        ----------
+        number : int
+            A frame of the shot.
+
+        Returns
+        -------
+        AlignedWindow
+            The first and the last frames of a shot have neighbours of confidence 0.
+        """
+        return self._assemble(number, self.load(number, self.radius))
+
+    def load(self, number: int, radius: int) -> list[int]:
+        """Read and prepare the frames around `number`; return the numbers of the window, ascending."""
+        step = self.shot.step
+        numbers = list(range(number - radius * step, number + radius * step + 1, step))
+        with self.timings.stage("read"):
+            window = self.shot.window(number, radius)
+        # What no window from here on needs is dropped, so that memory does not grow with the shot.
+        self._frames = {n: kept for n, kept in self._frames.items() if n in numbers}
+        with self.timings.stage("prepare"):
+            for n, frame in zip(numbers, window.frames, strict=True):
+                # A frame brought onto another data window is another object, and is prepared again.
+                if frame is not None and (n not in self._frames or self._frames[n][0] is not frame):
+                    self._frames[n] = frame, prepare(frame, self.effects)
+                    self._flows = {ab: flow for ab, flow in self._flows.items() if n not in ab}
+        self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
+        return numbers
+
+    def frame(self, number: int) -> PreparedFrame | None:
+        """Frame `number` of the window loaded last, or None where the shot has no such frame."""
+        kept = self._frames.get(number)
+        return None if kept is None else kept[1]
+
+    def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
+        """Flow from frame `start` to frame `end`, chained over the frames between; None where one is missing."""
+        step = self.shot.step if end > start else -self.shot.step
+        flow: Array | None = None
+        valid: Mask | None = None
+        for a in range(start, end, step):
+            link = self._step(a, a + step)
+            if link is None:
+                return None
+            if flow is None or valid is None:
+                flow, valid = link
+            else:
+                flow, valid = compose_flow(flow, link[0], first_valid=valid, second_valid=link[1])
+        return None if flow is None or valid is None else (flow, valid)
+
+    def _step(self, a: int, b: int) -> tuple[Array, Mask] | None:
+        """Flow between neighbouring frames, computed once."""
+        if (a, b) not in self._flows:
+            here, there = self.frame(a), self.frame(b)
+            if here is None or there is None:
+                return None
+            with self.timings.stage("flow"):
+                self._flows[a, b] = self._measure_step(here, there)
+        return self._flows[a, b]
+
+    def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask]:
+        shape = here.irradiance.shape[:2]
+        if "warp" not in self.effects:
+            return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
+        vectors = rendered_flow(here, there)
+        exposure = measure_exposure(remodulated(here))
+        guides = here.flow_guide(exposure), there.flow_guide(exposure)
+        noise = 0.5 * _guide_noise(here, exposure)
+        if vectors is None:
+            return dense_flow(*guides, noise=noise), np.ones(shape, bool)
+        flow, valid = vectors
+        if "refine" in self.effects:
+            refined = refine_flow(*guides, flow, noise=noise)
+            flow, _ = select_flow([flow, refined], *guides, noise=noise)
+        return flow, valid
+
+    def _assemble(self, number: int, numbers: list[int]) -> AlignedWindow:
+        centre = self._frames[number][1]
+        height, width = centre.irradiance.shape[:2]
+        layers = _stack(centre)
+        stack = np.empty((len(numbers), *layers.shape), np.float32)
+        confidence = np.zeros((len(numbers), height, width), np.float32)
+        flows = np.zeros((len(numbers), height, width, 2), np.float32)
+        for index, neighbour in enumerate(numbers):
+            if neighbour == number:
+                stack[index], confidence[index] = layers, centre.valid
+                continue
+            there = self.frame(neighbour)
+            link, back = self.flow(number, neighbour), self.flow(neighbour, number)
+            if there is None or link is None or back is None:
+                stack[index] = layers
+                continue
+            with self.timings.stage("warp"):
+                stack[index], confidence[index], flows[index] = self._warp(centre, there, link, back[0])
+        with self.timings.stage("confidence"):
+            return self._finish(centre, stack, confidence, flows)
+
+    def _warp(
+        self, centre: PreparedFrame, there: PreparedFrame, link: tuple[Array, Mask], back: Array
+    ) -> tuple[Array, Array, Array]:
+        """Warp one neighbour's layers to the centre, and say how far they can be trusted."""
+        flow, valid = link
+        if "warp" in self.effects:
+            warped, inside = warp(_stack(there), flow, interpolation=self.interpolation)
+        else:
+            warped, inside = _stack(there), np.ones(flow.shape[:2], bool)
+        slices = _slices(centre)
+        # The last channel is the share of finite colour in the mix: less than all of it is no measurement.
+        valid = valid & (warped[..., -1] > 0.999)
+        trust = estimate_confidence(
+            flow,
+            inside=inside,
+            reverse=back if "warp" in self.effects else None,
+            albedo=centre.albedo,
+            warped_albedo=None if centre.albedo is None else warped[..., slices["albedo"]],
+            normal=centre.normal,
+            warped_normal=None if centre.normal is None else warped[..., slices["normal"]],
+            valid=valid,
+        )
+        return warped, trust, flow
+
+    def _finish(self, centre: PreparedFrame, stack: Array, confidence: Array, flows: Array) -> AlignedWindow:
+        slices = _slices(centre)
+        color, estimates = stack[..., slices["color"]], stack[..., slices["estimate"]]
+        albedo = None if centre.albedo is None else stack[..., slices["albedo"]]
+        normal = None if centre.normal is None else stack[..., slices["normal"]]
+        exposure = measure_exposure(estimates[len(stack) // 2])
+        outliers = 0
+        if "outliers" in self.effects:
+            color, rejected = reject_outliers(color, confidence)
+            outliers = int(np.count_nonzero(rejected))
+        if "gate" in self.effects:
+            confidence = confidence * color_gate(estimates, color[len(stack) // 2], exposure)
+        clean_albedo, guide = centre.albedo, centre.guide
+        if guide is not None and "prefilter" in self.effects:
+            layers = [layer for layer in (albedo, normal) if layer is not None]
+            guide = prefilter_guides(np.concatenate(layers, axis=-1), confidence)
+            clean_albedo = None if albedo is None else guide[..., :3]
+        modulation = np.ones_like(color[0])
+        if clean_albedo is not None and "demodulate" in self.effects:
+            modulation = remodulate(modulation, clean_albedo)
+        if centre.variance is not None:
+            variance = np.ascontiguousarray(stack[..., slices["variance"]])
+        else:
+            variance = variance_from_window(color, confidence)[None]
+        return AlignedWindow(
+            number=centre.number,
+            color=np.ascontiguousarray(color),
+            estimates=np.ascontiguousarray(estimates),
+            albedo=albedo,
+            normal=normal,
+            confidence=confidence,
+            modulation=modulation,
+            guide=guide,
+            variance=variance,
+            exposure=exposure,
+            aovs={name: stack[..., slices[f"aov {name}"]] for name in centre.aovs},
+            flows=flows,
+            repaired=centre.repaired,
+            outliers=outliers,
+        )
+
+
+def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
+    """Flow between neighbouring frames as the renderer gave it, or None where it gave none.
+
+    Vectors span one frame; where only every n-th frame was rendered they are taken n times as long.
+    """
+    step = abs(there.number - here.number)
+    forward = there.number > here.number
+    if here.motion is not None:
+        motion = here.motion
+        if not forward:
+            return motion.to_previous * step, motion.previous_valid
+        if motion.to_next is not None and motion.next_valid is not None:
+            return motion.to_next * step, motion.next_valid
+    if forward and there.motion is not None:
+        # Only backward vectors: the next frame knows where each of its pixels was here.
+        previous = there.motion.to_previous * step
+        return invert_flow(previous, valid=there.motion.previous_valid, depth=there.depth)
+    return None
+
+
+def remodulated(frame: PreparedFrame) -> Array:
+    """The radiance (H, W, 3) of a prepared frame's estimate."""
+    return frame.estimate if frame.albedo is None else remodulate(frame.estimate, frame.albedo)
+
+
+def _guide_noise(frame: PreparedFrame, exposure: float) -> float:
+    """Standard deviation of the noise in the frame's flow guide: what the estimate removed, a typical value."""
+    noisy = frame.irradiance if frame.albedo is None else remodulate(frame.irradiance, frame.albedo)
+    removed = compress(noisy @ _LUMINANCE, exposure) - frame.flow_guide(exposure)
+    return float(1.4826 * np.median(np.abs(removed)))
+
+
+def _layers(frame: PreparedFrame) -> dict[str, Array]:
+    """All layers of a frame that are warped, in their order in the stack."""
+    named = {
+        "color": frame.irradiance,
+        "estimate": frame.estimate,
+        "albedo": frame.albedo,
+        "normal": frame.normal,
+        "variance": frame.variance,
+        **{f"aov {name}": layer for name, layer in frame.aovs.items()},
+        "valid": frame.valid[..., None].astype(np.float32),
+    }
+    return {name: layer for name, layer in named.items() if layer is not None}
+
+
+def _stack(frame: PreparedFrame) -> Array:
+    return np.concatenate(list(_layers(frame).values()), axis=-1)
+
+
+def _slices(frame: PreparedFrame) -> dict[str, slice]:
+    """Which channels of the stack each layer takes."""
+    slices, start = {}, 0
+    for name, layer in _layers(frame).items():
+        slices[name] = slice(start, start + layer.shape[-1])
+        start += layer.shape[-1]
+    return slices
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of the classical estimate; each preset is a measured point of accuracy against time.
+
+    Attributes
+    ----------
+    name : str
+        What the user calls it.
+    nlm_radius : int
+        Search radius of the non-local means, pixels; 0: the robust average alone.
+    nlm_patch_radius : int
+        Radius of the patches it compares, pixels.
+    guided_radius : int
+        Radius of the guided filter that follows, pixels; 0: none.
+    guided_eps : float
+        Its regularisation, relative to the guides' scale.
+    guided_subsample : int
+        Resolution at which its coefficients are computed, as a divisor.
+    """
+
+    name: str
+    nlm_radius: int
+    nlm_patch_radius: int
+    guided_radius: int
+    guided_eps: float
+    guided_subsample: int
+
+
+DRAFT = Preset("draft", 0, 0, guided_radius=4, guided_eps=1e-3, guided_subsample=4)
+BALANCED = Preset("balanced", 3, 3, guided_radius=2, guided_eps=1e-3, guided_subsample=2)
+FINAL = Preset("final", 6, 3, guided_radius=2, guided_eps=1e-3, guided_subsample=1)
+PRESETS = {preset.name: preset for preset in (DRAFT, BALANCED, FINAL)}
+
+
+def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timings | None = None) -> Array:
+    """Estimate the clean centre frame from an aligned window, without a network.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        From `Aligner.align`.
+    preset : Preset
+        How much work to put in.
+    timings : Timings, optional
+        Where to count the stages "average", "nlm" and "guided".
+
+    Returns
+    -------
+    (H, W, 3) array
+        Radiance, finite.
+
+    Notes
+    -----
+    Confidence-weighted robust average or joint non-local means over the window, then a guided filter, all on
+    irradiance, which is multiplied by the centre's albedo at the end (paper, section "Training Data").
+    """
+    timings = timings or Timings()
+    if preset.nlm_radius == 0:
+        with timings.stage("average"):
+            irradiance = robust_average(aligned.color, aligned.confidence)
+    else:
+        with timings.stage("nlm"):
+            irradiance = joint_nlm(
+                aligned.color,
+                aligned.variance,
+                None if aligned.guide is None else aligned.guide[None],
+                confidence=aligned.confidence,
+                radius=preset.nlm_radius,
+                patch_radius=preset.nlm_patch_radius,
+            )
+    if preset.guided_radius and aligned.guide is not None:
+        with timings.stage("guided"):
+            irradiance = guided_filter(
+                irradiance,
+                aligned.guide,
+                radius=preset.guided_radius,
+                eps=preset.guided_eps,
+                subsample=preset.guided_subsample,
+            )
+    return irradiance * aligned.modulation

@@ -1,0 +1,81 @@
+"""Transfer curves, each a forward and an inverse function."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+# Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely
+# specular surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a
+# neighbour's light can get by crossing an edge between materials; KPCN's 0.00316 allows a factor of 300.
+ALBEDO_FLOOR = 0.05
+
+
+def demodulate(radiance: Array, albedo: Array) -> Array:
+    """Divide radiance by albedo, which leaves the light (irradiance, up to a constant) without the texture.
+
+    Parameters
+    ----------
+    radiance : (H, W, C) array
+        Linear radiance, unbounded.
+    albedo : (H, W, 3) array
+        Reflectance, finite, >= 0. Its mean over channels is used where C is not 3.
+
+    Returns
+    -------
+    (H, W, C) array
+        ``radiance / (albedo + ALBEDO_FLOOR)``.
+
+    References
+    ----------
+    Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1, doi:10.1145/3072959.3073708.
+    """
+    return radiance / _divisor(albedo, radiance.shape[-1])
+
+
+def remodulate(irradiance: Array, albedo: Array) -> Array:
+    """Inverse of `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``."""
+    return irradiance * _divisor(albedo, irradiance.shape[-1])
+
+
+def _divisor(albedo: Array, channels: int) -> Array:
+    if channels != albedo.shape[-1]:
+        albedo = albedo.mean(axis=-1, keepdims=True)
+    return np.maximum(albedo, 0) + np.float32(ALBEDO_FLOOR)
+
+
+def compress(radiance: Array, exposure: float) -> Array:
+    """Map [0, inf) to [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure`` (Reinhard et al. 2002, eq. 3)."""
+    scaled = np.maximum(radiance, 0) / np.float32(exposure)
+    return scaled / (1 + scaled)
+
+
+def expand(compressed: Array, exposure: float) -> Array:
+    """Inverse of `compress`."""
+    return compressed / (1 - compressed) * np.float32(exposure)
+
+
+def measure_exposure(radiance: Array) -> float:
+    """Measure the brightness of an image: its mean without the brightest hundredth.
+
+    Parameters
+    ----------
+    radiance : (..., C) array
+        Linear radiance; values that are not finite are left out.
+
+    Returns
+    -------
+    float
+        Positive, and proportional to the image, so that what is divided by it does not depend on the image's
+        scale. 1 for an image without light.
+    """
+    level = radiance.mean(axis=-1).ravel()
+    level = level[np.isfinite(level)]
+    if level.size == 0:
+        return 1.0
+    # Lamps, sky seen through a window and fireflies are few and bright; they must not decide the exposure.
+    bright = np.partition(level, -1 - level.size // 100)[-1 - level.size // 100]
+    mean = float(np.minimum(level, bright).mean(dtype=np.float64))
+    return mean if mean > 0 else 1.0
