@@ -1,0 +1,475 @@
+"""Shots: numbered EXR files, read lazily, a window of neighbouring frames at a time."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import cast
+
+import fileseq
+import numpy as np
+
+from hybrid.exr import ROLES, ExrError, ExrImage, Layer, Layers, Part, find_layers, read_exr, write_exr
+
+# One "#" or "@" is one digit, as in Nuke, RV and ffmpeg's %04d.
+_PADDING = fileseq.PAD_STYLE_HASH1
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame of a shot; all arrays of all frames of a shot are of one size.
+
+    Attributes
+    ----------
+    number
+        Frame number.
+    color
+        (H, W, 3) float32, linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
+    albedo, normal, variance, estimate
+        (H, W, 3) float32 or None. Variance is that of the color's mean, in squared radiance.
+    depth, alpha
+        (H, W) float32 or None.
+    motion
+        (H, W, 2 or 4) float32, pixels, or None; what it means is `motion_convention`'s to say
+        (`hybrid.exr.Layers`).
+    aovs
+        Name → (H, W, C) float32, those that were asked for.
+    source
+        The file, if there is one.
+    """
+
+    number: int
+    color: np.ndarray
+    albedo: np.ndarray | None = None
+    normal: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    motion: np.ndarray | None = None
+    motion_convention: str | None = None
+    variance: np.ndarray | None = None
+    alpha: np.ndarray | None = None
+    estimate: np.ndarray | None = None
+    aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    source: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.color.ndim != 3 or self.color.shape[2] != 3:
+            raise ValueError(f"color has shape {self.color.shape}, expected (H, W, 3)")
+        size = self.color.shape[:2]
+        expected: dict[str, tuple[tuple[int, ...], ...]] = {
+            "color": ((*size, 3),),
+            **{name: ((*size, 3),) for name in ("albedo", "normal", "variance", "estimate")},
+            **{name: (size,) for name in ("depth", "alpha")},
+            "motion": ((*size, 2), (*size, 4)),
+        }
+        for name, shapes in expected.items():
+            array = getattr(self, name)
+            if array is not None and (array.shape not in shapes or array.dtype != np.float32):
+                allowed = " or ".join(map(str, shapes))
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {allowed}")
+        for name, array in self.aovs.items():
+            if array.ndim != 3 or array.shape[:2] != size:
+                raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
+        if (self.motion is None) != (self.motion_convention is None):
+            raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Frames t − radius … t + radius along the shot's step; None where there is none. The centre is there."""
+
+    frames: tuple[Frame | None, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.frames) % 2 == 0 or self.frames[len(self.frames) // 2] is None:
+            raise ValueError(f"window of {len(self.frames)} frames, expected an odd number and a centre")
+        sizes = {frame.color.shape for frame in self.frames if frame is not None}
+        if len(sizes) != 1:
+            raise ValueError(f"frames of one window must be of one size, got {sorted(sizes)}")
+
+    @property
+    def radius(self) -> int:
+        """Number of frames on either side."""
+        return len(self.frames) // 2
+
+    @property
+    def centre(self) -> Frame:
+        """The frame the window is for."""
+        return cast(Frame, self.frames[self.radius])
+
+
+class Shot:
+    """The frames of a shot. Made by `open_shot`.
+
+    Attributes
+    ----------
+    numbers
+        The frames that were asked for and are there, ascending.
+    step
+        Distance between neighbouring frames: 1, or 2 where only every second frame was rendered. A renderer's
+        motion vectors usually span one frame, whatever the step.
+    warnings
+        One line each.
+
+    Notes
+    -----
+    Neighbours come from all the files there are, also those outside `numbers`: denoising every second frame,
+    or the last ten, gives the same pictures as denoising all of them.
+
+    At most `keep` frames are held, so memory does not grow with the shot; a window that slides along it reads
+    each file once.
+
+    Renderers may crop each frame to what is not empty, so that data windows differ from frame to frame, and
+    from part to part. Frames are therefore read onto the smallest window that holds those of all frames,
+    with 0 where a file has nothing, as OpenEXR defines it; `write` cuts them again.
+    """
+
+    def __init__(
+        self,
+        files: Mapping[int, Path],
+        *,
+        frames: str | None = None,
+        layers: Mapping[str, str] | None = None,
+        aovs: Sequence[str] = (),
+        keep: int = 2,
+    ) -> None:
+        wanted = sorted(files) if frames is None else _parse_frames(frames)
+        # The numbers asked for count as well: --frames 1-5 where 1, 3 and 5 are there has two holes.
+        self.step = math.gcd(*(b - a for a, b in pairwise(sorted({*files, *wanted})))) or 1
+        if frames is None:
+            wanted = list(range(wanted[0], wanted[-1] + 1, self.step))
+        self.numbers = tuple(number for number in wanted if number in files)
+        self.warnings: list[str] = []
+        if not self.numbers:
+            folder = next(iter(files.values())).parent
+            raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {_ranges(files)}")
+        if missing := [number for number in wanted if number not in files]:
+            self.warnings.append(f"missing frames {_ranges(missing)}: the windows beside them are narrower")
+        self._files = dict(files)
+        self._overrides = dict(layers or {})
+        self._aovs = tuple(aovs)
+        self._keep = keep
+        self._held: OrderedDict[int, Frame] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def has(self, number: int) -> bool:
+        """Whether there is a file for this frame, asked for or not."""
+        return number in self._files
+
+    def reads(self, path: Path) -> bool:
+        """Whether this is one of the shot's files, asked for or not, by whatever name."""
+        return path.resolve() in self._resolved
+
+    def path(self, number: int) -> Path:
+        """The file of a frame.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        if number not in self._files:
+            raise FileNotFoundError(f"frame {number} is not there; the shot has {_ranges(self._files)}")
+        return self._files[number]
+
+    def source(self, number: int) -> ExrImage:
+        """Everything in the file of a frame; not kept."""
+        return read_exr(self.path(number))
+
+    def layers(self, number: int) -> Layers:
+        """Which channels of a frame's file are taken for what; reads the header only."""
+        return find_layers(read_exr(self.path(number), pixels=False), self._overrides)
+
+    def read(self, number: int) -> Frame:
+        """A frame, from memory if it was read lately.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is not there.
+        ExrError
+            If the file is damaged, or lacks a layer.
+        ValueError
+            If its size is not that of the first frame.
+        """
+        if number in self._held:
+            self._held.move_to_end(number)
+            return self._held[number]
+        image = self.source(number)
+        layers = find_layers(image, self._overrides)
+        size = _size(image.parts[layers.color.part])
+        if size != self._size:
+            first, second = ("x".join(map(str, s)) for s in (self._size, size))
+            raise ValueError(f"frames differ in size: frame {self.numbers[0]} is {first}, frame {number} is {second}")
+        frame = _frame(image, layers, self._aovs, self._canvas, number)
+        self._held[number] = frame
+        while len(self._held) > self._keep:
+            self._held.popitem(last=False)
+        return frame
+
+    def window(self, number: int, radius: int) -> Window:
+        """A frame with its neighbours t ± step … t ± radius · step; None for those that are not there."""
+        self._keep = max(self._keep, 2 * radius + 1)
+        numbers = [number + self.step * k for k in range(-radius, radius + 1)]
+        return Window(tuple(self.read(n) if n == number or self.has(n) else None for n in numbers))
+
+    def write(
+        self,
+        path: str | Path,
+        number: int,
+        images: Mapping[str, np.ndarray],
+        extra: Mapping[str, np.ndarray] | None = None,
+        attributes: Mapping[str, str] | None = None,
+    ) -> int:
+        """Write a frame's file again with some layers replaced (`hybrid.exr.write_exr`).
+
+        Parameters
+        ----------
+        path
+            The file to write.
+        number
+            Frame number.
+        images
+            Role or name of a layer → (H, W, C) or (H, W), of the size of `Frame.color`. "color" goes where
+            the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
+        extra
+            Layers to add; name → (H, W, C) or (H, W), of the same size.
+        attributes
+            Strings for the header.
+
+        Returns
+        -------
+        int
+            How many values were too large for a half channel.
+        """
+        source = self.source(number)
+        layers = find_layers(source, self._overrides)
+        replaced: dict[str, np.ndarray] = {}
+        for name, image in images.items():
+            taken = layers.target if name == "color" else getattr(layers, name) if name in ROLES else None
+            layer = taken or source.layer(name)
+            part = source.parts[layer.part]
+            cut = self._cut(image, part)
+            # Another part may reach beyond the color of all frames; what is there was not read, and stays.
+            inside = self._cut(np.ones(image.shape[:2], bool), part)
+            planes = [cut] if cut.ndim == 2 else list(np.moveaxis(cut, 2, 0))
+            for channel, plane in zip(layer.channels, planes, strict=False):
+                replaced[channel] = plane if inside.all() else np.where(inside, plane, source.channel(channel))
+        home = source.parts[layers.color.part]
+        added = {name: self._cut(image, home) for name, image in (extra or {}).items()}
+        return write_exr(path, source, replaced, added, attributes)
+
+    def _cut(self, image: np.ndarray, part: Part) -> np.ndarray:
+        """What lies on the data window of a part, of an image on the shot's."""
+        (left, top, right, bottom), (x, y, _, _) = self._canvas, _data_window(part)
+        if image.shape[:2] != (bottom - top + 1, right - left + 1):
+            raise ValueError(
+                f"image has shape {image.shape}, expected {(bottom - top + 1, right - left + 1)} and channels"
+            )
+        return _placed(image, (left - x, top - y), part.shape)
+
+    @cached_property
+    def _resolved(self) -> frozenset[Path]:
+        return frozenset(file.resolve() for file in self._files.values())
+
+    @cached_property
+    def _size(self) -> tuple[int, int]:
+        """Width and height of the first frame's display window."""
+        image = read_exr(self.path(self.numbers[0]), pixels=False)
+        return _size(image.parts[find_layers(image, self._overrides).color.part])
+
+    @cached_property
+    def _canvas(self) -> tuple[int, int, int, int]:
+        """The window, relative to the display window, that holds the color of every frame; from headers."""
+        boxes, size = [], self._size
+        for path in self._files.values():
+            # A file that cannot be read, or is of another size, is an error when its turn comes, not now.
+            with suppress(ExrError, OSError):
+                image = read_exr(path, pixels=False)
+                home = image.parts[find_layers(image, self._overrides).color.part]
+                if _size(home) == size:
+                    boxes.append(_data_window(home))
+        lefts, tops, rights, bottoms = zip(*boxes, strict=True)
+        return min(lefts), min(tops), max(rights), max(bottoms)
+
+
+def open_shot(
+    spec: str | Path,
+    *,
+    frames: str | None = None,
+    layers: Mapping[str, str] | None = None,
+    aovs: Sequence[str] = (),
+    keep: int = 2,
+) -> Shot:
+    """Find the files of a shot. None is opened yet.
+
+    Parameters
+    ----------
+    spec
+        ``shot.####.exr``, ``shot.%04d.exr``, ``shot.@@@@.exr``, a folder with one sequence in it, or one file.
+    frames
+        A range such as ``1001-1010x2``; all by default.
+    layers
+        Overrides for `hybrid.exr.find_layers`.
+    aovs
+        Names of further layers to load into `Frame.aovs`.
+    keep
+        How many frames to hold in memory; `Shot.window` holds as many as it needs.
+
+    Raises
+    ------
+    FileNotFoundError
+        If nothing matches; names the pattern and what the folder has.
+    ValueError
+        If the folder has several sequences, or `frames` is not a range.
+    """
+    return Shot(_find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep)
+
+
+def output_path(pattern: str | Path, shot: Shot, number: int) -> Path:
+    """Where the result for a frame goes.
+
+    Parameters
+    ----------
+    pattern
+        ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (one that is
+        there, or any name without ``.exr``), which keeps the input's file names.
+    shot
+        The shot.
+    number
+        Frame number.
+
+    Raises
+    ------
+    ValueError
+        If several frames would get one name, or an input file would be overwritten.
+    """
+    pattern = str(pattern)
+    if Path(pattern).is_dir() or not pattern.lower().endswith(".exr"):
+        path = Path(pattern) / shot.path(number).name
+    else:
+        sequence = fileseq.FileSequence(pattern, pad_style=_PADDING)
+        placeholder = bool(sequence.padding()) and not sequence.frameSet()
+        if not placeholder and len(shot) > 1:
+            raise ValueError(f"output {pattern!r} names one file for {len(shot)} frames, expected OUT.####.exr")
+        path = Path(sequence.frame(number)) if placeholder else Path(pattern)
+    # Not only its own input: frames still to come need the noisy neighbours.
+    if shot.reads(path):
+        raise ValueError(f"output {str(path)!r} would overwrite an input frame")
+    return path
+
+
+def _find_files(spec: str) -> dict[int, Path]:
+    """Frame number → file."""
+    path = Path(spec)
+    if path.is_dir():
+        sequences = _sequences(path)
+        if not sequences:
+            raise FileNotFoundError(f"{spec}: no EXR files in this folder")
+        if len(sequences) > 1:
+            raise ValueError(f"{spec} holds several sequences, name one: {_listing(path)}")
+        return _files(sequences[0])
+    sequence = fileseq.FileSequence(spec, pad_style=_PADDING)
+    if path.is_file():
+        return {int(sequence.start()) if sequence.frameSet() else 1: path}
+    if not sequence.padding() or sequence.frameSet():
+        raise FileNotFoundError(f"{spec}: no such file; {_listing(path.parent)}")
+    for strict in (False, True):  # files with one name and two widths of numbers: the pattern's width decides
+        try:
+            return _files(fileseq.FileSequence.findSequenceOnDisk(spec, strictPadding=strict, pad_style=_PADDING))
+        except fileseq.FileSeqException:
+            continue
+    raise FileNotFoundError(f"{spec}: no frame matches; {_listing(path.parent)}")
+
+
+def _sequences(folder: Path) -> list[fileseq.FileSequence]:
+    found = fileseq.FileSequence.findSequencesOnDisk(str(folder), pad_style=_PADDING)
+    return [sequence for sequence in found if sequence.extension().lower() == ".exr"]
+
+
+def _files(sequence: fileseq.FileSequence) -> dict[int, Path]:
+    numbers = sequence.frameSet()
+    if numbers is None:
+        return {1: Path(str(sequence))}
+    return {int(number): Path(sequence.frame(number)) for number in numbers}
+
+
+def _listing(folder: Path) -> str:
+    """What a folder has, for an error message; shortened if there is much of it."""
+    if not folder.is_dir():
+        return f"there is no folder {str(folder)!r}"
+    names = [f"{s.basename()}{s.padding()}{s.extension()} {s.frameRange()}".strip() for s in _sequences(folder)]
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return f"{str(folder)!r} has {', '.join(sorted(names)[:8]) or 'no EXR files'}{more}"
+
+
+def _parse_frames(frames: str) -> list[int]:
+    """Ascending frame numbers of a range like 1001-1010x2."""
+    try:
+        numbers = list(fileseq.FrameSet(frames))
+    except ValueError:
+        numbers = []
+    if not numbers or any(number != int(number) for number in numbers):
+        raise ValueError(f"frames {frames!r} is not a range of frames, expected one like 1001-1010x2")
+    return sorted({int(number) for number in numbers})
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    return str(fileseq.FrameSet(sorted(numbers)))
+
+
+def _size(part: Part) -> tuple[int, int]:
+    """Width and height of the display window."""
+    left, top, right, bottom = part.display_window
+    return right - left + 1, bottom - top + 1
+
+
+def _data_window(part: Part) -> tuple[int, int, int, int]:
+    """The data window relative to the display window's first pixel."""
+    x, y = part.display_window[:2]
+    left, top, right, bottom = part.data_window
+    return left - x, top - y, right - x, bottom - y
+
+
+def _frame(
+    image: ExrImage, layers: Layers, aovs: Sequence[str], canvas: tuple[int, int, int, int], number: int
+) -> Frame:
+    left, top, right, bottom = canvas
+
+    def pixels(layer: Layer) -> np.ndarray:
+        x, y = _data_window(image.parts[layer.part])[:2]
+        size = bottom - top + 1, right - left + 1
+        return _placed(image.pixels(layer.channels), (x - left, y - top), size)
+
+    taken = {role: pixels(layer) for role in ROLES if (layer := getattr(layers, role)) is not None}
+    for role in {"depth", "alpha"} & taken.keys():
+        taken[role] = np.ascontiguousarray(taken[role][..., 0])
+    if "variance" in taken and taken["variance"].shape[2] == 1:
+        taken["variance"] = np.repeat(taken["variance"], 3, axis=2)
+    return Frame(
+        number=number,
+        **taken,
+        motion_convention=layers.motion_convention,
+        aovs={name: pixels(image.layer(name)) for name in aovs},
+        source=image.path,
+    )
+
+
+def _placed(array: np.ndarray, shift: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """`array` moved right and down by `shift`, cut or filled with 0 to `size` (H, W)."""
+    if shift == (0, 0) and array.shape[:2] == size:
+        return array
+    out = np.zeros((*size, *array.shape[2:]), array.dtype)
+    x, y = shift
+    top, bottom = max(0, y), min(size[0], y + array.shape[0])
+    left, right = max(0, x), min(size[1], x + array.shape[1])
+    if top < bottom and left < right:
+        out[top:bottom, left:right] = array[top - y : bottom - y, left - x : right - x]
+    return out
