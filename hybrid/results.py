@@ -1,0 +1,311 @@
+"""What a comparison has measured: methods, measures, who is best, what ties, and tables of it as text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from hybrid.metrics import bootstrap_interval
+
+Cost = Literal["seconds_per_megapixel", "peak_bytes"]
+COSTS: tuple[Cost, ...] = ("seconds_per_megapixel", "peak_bytes")
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One measure over the frames of a shot: its mean, range, and the interval that the mean is known to."""
+
+    mean: float
+    minimum: float
+    maximum: float
+    low: float
+    high: float
+    values: tuple[float, ...] = ()  # frame by frame, where known: paired differences then decide on ties
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a measure is called, read and printed."""
+
+    key: str
+    label: str
+    definition: str
+    unit: str = ""
+    digits: int = 2
+    better: Literal["higher", "lower", "zero"] = "higher"
+    logarithmic: bool = False  # on the chart; printed with three significant digits
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """What one method, with one choice of settings, has reached and cost on a shot.
+
+    `seconds_per_megapixel` is the median, `spread` the (low, high) of repeated runs; None where the time is not
+    known, 0 where nothing was run. `worth` is the number of times the noisy render's samples that would
+    bring it to the same error. Methods of one `family` share a marker; `sweep` marks a point that only
+    varies the settings of a method. `absent_reason` says why a method that was asked for has no figures.
+    """
+
+    name: str
+    label: str
+    settings: Mapping[str, object] = field(default_factory=dict)
+    family: str = "Methods"
+    sweep: bool = False
+    seconds_per_megapixel: float | None = None
+    spread: tuple[float, float] | None = None
+    peak_bytes: int | None = None
+    metrics: Mapping[str, Statistic] = field(default_factory=dict)
+    worth: float | None = None
+    absent_reason: str | None = None
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric(
+        "psnr",
+        "PSNR",
+        "Peak signal-to-noise ratio, −10 log₁₀ mean (T(x) − T(r))², on the tone curve T(x) = e·x / (1 + e·x) "
+        "at one exposure e for the whole shot. Mean over frames.",
+        unit="dB",
+    ),
+    Metric(
+        "temporal_psnr",
+        "Temporal PSNR",
+        "PSNR of what changes from frame to frame: the difference of each frame to the one before, warped onto "
+        "it, against the reference's own. Flicker lowers it; an error that stands still does not, so read "
+        "it beside the PSNR.",
+        unit="dB",
+    ),
+    Metric(
+        "ssim",
+        "SSIM",
+        "Mean structural similarity on the same tone curve: Gaussian window, σ = 1.5, K = (0.01, 0.03); 1 at best.",
+        digits=4,
+    ),
+    Metric(
+        "relmse",
+        "relMSE",
+        "Relative mean squared error, mean (x − r)² / (r² + 0.01), on linear radiance. One firefly can decide it.",
+        better="lower",
+        logarithmic=True,
+    ),
+    Metric(
+        "relmse_trimmed",
+        "relMSE, trimmed",
+        "relMSE without the 0.1 % of the pixels whose error is largest.",
+        better="lower",
+        logarithmic=True,
+    ),
+    Metric("smape", "SMAPE", "Mean |x − r| / (|x| + |r| + 0.01), in [0, 1].", digits=4, better="lower"),
+    Metric(
+        "flip",
+        "FLIP",
+        "Mean HDR-FLIP error: how different the two look when one flips between them, over the range of "
+        "exposures the reference calls for; 0 at best, 1 at worst.",
+        digits=4,
+        better="lower",
+    ),
+    Metric(
+        "mean_bias",
+        "Bias",
+        "Relative error of the mean radiance, mean x / mean r − 1: below zero where light was lost.",
+        digits=4,
+        better="zero",
+    ),
+    Metric(
+        "static_std",
+        "Static deviation",
+        "Standard deviation over time of the pixels that stand still, on the tone curve: 0 is no flicker at "
+        "all, which blur reaches too.",
+        better="lower",
+        logarithmic=True,
+    ),
+)
+CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # those the chart offers, the first one first
+
+
+def summarize(values: Sequence[float]) -> Statistic:
+    """Summarize a measure taken frame by frame: mean, range, and the 95 % bootstrap interval of the mean."""
+    if len(values) == 0:
+        raise ValueError("values must hold at least one frame, is empty")
+    data = np.asarray(values, np.float64)
+    return Statistic(
+        float(data.mean()),
+        float(data.min()),
+        float(data.max()),
+        *bootstrap_interval(data),
+        tuple(float(v) for v in data),
+    )
+
+
+def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
+    """Name the best method by a measure, and those that cannot be told from it.
+
+    Returns
+    -------
+    (best, ties)
+        The best mean, None where no method has one; the names whose difference to it is a tie.
+
+    Notes
+    -----
+    Two methods tie where the bootstrap interval of their differences frame by frame contains 0; where the
+    values of the frames are not known, where the intervals of the means overlap.
+    """
+    rated = {r.name: r.metrics[metric.key] for r in results if metric.key in r.metrics}
+    rated = {name: s for name, s in rated.items() if not math.isnan(s.mean)}
+    if not rated:
+        return None, set()
+    best = max(rated, key=lambda name: _goodness(rated[name].mean, metric))
+    return best, {name for name in rated if name != best and _tied(rated[name], rated[best])}
+
+
+def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
+    """Name the methods that no other beats at the same cost or less, by rising cost.
+
+    Methods whose cost is not known, or whose measure is not finite, are left out.
+    """
+    points = [
+        (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
+        for r in results
+        if (spent := getattr(r, cost)) is not None
+        and metric.key in r.metrics
+        and math.isfinite(r.metrics[metric.key].mean)
+    ]
+    front: list[str] = []
+    least = math.inf
+    for _, badness, name in sorted(points):
+        if badness < least:
+            front.append(name)
+            least = badness
+    return front
+
+
+def markdown_table(results: Sequence[MethodResult], metrics: Sequence[Metric] = METRICS) -> str:
+    """Return the results as a Markdown table: measures the chart offers, cost, worth in samples.
+
+    The best of a column is bold, what ties with it is marked "≈"; absent methods follow with their reason.
+    Points of a sweep are left out.
+    """
+    methods = [r for r in results if not r.sweep]
+    columns = [m for m in present_metrics(methods, metrics) if m.key in CHART_METRICS]
+    verdicts = {m.key: best_and_ties(methods, m) for m in columns}
+    titles = ["method", *(column_title(m) for m in columns), "s / megapixel", "peak memory", "worth in samples"]
+    lines = [titles, ["---", *("---:" for _ in titles[1:])]]
+    for r in methods:
+        cells = [r.label]
+        if r.absent_reason is not None:
+            lines.append([r.label, f"absent: {r.absent_reason}", *("" for _ in titles[2:])])
+            continue
+        for m in columns:
+            text = format_value(r.metrics[m.key].mean, m) if m.key in r.metrics else "–"
+            best, ties = verdicts[m.key]
+            cells.append(f"**{text}**" if r.name == best else f"≈ {text}" if r.name in ties else text)
+        cells += [format_seconds(r.seconds_per_megapixel), format_bytes(r.peak_bytes), format_worth(r.worth)]
+        lines.append(cells)
+    return "".join(f"| {' | '.join(_markdown_cell(c) for c in line)} |\n" for line in lines)
+
+
+def _goodness(value: float, metric: Metric) -> float:
+    """A figure that is larger where the method is better."""
+    return {"higher": value, "lower": -value, "zero": -abs(value)}[metric.better]
+
+
+def _tied(a: Statistic, b: Statistic) -> bool:
+    if a.values and len(a.values) == len(b.values):
+        with np.errstate(invalid="ignore"):  # two perfect scores: inf − inf
+            difference = np.subtract(a.values, b.values)
+        low, high = bootstrap_interval(np.where(np.equal(a.values, b.values), 0.0, difference))
+        return low <= 0 <= high
+    return a.low <= b.high and b.low <= a.high
+
+
+def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list[Metric]:
+    """Return those of the metrics that at least one result has."""
+    return [m for m in metrics if any(m.key in r.metrics for r in results)]
+
+
+def format_value(value: float, metric: Metric) -> str:
+    """Print a figure as its metric asks for, "–" for NaN."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
+    text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
+    return text.replace("-", "−")
+
+
+def format_seconds(value: float | None) -> str:
+    """Print seconds with three significant digits, "–" where not known."""
+    if value is None:
+        return "–"
+    return "0" if value == 0 else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def format_bytes(value: int | None) -> str:
+    """Print an amount of memory in MiB or GiB, "–" where not known."""
+    if value is None:
+        return "–"
+    return f"{value / 2**20:.0f} MiB" if value < 2**30 else f"{value / 2**30:.2f} GiB"
+
+
+def format_worth(value: float | None) -> str:
+    """Print how many times the samples a method is worth, "–" where not known."""
+    return "–" if value is None or math.isnan(value) else f"{value:.2g}×" if value < 10 else f"{value:.0f}×"
+
+
+def column_title(metric: Metric) -> str:
+    """Return the metric's label with its unit."""
+    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
+
+
+def _markdown_cell(text: str) -> str:
+    return re.sub(r"\s+", " ", text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+
+
+def plain(result: MethodResult) -> dict[str, object]:
+    """A result as plain dicts, settings as text: what they hold is the caller's business."""
+    settings = {str(k): str(v) for k, v in result.settings.items()}
+    # asdict copies mappings by their own type, which a MappingProxy does not survive.
+    metrics = {k: asdict(v) for k, v in result.metrics.items()}
+    values = {name: getattr(result, name) for name in result.__dataclass_fields__}
+    return {**values, "settings": settings, "metrics": metrics}
+
+
+def to_json(document: object, indent: int | None = None) -> str:
+    """JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read."""
+
+    def finite(value: object) -> object:
+        if isinstance(value, Mapping):
+            return {str(k): finite(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [finite(v) for v in value]
+        if isinstance(value, np.generic):
+            return finite(value.item())
+        if isinstance(value, float) and not math.isfinite(value):
+            return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+        return value
+
+    return json.dumps(finite(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """One row per method: settings as JSON, five columns per measure."""
+    parts = ("mean", "minimum", "maximum", "low", "high")
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    facts = ["name", "label", "family", "sweep", "absent_reason", "settings"]
+    costs = ["seconds_per_megapixel", "seconds_low", "seconds_high", "peak_bytes", "worth"]
+    writer.writerow([*facts, *costs, *(f"{m.key}_{part}" for m in metrics for part in parts)])
+    for r in results:
+        row: list[object] = [r.name, r.label, r.family, int(r.sweep), r.absent_reason]
+        row += [to_json({str(k): str(v) for k, v in r.settings.items()}).strip(), r.seconds_per_megapixel]
+        row += [*(r.spread or (None, None)), r.peak_bytes, r.worth]
+        for m in metrics:
+            row += [getattr(r.metrics[m.key], p) if m.key in r.metrics else None for p in parts]
+        writer.writerow(row)
+    return out.getvalue()
