@@ -81,9 +81,7 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     return float(structural_similarity(r, x, channel_axis=-1, **settings))
 
 
-def relmse(
-    image: Array, reference: Reference, *, eps: float = 1e-2, trim: float = 0.0, exposure: float = 1.0
-) -> float:
+def relmse(image: Array, reference: Reference, *, eps: float = 1e-2, trim: float = 0.0, exposure: float = 1.0) -> float:
     """Relative mean squared error: mean (x − r)² / (r² + ε).
 
     Parameters

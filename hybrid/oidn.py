@@ -69,9 +69,7 @@ def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np
     return np.ascontiguousarray(image, np.float32)
 
 
-def _execute(
-    images: dict[str, NDArray[np.float32]], quality: str, threads: int, **flags: bool
-) -> NDArray[np.float32]:
+def _execute(images: dict[str, NDArray[np.float32]], quality: str, threads: int, **flags: bool) -> NDArray[np.float32]:
     """Run one filter over `images`."""
     oidn, device = _device(threads)
     qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,

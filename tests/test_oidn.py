@@ -75,9 +75,7 @@ class TestDenoise:
         clean, color, albedo, _ = scene
         errors = [rms(denoise_oidn(color, *guides, threads=1), clean) for guides in ([], [albedo])]
         assert errors[1] < errors[0] < rms(color, clean)
-        np.testing.assert_array_equal(
-            denoise_oidn(color, prefilter=True, threads=1), denoise_oidn(color, threads=1)
-        )
+        np.testing.assert_array_equal(denoise_oidn(color, prefilter=True, threads=1), denoise_oidn(color, threads=1))
 
     @pytest.mark.parametrize("size", [(1, 1), (3, 5), (17, 33)])
     def test_any_size_and_layout(self, scene, size) -> None:
