@@ -1,0 +1,181 @@
+"""Building blocks: the robust average, the Robust Average block that connects the frames, the residual block.
+
+Frames are stacked in time along the batch: ``(T·N, C, H, W)``, all samples of the first frame, then all of the
+second. Spatial layers see a larger batch and need not know about time; splitting into frames is a view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def ravg(frames: Sequence[Tensor]) -> Tensor:
+    """Mean of tensors after discarding the minimum and the maximum of each element.
+
+    Parameters
+    ----------
+    frames : sequence of Tensor
+        At least one tensor, all of one shape. For a tensor with a time axis, pass ``x.unbind(axis)``.
+
+    Returns
+    -------
+    Tensor
+        Of the shape of one frame. Of two frames the mean, of one itself.
+
+    Raises
+    ------
+    ValueError
+        If there is no frame.
+
+    Notes
+    -----
+    ``ravg(S) = (Σ x − max(S) − min(S)) / (|S| − 2)`` for ``|S| ≥ 3``, computed without forming ``Σ x``: beside
+    an outlier of 1e6 the subtraction would leave nothing of the other values in half precision. Where several
+    values are equally extreme, one of them gets the gradient.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, "Robust Average Networks for Monte Carlo Denoising", section 3, equation 1.
+    """
+    if len(frames) == 0:
+        raise ValueError("frames: expected at least one tensor, got none")
+    if len(frames) == 1:
+        return frames[0]
+    if len(frames) == 2:
+        return torch.lerp(frames[0], frames[1], 0.5)
+    if len(frames) == 4:
+        average: Tensor = _MeanOfMiddleTwo.apply(*frames)
+        return average
+    low, high = torch.minimum(frames[0], frames[1]), torch.maximum(frames[0], frames[1])
+    total = torch.zeros_like(low)
+    for frame in frames[2:]:
+        # Of (low, frame, high) the middle one can no longer be extreme: it joins the sum.
+        middle = torch.maximum(low, torch.minimum(frame, high))
+        low, high = torch.minimum(low, frame), torch.maximum(high, frame)
+        total = total + middle
+    return total / (len(frames) - 2)
+
+
+class _MeanOfMiddleTwo(torch.autograd.Function):
+    """ravg of four frames, the case of every step of a five-frame window; see ``ravg``.
+
+    Sorted pairs (a, b) and (c, d) give the two middle values directly. Autograd through seven minima and maxima
+    costs ten times this backward pass, which keeps four 0/1 masks in the data's own type (so that every pass
+    over memory is vectorised) and sends half the gradient to each of the two frames that were averaged.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+        low_ab, high_ab = torch.minimum(a, b), torch.maximum(a, b)
+        low_cd, high_cd = torch.minimum(c, d), torch.maximum(c, d)
+        mean = torch.maximum(low_ab, low_cd).add_(torch.minimum(high_ab, high_cd)).mul_(0.5)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(
+                low_ab.ge_(low_cd),  # the lower middle value came from (a, b)
+                high_ab.le_(high_cd),  # the upper middle value came from (a, b)
+                torch.le(a, b, out=low_cd),
+                torch.le(c, d, out=high_cd),
+            )
+        return mean
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        lower_from_ab, upper_from_ab, a_is_lower, c_is_lower = ctx.saved_tensors
+        half = gradient * 0.5
+        # Every value below is 0, half or gradient, so the sums and differences are exact in any precision.
+        lower_ab, upper_ab = half * lower_from_ab, half * upper_from_ab
+        lower_cd, upper_cd = half - lower_ab, half - upper_ab
+        to_a = torch.lerp(upper_ab, lower_ab, a_is_lower)
+        to_c = torch.lerp(upper_cd, lower_cd, c_is_lower)
+        return to_a, lower_ab.add_(upper_ab).sub_(to_a), to_c, lower_cd.add_(upper_cd).sub_(to_c)
+
+
+class ResidualBlock(nn.Module):
+    """``x + conv(relu(conv(x)))``, without normalisation, at constant width.
+
+    Parameters
+    ----------
+    channels : int
+        Width of input, output and hidden layer.
+    kernel_size : int
+        Odd size of both convolutions.
+
+    References
+    ----------
+    He et al. 2016, "Deep Residual Learning for Image Recognition", doi:10.1109/CVPR.2016.90.
+    """
+
+    def __init__(self, channels: int, kernel_size: int = 3) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, kernel_size, padding=kernel_size // 2)
+        self.second = nn.Conv2d(channels, channels, kernel_size, padding=kernel_size // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, C, H, W)`` to the same shape."""
+        return x + self.second(torch.relu(self.first(torch.relu(x))))
+
+
+class RobustAverage(nn.Module):
+    """Robust Average block: blends each frame with the robust average of the others, by learned weights.
+
+    Parameters
+    ----------
+    channels : int
+        Width of the features.
+    kernel_size : int
+        Odd size of the convolutions that predict the weights.
+
+    Notes
+    -----
+    For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place:
+    ``a = ravg(x_j, j ≠ i)``, ``w = sigmoid(conv(relu(conv([x_i, a]))))``, ``x_i ← (1 − w) x_i + w a``, one weight
+    per pixel. The parameters are shared over the steps. ``w → 0`` makes the block the identity.
+
+    The first convolution acts on the concatenation of x_i and a; it is held as two halves. As each frame is
+    excluded before it has been changed, the half on x_i runs on all frames at once, and nothing is concatenated.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 3.
+    """
+
+    def __init__(self, channels: int, kernel_size: int = 3) -> None:
+        super().__init__()
+        padding = kernel_size // 2
+        self.on_frame = nn.Conv2d(channels, channels, kernel_size, padding=padding)
+        self.on_average = nn.Conv2d(channels, channels, kernel_size, padding=padding, bias=False)
+        self.weight = nn.Conv2d(channels, 1, kernel_size, padding=padding)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """Blend over time.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(T·N, C, H, W)``, time first.
+        frames : int
+            T. With one frame there is nothing to average: the block is the identity.
+
+        Returns
+        -------
+        Tensor
+            As x.
+        """
+        if frames == 1:
+            return x
+        of_frame = self.on_frame(x).chunk(frames)
+        state = list(x.chunk(frames))
+        for i in outermost_first(frames):
+            average = ravg(state[:i] + state[i + 1 :])
+            weight = torch.sigmoid(self.weight(torch.relu(of_frame[i] + self.on_average(average))))
+            state[i] = torch.lerp(state[i], average, weight)
+        return torch.cat(state)
+
+
+def outermost_first(frames: int) -> list[int]:
+    """Order in which a Robust Average block visits a window: 0, 4, 1, 3, 2 for five frames."""
+    return sorted(range(frames), key=lambda i: (-abs(i - frames // 2), i))

@@ -1,0 +1,154 @@
+"""A model in one safetensors file: weights, and in its metadata what to build and where it comes from."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from network.models import KernelConfig, Model, RAResNet, RAResNetConfig, RAUNet, RAUNetConfig
+
+FORMAT = "ravg-network"
+#: Raised when a change makes older weights give other kernels. Files say which one they were written for.
+VERSION = 1
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """What is needed to build the model anew, as plain JSON values."""
+    return {"model": type(model).__name__, "config": asdict(model.config)}
+
+
+def build(description: Mapping[str, Any]) -> Model:
+    """Model of a description, with initial weights.
+
+    Raises
+    ------
+    ValueError
+        If the description is not one of `describe`.
+    """
+    try:
+        name, values = description["model"], dict(description["config"])
+        values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        values["kernel"] = KernelConfig(**values["kernel"])
+        if name == "RAUNet":
+            return RAUNet(RAUNetConfig(**values))
+        if name == "RAResNet":
+            return RAResNet(RAResNetConfig(**values))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"model description: {error!r}") from error
+    raise ValueError(f"model description: expected model RAUNet or RAResNet, got {name!r}")
+
+
+def save_model(
+    path: str | os.PathLike[str],
+    model: Model,
+    notes: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float16,
+) -> None:
+    """Write a model; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The safetensors file.
+    model : Model
+        The model, in any precision.
+    notes : mapping, optional
+        Where the weights come from (training configuration, validation), as JSON values.
+    dtype : torch.dtype
+        Stored precision.
+
+    Raises
+    ------
+    ValueError
+        If a weight is not finite in the stored precision.
+    """
+    tensors = {name: value.detach().to("cpu", dtype).contiguous() for name, value in model.state_dict().items()}
+    for name, value in tensors.items():
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{name}: expected finite weights in {dtype}, got NaN or infinity")
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "description": json.dumps(describe(model)),
+        "notes": json.dumps(dict(notes or {})),
+    }
+    path = Path(path)
+    partial = path.with_name(path.name + ".part")
+    try:
+        save_file(tensors, partial, metadata)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_model(path: str | os.PathLike[str]) -> Model:
+    """Read a model.
+
+    Parameters
+    ----------
+    path : path
+        File from `save_model`.
+
+    Returns
+    -------
+    Model
+        Float32, in training layout; see `network.models.for_inference`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is cut short, no safetensors file, not ours, of another version, or its weights are not
+        those of the model it names.
+    """
+    metadata, tensors = _read(path)
+    where = f"weights {os.fspath(path)!r}"
+    try:
+        model = build(json.loads(metadata["description"]))
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from error
+    wanted = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    if wanted != found:
+        name = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
+        raise ValueError(f"{where}: {name}: expected shape {wanted.get(name)}, got {found.get(name)}")
+    model.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return model
+
+
+def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read where weights come from: the notes given to `save_model`. Raises as `load_model`."""
+    metadata, _ = _read(path)
+    try:
+        notes: dict[str, Any] = json.loads(metadata["notes"])
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"weights {os.fspath(path)!r}: {error!r}") from error
+    return notes
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Metadata and tensors of a file, if it is one of ours."""
+    where = f"weights {os.fspath(path)!r}"
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{where}: no such file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except SafetensorError as error:
+        raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{where}: expected format {FORMAT!r}, got {metadata.get('format')!r}")
+    if metadata.get("version") != str(VERSION):
+        raise ValueError(f"{where}: expected version {VERSION}, got {metadata.get('version')}")
+    return metadata, tensors

@@ -1,0 +1,109 @@
+"""What the network sees: the one place where a window becomes feature channels, for training and for running."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+#: Channels of a frame without an estimate: color, albedo, normal, confidence (the paper's).
+CHANNELS = 10
+#: Channels an estimate adds: its three, and one that tells that it is there.
+ESTIMATE_CHANNELS = 4
+
+
+def window_exposure(color: Tensor) -> Tensor:
+    """Scale of a window's radiance: a mean that fireflies cannot move.
+
+    Parameters
+    ----------
+    color : Tensor
+        ``(N, T, C, H, W)``, finite, linear.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``, positive; 1 for a black window. ``window_exposure(a·x) = a·window_exposure(x)``.
+
+    Notes
+    -----
+    The mean m of the pixels, then three times the mean of ``min(x, 4 m)``. One pixel of 1e6 in a million of 0.2
+    moves the first mean to 1.2 and the last by less than 1e-6. Take it of whole frames, never of tiles: tiles
+    of different exposure would show their seams.
+    """
+    brightness = color.mean(2).clamp_min(0).flatten(1)
+    mean = brightness.mean(1, keepdim=True)
+    for _ in range(3):
+        mean = torch.minimum(brightness, 4 * mean).mean(1, keepdim=True)
+    return torch.where(mean > 0, mean, torch.ones_like(mean)).squeeze(1)
+
+
+def network_inputs(
+    color: Tensor,
+    albedo: Tensor | None,
+    normal: Tensor | None,
+    confidence: Tensor,
+    exposure: Tensor,
+    *,
+    takes_estimate: bool,
+    estimate: Tensor | None = None,
+    present: Tensor | None = None,
+) -> Tensor:
+    """Feature channels of each frame of an aligned window.
+
+    Parameters
+    ----------
+    color : Tensor
+        ``(N, T, 3, H, W)`` aligned irradiance.
+    albedo, normal : Tensor, optional
+        ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space. Zeros where missing.
+    confidence : Tensor
+        ``(N, T, 1, H, W)`` in [0, 1].
+    exposure : Tensor
+        ``(N,)`` from `window_exposure`.
+    takes_estimate : bool
+        Whether the model has channels for an estimate.
+    estimate : Tensor, optional
+        ``(N, T_e, 3, H, W)`` denoised irradiance, T_e = 1 (of the centre; every frame sees it) or T.
+    present : Tensor, optional
+        ``(N,)``, 1 where a sample has its estimate, 0 where it is to be ignored. Default: all have.
+
+    Returns
+    -------
+    Tensor
+        ``(N, T, 10, H, W)``, or ``(N, T, 14, H, W)`` if takes_estimate: ``log1p(color / exposure)``,
+        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)`` and its presence.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit color's.
+
+    Notes
+    -----
+    The logarithm keeps a firefly of 1e6 at 14; negative radiance (bicubic warping makes some) counts as zero
+    here, though not in what the kernels are applied to.
+    """
+    n, t, _, h, w = color.shape
+    for name, value, depth in (("albedo", albedo, 3), ("normal", normal, 3), ("confidence", confidence, 1)):
+        if value is not None and value.shape != (n, t, depth, h, w):
+            raise ValueError(f"{name}: expected shape {(n, t, depth, h, w)}, got {tuple(value.shape)}")
+    if exposure.shape != (n,):
+        raise ValueError(f"exposure: expected shape {(n,)}, got {tuple(exposure.shape)}")
+    scale = exposure.reciprocal().view(n, 1, 1, 1, 1)
+    missing = color.new_zeros(()).expand(n, t, 3, h, w)
+    channels = [
+        torch.log1p((color * scale).clamp_min(0)),
+        missing if albedo is None else torch.log1p(albedo.clamp_min(0)),
+        missing if normal is None else normal,
+        confidence,
+    ]
+    if takes_estimate:
+        if estimate is None:
+            channels.append(color.new_zeros(()).expand(n, t, ESTIMATE_CHANNELS, h, w))
+        else:
+            if estimate.shape not in ((n, 1, 3, h, w), (n, t, 3, h, w)):
+                raise ValueError(f"estimate: expected shape (N, 1 or T, 3, H, W), got {tuple(estimate.shape)}")
+            here = (color.new_ones(n) if present is None else present.to(color.dtype)).view(n, 1, 1, 1, 1)
+            log = torch.log1p((estimate * scale).clamp_min(0)) * here
+            channels += [log.expand(n, t, 3, h, w), here.expand(n, t, 1, h, w)]
+    return torch.cat(channels, 2)

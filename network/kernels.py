@@ -1,0 +1,291 @@
+"""Predicted kernels: activation with a threshold, and applying them frame by frame.
+
+A kernel has one weight per tap: the K×K neighbours of a pixel in each frame of the aligned window (time, then
+row, then column), then, where there are estimates, their taps in the same order. All taps of a pixel are
+normalised together. Applying them keeps the frames apart: numerators ``S_t = Σ k_i x_i`` and denominators
+``N_t = Σ k_i`` over the taps of frame t. The filtered image is ``Σ S_t / Σ N_t``; any subset of the frames, and
+the share of each frame, are sums of the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+Slices = tuple[slice, slice]
+
+
+def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
+    """Thresholded, normalised kernel of raw weights (the paper's η_t).
+
+    Parameters
+    ----------
+    weights : Tensor
+        ``(N, K, H, W)`` raw weights of K taps.
+    threshold : float or Tensor, optional
+        t, on the scale of the weights; a tensor broadcasts against ``(N, 1, H, W)``. Default ``1 / (2K)``.
+    centre : int
+        The tap that gets all the weight where no weight exceeds the threshold: the kernel is then the identity.
+
+    Returns
+    -------
+    Tensor
+        ``(N, K, H, W)``, not negative, sums to 1 over the taps.
+
+    Raises
+    ------
+    ValueError
+        If a float threshold is outside ``[0, 1/K)``, or the centre is no tap.
+
+    Notes
+    -----
+    ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)``. ``t < 1/K`` keeps a normalised kernel of equal weights
+    alive. Where the kernel is the identity the gradient is zero.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 4.
+    """
+    return _activate(weights, threshold, centre, relative=False)
+
+
+def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
+    """Kernel of raw weights: normalised, thresholded, normalised again.
+
+    Parameters
+    ----------
+    weights : Tensor
+        ``(N, K, H, W)`` raw weights on any scale.
+    threshold : float or Tensor, optional
+        t on the scale of the *normalised* weights, below 1/K; a tensor broadcasts against ``(N, 1, 1, 1)``.
+        Default ``1 / (2K)``.
+    centre : int
+        As for `threshold_kernel`.
+
+    Returns
+    -------
+    Tensor
+        ``(N, K, H, W)`` float32 (float64 stays), not negative, sums to 1 over the taps.
+
+    Raises
+    ------
+    ValueError
+        As for `threshold_kernel`.
+
+    Notes
+    -----
+    ``η_t(η_0(w))``. Without the first normalisation t would be compared with numbers whose scale the network
+    chooses, and the same t would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first
+    normalisation needs only its sum. Kept in float32: in half precision a weight near 1/K has lost the digits
+    that tell it from t.
+    """
+    if weights.dtype != torch.float64:
+        weights = weights.float()
+    return _activate(weights, threshold, centre, relative=True)
+
+
+def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply the kernels of one source to its frames, frame by frame.
+
+    Parameters
+    ----------
+    kernels : Tensor
+        ``(N, T·K·K, H, W)``, K odd.
+    frames : Tensor
+        ``(N, T, C, H, W)``: radiance, irradiance, an AOV; any linear quantity.
+
+    Returns
+    -------
+    numerators : Tensor
+        ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``.
+    denominators : Tensor
+        ``(N, T, 1, H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)`` over the taps inside the image.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit together.
+
+    Notes
+    -----
+    Taps outside the image count in neither sum, so that dividing renormalises what is left of a kernel at the
+    border. Both directions accumulate shifted planes in place: unfolding would write each frame K·K times.
+    """
+    if frames.ndim != 5 or kernels.ndim != 4 or kernels.shape[0] != frames.shape[0]:
+        raise ValueError(
+            f"kernels, frames: expected (N, T·K·K, H, W) and (N, T, C, H, W), got {tuple(kernels.shape)} "
+            f"and {tuple(frames.shape)}"
+        )
+    size = math.isqrt(kernels.shape[1] // frames.shape[1])
+    if size % 2 == 0 or size * size * frames.shape[1] != kernels.shape[1]:
+        raise ValueError(f"kernels: expected T·K·K taps with K odd for T = {frames.shape[1]}, got {kernels.shape[1]}")
+    if kernels.shape[2:] != frames.shape[3:]:
+        raise ValueError(
+            f"kernels: expected the frames' size {tuple(frames.shape[3:])}, got {tuple(kernels.shape[2:])}"
+        )
+    numerators: Tensor
+    denominators: Tensor
+    numerators, denominators = _ApplyKernels.apply(kernels, frames)
+    return numerators, denominators
+
+
+def filter_window(kernels: Tensor, color: Tensor, size: int, estimate: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Apply kernels that span the noisy window and, where there is one, the estimate.
+
+    Parameters
+    ----------
+    kernels : Tensor
+        ``(N, taps, H, W)``: T·K·K taps of the window, then those of the estimate.
+    color : Tensor
+        ``(N, T, C, H, W)`` aligned window: what the kernels were predicted for, or an AOV warped with it.
+    size : int
+        K of the window's taps.
+    estimate : Tensor, optional
+        ``(N, T_e, C, H, W)``, T_e = 1 (of the centre) or T, of the same quantity as color. Without one (an AOV
+        that has none) the estimate's taps are left out, and dividing renormalises the others.
+
+    Returns
+    -------
+    numerators, denominators : Tensor
+        As for `apply_kernels`, ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)``. The estimate of a frame is counted
+        with that frame, so the centre's with the centre.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit together.
+    """
+    frames = color.shape[1]
+    taps = frames * size * size
+    numerators, denominators = apply_kernels(kernels[:, :taps], color)
+    if estimate is None:
+        return numerators, denominators
+    if estimate.shape[1] not in (1, frames):
+        raise ValueError(f"estimate: expected 1 or {frames} frames, got {estimate.shape[1]}")
+    more, share = apply_kernels(kernels[:, taps:], estimate)
+    first = 0 if estimate.shape[1] == frames else frames // 2
+    last = first + estimate.shape[1]
+    padding = (0, 0, 0, 0, 0, 0, first, frames - last)
+    return (
+        numerators + torch.nn.functional.pad(more, padding),
+        denominators + torch.nn.functional.pad(share, padding),
+    )
+
+
+def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:
+    """Filtered image of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``.
+
+    Parameters
+    ----------
+    numerators, denominators : Tensor
+        ``(N, T', C, H, W)`` and ``(N, T', 1, H, W)``: all frames, or a subset of them along the second axis.
+    fallback : Tensor
+        ``(N, C, H, W)``: what the image is where the kernels have no weight on these frames.
+    epsilon : float
+        Weight of the fallback, on the scale of a kernel, whose weights sum to 1.
+
+    Returns
+    -------
+    Tensor
+        ``(N, C, H, W)``.
+    """
+    return (numerators.sum(1) + epsilon * fallback) / (denominators.sum(1) + epsilon)
+
+
+def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:
+    """Check the arguments shared by the two activations, and run one."""
+    taps = weights.shape[1]
+    if not 0 <= centre < taps:
+        raise ValueError(f"centre: expected a tap from 0 to {taps - 1}, got {centre}")
+    if threshold is None:
+        threshold = 0.5 / taps
+    if not isinstance(threshold, Tensor) and not 0 <= threshold < 1 / taps:
+        raise ValueError(f"threshold: expected 0 <= t < 1/K = {1 / taps:.6g} for K = {taps}, got {threshold}")
+    kernel: Tensor = _Threshold.apply(weights, threshold, centre, relative)
+    return kernel
+
+
+class _Threshold(torch.autograd.Function):
+    """η_t of raw weights, or, if relative, η_t of normalised weights; one buffer instead of autograd's eight."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, threshold: float | Tensor, centre: int, relative: bool) -> Tensor:
+        buffer = torch.relu(weights)
+        cut = threshold * buffer.sum(1, keepdim=True) if relative else threshold
+        kernel = torch.sub(weights, cut, out=buffer).relu_()
+        total = kernel.sum(1, keepdim=True)
+        nothing = total == 0
+        kernel.div_(total.masked_fill_(nothing, torch.inf))
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(weights, kernel, total)
+            ctx.threshold, ctx.relative = threshold, relative
+            kernel = kernel.clone() if bool(nothing.any()) else kernel
+        kernel[:, centre : centre + 1] += nothing
+        return kernel
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        weights, kernel, total = ctx.saved_tensors
+        mean = (gradient * kernel).sum(1, keepdim=True)
+        above = kernel > 0
+        to_weights = torch.sub(gradient, mean).div_(total).mul_(above)
+        if ctx.relative:  # the cut is t times the sum of the positive weights
+            to_cut = to_weights.sum(1, keepdim=True).mul_(ctx.threshold)
+            to_weights.sub_(to_cut * (weights > 0))
+        return to_weights, None, None, None
+
+
+class _ApplyKernels(torch.autograd.Function):
+    """Shifted accumulation over the taps; see `apply_kernels`."""
+
+    @staticmethod
+    def forward(ctx: Any, kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+        n, t, c, h, w = frames.shape
+        dtype = torch.promote_types(kernels.dtype, frames.dtype)
+        kernels, frames = kernels.to(dtype), frames.to(dtype)
+        numerators = frames.new_zeros(n, t, c, h, w)
+        denominators = frames.new_zeros(n, t, 1, h, w)
+        for tap, (frame, here, there) in enumerate(_taps(kernels.shape[1], t, h, w)):
+            weight = kernels[:, tap : tap + 1, *here]
+            numerators[:, frame, :, *here].addcmul_(weight, frames[:, frame, :, *there])
+            denominators[:, frame, :, *here].add_(weight)
+        ctx.save_for_backward(kernels, frames)
+        return numerators, denominators
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_numerators: Tensor, to_denominators: Tensor) -> tuple[Tensor | None, ...]:
+        kernels, frames = ctx.saved_tensors
+        _, t, c, h, w = frames.shape
+        to_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[0] else None
+        to_frames = torch.zeros_like(frames) if ctx.needs_input_grad[1] else None
+        for tap, (frame, here, there) in enumerate(_taps(kernels.shape[1], t, h, w)):
+            if to_kernels is not None:
+                gradient = to_kernels[:, tap, *here].copy_(to_denominators[:, frame, 0, *here])
+                for channel in range(c):
+                    gradient.addcmul_(to_numerators[:, frame, channel, *here], frames[:, frame, channel, *there])
+            if to_frames is not None:
+                to_frames[:, frame, :, *there].addcmul_(
+                    kernels[:, tap : tap + 1, *here], to_numerators[:, frame, :, *here]
+                )
+        return to_kernels, to_frames
+
+
+def _taps(taps: int, frames: int, height: int, width: int) -> Iterator[tuple[int, Slices, Slices]]:
+    """For each tap its frame, the pixels for which it is inside the image, and the pixels it reads there."""
+    size = math.isqrt(taps // frames)
+    radius = size // 2
+    for frame in range(frames):
+        for dy in range(-radius, radius + 1):
+            rows = slice(max(0, -dy), max(0, height - max(0, dy)))
+            from_rows = slice(max(0, dy), max(0, height + min(0, dy)))
+            for dx in range(-radius, radius + 1):
+                columns = slice(max(0, -dx), max(0, width - max(0, dx)))
+                from_columns = slice(max(0, dx), max(0, width + min(0, dx)))
+                yield frame, (rows, columns), (from_rows, from_columns)

@@ -1,0 +1,164 @@
+"""Image losses, and their conversion from space to time.
+
+An image loss takes prediction and target, ``(N, C, H, W)`` radiance, and the scale of the radiance, ``(N,)``, and
+returns one value per sample, ``(N,)``. All are scale invariant: ``loss(a·x, a·y, a·s) = loss(x, y, s)``.
+
+What they do to the mean when the targets are noisy (Lehtinen et al. 2018): a squared error is least at the mean
+of the targets, so `relmse`, whose weights depend on the prediction alone and carry no gradient, is unbiased.
+`l1` is least at the median, and Monte Carlo noise is skewed, with its median below its mean: it darkens.
+`smape` is an L1 error with a weight that depends on the target too and darkens as well, where the noise is
+strong. `relmse` with a limit on outliers stays between the two: it only darkens by what is beyond the limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from network.kernels import mean_of
+
+ImageLoss = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+#: Weight of the fallback in the image of a subset of frames. The kernels sum to 1 over all frames; a subset to
+#: which they give less than this is mostly its own unfiltered pixels, and dividing by its share stays harmless.
+SUBSET_EPSILON = 1e-3
+
+
+def l1(prediction: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median)."""
+    return (prediction - target).abs().mean((1, 2, 3)) / scale
+
+
+def smape(prediction: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2.
+
+    Notes
+    -----
+    Darkens with noisy targets, see the module. ε is where "dark" starts, relative to the scale of the image.
+
+    References
+    ----------
+    Vogels et al. 2018, "Denoising with Kernel Prediction and Asymmetric Loss Functions",
+    doi:10.1145/3197517.3201388.
+    """
+    floor = 1e-2 * scale.view(-1, 1, 1, 1)
+    return ((prediction - target).abs() / (prediction.abs() + target.abs() + floor)).mean((1, 2, 3))
+
+
+def relmse(prediction: Tensor, target: Tensor, scale: Tensor, epsilon: float = 0.1, limit: float = 4.0) -> Tensor:
+    """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``.
+
+    Parameters
+    ----------
+    prediction, target : Tensor
+        ``(N, C, H, W)``.
+    scale : Tensor
+        ``(N,)``.
+    epsilon : float
+        Floor of the denominator in squared scales: pixels darker than ``sqrt(ε) s`` count by absolute error.
+    limit : float
+        Relative error beyond which the square goes on as a straight line (Huber), so that one firefly in a
+        target is not the whole gradient. ``inf`` for the pure, unbiased square.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
+
+    Notes
+    -----
+    ``d̄`` is the mean of the prediction over the channels, without gradient: dividing by each channel would let
+    dark channels of saturated colors rule.
+
+    References
+    ----------
+    Lehtinen et al. 2018, "Noise2Noise", section 3.3, arXiv:1803.04189.
+    """
+    level = prediction.detach().mean(1, keepdim=True)
+    relative = (prediction - target) * torch.rsqrt(level**2 + epsilon * scale.view(-1, 1, 1, 1) ** 2)
+    size = relative.abs()
+    # Quadratic inside the limit, tangent outside. The minimum keeps an infinite limit from making inf − inf.
+    inside = size.clamp(max=limit)
+    return (inside * (2 * size - inside)).mean((1, 2, 3))
+
+
+def frame_pairs(frames: int) -> list[tuple[int, int]]:
+    """Pairs of one frame before the centre and one after: first + fourth and second + fifth of five.
+
+    Of any odd window of 2k + 1 frames the pairs ``(i, i + k + 1)``, i < k: each side frame occurs once.
+    """
+    half = frames // 2
+    return [(i, i + half + 1) for i in range(half)]
+
+
+def temporal_loss(
+    loss: ImageLoss,
+    numerators: Tensor,
+    denominators: Tensor,
+    color: Tensor,
+    target: Tensor,
+    modulation: Tensor,
+    scale: Tensor,
+    whole: float = 0.0,
+) -> Tensor:
+    """Spatial loss converted to a temporal one: the target is predicted from parts of the window.
+
+    Parameters
+    ----------
+    loss : callable
+        Image loss of this module.
+    numerators, denominators : Tensor
+        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` from `network.kernels.filter_window`.
+    color : Tensor
+        ``(N, T, C, H, W)`` aligned irradiance: what a subset to which the kernels give no weight falls back to.
+    target : Tensor
+        ``(N, C, H, W)`` radiance of the centre.
+    modulation : Tensor
+        ``(N, C, H, W)``: radiance is irradiance times modulation.
+    scale : Tensor
+        ``(N,)`` exposure of the irradiance.
+    whole : float
+        Weight of the term of the whole window; the others have weight 1. The paper uses it only to train a model
+        further, and downweighted, because on its own it leads away from using time.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)`` weighted mean of the terms.
+
+    Notes
+    -----
+    Terms: the centre; each of `frame_pairs`; the whole window. A subset's image is the mean of its taps: the
+    kernels of the other frames are zeroed and the rest renormalised. An estimate of the centre belongs to the
+    centre's term and the whole's.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 5.
+    """
+    frames = numerators.shape[1]
+    # Scale of the radiance; a black modulation (no albedo anywhere) would make it 0.
+    radiance = scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
+    total = torch.zeros_like(scale)
+    terms = [((frames // 2,), 1.0), *((pair, 1.0) for pair in frame_pairs(frames))]
+    if whole:
+        terms.append((tuple(range(frames)), whole))
+    for subset, weight in terms:
+        index = list(subset)
+        fallback = color[:, frames // 2] if frames // 2 in subset else color[:, index].mean(1)
+        image = mean_of(numerators[:, index], denominators[:, index], fallback, SUBSET_EPSILON)
+        total = total + weight * loss(image * modulation, target, radiance)
+    return total / sum(weight for _, weight in terms)
+
+
+def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio on ``x / (1 + x)``, ``(N, C, H, W)`` radiance to ``(N,)`` dB.
+
+    Negative radiance counts as 0. The peak is 1, the limit of the curve.
+    """
+    error = functional.relu(prediction) / (1 + functional.relu(prediction))
+    error = error - functional.relu(target) / (1 + functional.relu(target))
+    return -10 * torch.log10(error.square().mean((1, 2, 3)).clamp_min(1e-12))
