@@ -18,6 +18,8 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
+import OpenEXR
 from mathutils import Vector
 
 
@@ -33,6 +35,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
     parser.add_argument("--reference", type=int, default=0, help="samples of the reference; 0: none")
     parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
+    parser.add_argument("--compact", action="store_true", help="all channels as half, without the denoising depth")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args(argv)
@@ -86,8 +89,14 @@ def add_mover(scene: bpy.types.Scene, rng: random.Random, film: str, size: str, 
     depth = rng.uniform(0.4, 0.8) * distance
     plane = (top_left + x * right + y * down - eye).length
     pixel = right.length / film_w * depth / plane  # world units per film pixel there
-    add = rng.choice([bpy.ops.mesh.primitive_monkey_add, bpy.ops.mesh.primitive_torus_add,
-                      bpy.ops.mesh.primitive_cube_add, bpy.ops.mesh.primitive_uv_sphere_add])
+    add = rng.choice(
+        [
+            bpy.ops.mesh.primitive_monkey_add,
+            bpy.ops.mesh.primitive_torus_add,
+            bpy.ops.mesh.primitive_cube_add,
+            bpy.ops.mesh.primitive_uv_sphere_add,
+        ]
+    )
     add(location=eye + direction * depth)
     mover = bpy.context.active_object
     mover.scale = Vector((1, 1, 1)) * pixel * rng.uniform(0.12, 0.3) * h
@@ -144,6 +153,19 @@ def render_level(scene: bpy.types.Scene, folder: Path, name: str, spp: int, fram
         partial.rename(path)
 
 
+def compact(path: Path) -> None:
+    """Write a file again as half and without the second depth: a third of the size, for shots in a repository."""
+    source = OpenEXR.File(str(path), separate_channels=True)
+    channels = {
+        name: OpenEXR.Channel(channel.pixels.clip(-65504, 65504).astype(np.float16))
+        for name, channel in source.channels().items()
+        if "Denoising Depth" not in name
+    }
+    partial = path.with_name(f".{os.getpid()}-{path.name}")
+    OpenEXR.File(source.header() | {"compression": OpenEXR.ZIP_COMPRESSION}, channels).write(str(partial))
+    partial.rename(path)
+
+
 def main(argv: list[str]) -> int:
     options = parse_arguments(argv)
     if not options.scene.is_file():
@@ -168,6 +190,9 @@ def main(argv: list[str]) -> int:
         scene.view_layers[0].cycles.denoising_store_passes = False
         scene.view_layers[0].use_pass_z = scene.view_layers[0].use_pass_vector = False
         render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)
+    if options.compact:
+        for path in sorted(out.glob("*.exr")):
+            compact(path)
     return 0
 
 

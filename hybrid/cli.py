@@ -54,7 +54,7 @@ def inspect(
     from rich.console import Console
     from rich.table import Table
 
-    from hybrid.frames import describe_layers
+    from hybrid.exr import describe_layers
     from hybrid.plan import EFFECTS
 
     console = Console()

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.exr import Layer, write_exr
-from hybrid.frames import Shot
+from hybrid.frames import Shot, output_path
 from hybrid.plan import Plan
 from hybrid.pseudo_reference import AlignedWindow, Aligner
 from hybrid.timing import Timings
@@ -95,29 +94,13 @@ def denoise_shot(
     """
     timings = timings or Timings()
     aligner = Aligner(shot, plan.effects, radius=radius, interpolation=interpolation, timings=timings)
-    paths = {number: shot.output_path(str(output), number) for number in shot.numbers}
+    paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
     for number, path in paths.items():
         aligned = aligner.align(number)
         denoised = estimator(aligned)
         with timings.stage("write"):
-            clamped = write_frame(shot, number, path, denoised, attributes)
+            images = {"color": denoised.color, **denoised.aovs}
+            clamped = shot.write(path, number, images, denoised.extra, attributes)
         yield Finished(number, path, aligned.repaired, aligned.outliers, clamped)
-
-
-def write_frame(
-    shot: Shot, number: int, path: Path, denoised: Denoised, attributes: Mapping[str, str] | None = None
-) -> int:
-    """Write one frame: its input with the denoised channels replaced; return how many values a half cut off."""
-    layers = shot.layers(number)
-    # Where the renderer has denoised already, its picture is what the user looks at; the noisy one stays as it is.
-    target = layers.estimate or layers.color
-    replaced = _channels(target, denoised.color)
-    for name, image in denoised.aovs.items():
-        replaced |= _channels(shot.source(number).layer(name), image)
-    return write_exr(path, shot.source(number), replaced, denoised.extra, attributes)
-
-
-def _channels(layer: Layer, image: Array) -> dict[str, Array]:
-    return {name: image[..., index] for index, name in enumerate(layer.channels[: image.shape[-1]])}

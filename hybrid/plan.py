@@ -271,7 +271,7 @@ def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -
 
 
 def _outlier_share(frame: PreparedFrame) -> float:
-    _, rejected = reject_outliers(frame.irradiance[None])
+    _, rejected = reject_outliers(frame.irradiance[None], frame.valid[None].astype(np.float32))
     return float(np.mean(rejected))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from flow.confidence import estimate_confidence, mix_centre
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
-from nlm.variance import prefilter_guides, variance_from_window
+from nlm.variance import prefilter_guide, variance_from_window
 from numpy.typing import NDArray
 
 from flow.motion import Motion, compose_flow, invert_flow, normalize_motion
@@ -197,7 +197,7 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
 
 def _estimate_alone(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
     """Estimate one frame cheaply: what the gate and the flow compare must not be noise."""
-    clean, _ = reject_outliers(irradiance[None])
+    clean, _ = reject_outliers(irradiance[None], np.ones((1, *irradiance.shape[:2]), np.float32))
     guides = [layer for layer in (albedo, normal) if layer is not None]
     if guides:
         return guided_filter(clean[0], np.concatenate(guides, axis=-1), radius=5, eps=1e-3, subsample=2)
@@ -377,7 +377,7 @@ class Aligner:
         clean_albedo, guide = centre.albedo, centre.guide
         if guide is not None and "prefilter" in self.effects:
             layers = [layer for layer in (albedo, normal) if layer is not None]
-            guide = prefilter_guides(np.concatenate(layers, axis=-1), confidence)
+            guide = prefilter_guide(np.concatenate(layers, axis=-1), confidence)
             clean_albedo = None if albedo is None else guide[..., :3]
         modulation = np.ones_like(color[0])
         if clean_albedo is not None and "demodulate" in self.effects:

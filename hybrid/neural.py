@@ -1,0 +1,178 @@
+"""The boundary to torch: layout, tiles, precision; kernels go in, images come out.
+
+The only module outside `network` that imports torch. Here HWC becomes NCHW, and nowhere else at run time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from network.checkpoint import load_model
+from numpy.typing import NDArray
+
+import network
+from hybrid.pipeline import Denoised
+from hybrid.pseudo_reference import BALANCED, AlignedWindow, estimate
+from hybrid.timing import Timings
+from network.inputs import window_exposure
+from network.models import denoise_tile, for_inference
+
+Array = NDArray[np.float32]
+
+# The classical estimate that the shipped weights were trained beside, and are given as a further tap.
+ESTIMATE = BALANCED
+# Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
+# on a trained net is below half a float's precision.
+HALO = 32
+PRECISIONS = ("auto", "float32", "bfloat16")
+
+
+def shipped_weights(preset: str) -> Path:
+    """Path of the weights that come with the package.
+
+    Raises
+    ------
+    ValueError
+        If there is no such preset; names those there are.
+    """
+    folder = Path(network.__file__).parent / "weights"
+    path = folder / f"{preset}.safetensors"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
+        raise ValueError(f"preset is {preset!r}, expected one of: {known}")
+    return path
+
+
+def has_bfloat16() -> bool:
+    """Whether this processor computes in bfloat16 faster than in float32 (AVX-512 bf16 or AMX)."""
+    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
+class Denoiser:
+    """Runs a Robust Average network on aligned windows; an estimator for `hybrid.pipeline.denoise_shot`.
+
+    Parameters
+    ----------
+    weights : Path
+        A file written by training.
+    tile : int
+        Side of the squares that the network sees at once, pixels; a `HALO` is added around each.
+    precision : str
+        One of `PRECISIONS`; "auto" takes bfloat16 where the processor has it.
+    threshold : float, optional
+        t·K of the kernels, in [0, 1); higher stays closer to the input. Without: what it was trained with.
+    timings : Timings, optional
+        Where to count the stages of the estimate, and "network".
+
+    Raises
+    ------
+    ValueError
+        A bad option, or a file that holds no such model.
+    """
+
+    def __init__(
+        self,
+        weights: Path,
+        *,
+        tile: int = 256,
+        precision: str = "auto",
+        threshold: float | None = None,
+        timings: Timings | None = None,
+    ) -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision is {precision!r}, expected one of {', '.join(PRECISIONS)}")
+        if tile < 16:
+            raise ValueError(f"tile is {tile}, expected at least 16 pixels")
+        if threshold is not None and not 0 <= threshold < 1:
+            raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
+        half = precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+        self.model = for_inference(load_model(weights), half)
+        self.tile = tile
+        self.threshold = threshold
+        self.timings = timings or Timings()
+
+    @property
+    def radius(self) -> int:
+        """Frames on each side that the network looks at."""
+        return self.model.config.kernel.frames // 2
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of an aligned window."""
+        given = None
+        if self.model.config.kernel.estimate_frames:
+            given = estimate(aligned, ESTIMATE, timings=self.timings)
+        with self.timings.stage("network"):
+            return self._run(aligned, given)
+
+    def _run(self, aligned: AlignedWindow, given: Array | None) -> Denoised:
+        color = aligned.mixed(aligned.color)
+        height, width = color.shape[1:3]
+        layers: dict[str, Array | None] = {
+            "color": color,
+            "albedo": None if aligned.albedo is None else aligned.mixed(aligned.albedo),
+            "normal": None if aligned.normal is None else aligned.mixed(aligned.normal),
+            "confidence": aligned.confidence[..., None],
+            "estimate": None if given is None else (given / aligned.modulation)[None],
+        }
+        if aligned.aovs:
+            layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
+        exposure = window_exposure(_tensor(color))
+        irradiance = np.empty(color.shape[1:], np.float32)
+        channels = 0 if layers.get("aovs") is None else sum(layer.shape[-1] for layer in aligned.aovs.values())
+        filtered = np.empty((height, width, channels), np.float32)
+        for inner, outer, offset in _tiles(height, width, self.tile, self.model.multiple):
+            cut = {
+                name: None if a is None else _tensor(_pad(a[:, *outer], self.model.multiple))
+                for name, a in layers.items()
+            }
+            out, _, aovs = denoise_tile(self.model, exposure=exposure, threshold=self.threshold, **cut)
+            irradiance[inner] = _image(out)[offset]
+            if aovs is not None:
+                filtered[inner] = _image(aovs)[offset]
+        aovs_out, start = {}, 0
+        for name, layer in aligned.aovs.items():
+            stop = start + layer.shape[-1]
+            modulation = aligned.modulation if stop - start == 3 else aligned.modulation.mean(axis=-1, keepdims=True)
+            aovs_out[name] = filtered[..., start:stop] * modulation
+            start = stop
+        return Denoised(irradiance * aligned.modulation, aovs_out)
+
+
+def _tensor(window: Array) -> torch.Tensor:
+    """(T, H, W, C) to (1, T, C, H, W)."""
+    return torch.from_numpy(np.ascontiguousarray(window.transpose(0, 3, 1, 2)))[None]
+
+
+def _image(tensor: torch.Tensor) -> Array:
+    """(1, C, H, W) to (H, W, C)."""
+    return tensor[0].permute(1, 2, 0).float().numpy()
+
+
+def _pad(window: Array, multiple: int) -> Array:
+    """Repeat the last row and column until height and width are what the network needs."""
+    bottom, right = (-window.shape[1] % multiple, -window.shape[2] % multiple)
+    return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
+
+
+Block = tuple[slice, slice]
+
+
+def _tiles(height: int, width: int, tile: int, multiple: int) -> Iterator[tuple[Block, Block, Block]]:
+    """Cover the image: where each tile's result goes, what it is computed from, and where in that the result is."""
+    # The halo starts on a multiple, so that every tile samples its coarse scales where the whole image would.
+    halo = -(-HALO // multiple) * multiple
+    tile = -(-tile // multiple) * multiple
+    for top in range(0, height, tile):
+        for left in range(0, width, tile):
+            inner, outer, offset = [], [], []
+            for start, size in ((top, height), (left, width)):
+                stop = min(start + tile, size)
+                first, last = max(start - halo, 0), min(stop + halo, size)
+                inner.append(slice(start, stop))
+                outer.append(slice(first, last))
+                offset.append(slice(start - first, stop - first))
+            yield (inner[0], inner[1]), (outer[0], outer[1]), (offset[0], offset[1])

@@ -1,0 +1,70 @@
+"""The walls of the house: who may import whom, and what starts without torch."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+OURS = {"flow", "nlm", "network", "hybrid"}
+
+
+def imports(path: Path) -> set[str]:
+    """Top-level names of all modules that a file imports, wherever in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("package", ["flow", "nlm", "network"])
+def test_packages_of_arrays_import_none_of_ours(package):
+    for path in (ROOT / package).rglob("*.py"):
+        assert not (imports(path) & OURS) - {package}, path.name
+
+
+def test_only_neural_imports_torch_and_the_network():
+    files = [path for package in ("flow", "nlm", "hybrid") for path in (ROOT / package).rglob("*.py")]
+    assert len(files) > 10
+    assert [path.name for path in files if imports(path) & {"torch", "network", "safetensors"}] == ["neural.py"]
+
+
+def test_the_core_imports_no_peer_at_start():
+    """Importing the command must not load what only some of its commands need."""
+    code = "import sys, hybrid, hybrid.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "typer" in loaded
+    assert not {"torch", "numba", "cv2", "skimage", "OpenEXR", "bpy", "oidn"} & set(loaded)
+
+
+WITHOUT_TORCH = """
+import sys
+for name in ("torch", "safetensors"):
+    sys.modules[name] = None  # what Python does for a module that must not be imported
+from hybrid.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def without_torch(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT_TORCH, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def test_inspect_and_pseudoref_work_without_torch(shot_folder, tmp_path):
+    assert without_torch("inspect", str(shot_folder)).returncode == 0
+    done = without_torch("pseudoref", str(shot_folder), "-o", str(tmp_path), "--preset", "draft")
+    assert done.returncode == 0, done.stderr
+    assert len(list(tmp_path.glob("*.exr"))) == 3
+
+
+def test_denoise_without_torch_says_how_to_get_it(shot_folder, tmp_path):
+    done = without_torch("denoise", str(shot_folder), "-o", str(tmp_path))
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("error: torch is not installed")
+    assert "ravg[neural]" in done.stderr
