@@ -1,0 +1,508 @@
+"""What is in a scene, and which of Cycles' effects that calls for.
+
+`facts_of` reads a Blender scene into plain numbers, `effects_of` turns the numbers into decisions, each with
+its figure, threshold and reason, and `needed_bounces` measures with a few samples how deep the light paths
+have to be. Only `facts_of` needs Blender: the rules are plain functions of plain data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+# Cycles' own "Full Global Illumination" preset, and everything else that a scene might need, switched on.
+DEEP = 32
+EVERYTHING: dict[str, Any] = {
+    "cycles.max_bounces": DEEP,
+    "cycles.diffuse_bounces": DEEP,
+    "cycles.glossy_bounces": DEEP,
+    "cycles.transmission_bounces": DEEP,
+    "cycles.volume_bounces": DEEP,
+    "cycles.transparent_max_bounces": DEEP,
+    "cycles.caustics_reflective": True,
+    "cycles.caustics_refractive": True,
+    "cycles.use_light_tree": True,
+    "world.cycles.sampling_method": "AUTOMATIC",
+    "layer.use_pass_position": True,
+    "layer.use_pass_normal": True,
+    "layer.use_pass_mist": True,
+    "layer.use_pass_uv": True,
+    "layer.use_pass_object_index": True,
+    "layer.cycles.pass_debug_sample_count": True,
+}
+BOUNCE_KINDS = ("diffuse", "glossy", "transmission", "volume")
+
+BLUR_PIXELS = 0.1  # a tenth of the pixel filter's width cannot be seen through it
+SMALL_LIGHT = 0.1  # radius over distance to what is seen: below, a reflection of it is a caustic
+MIRROR_ROUGHNESS = 0.2  # at roughness 0.2 the lobe is some 5° wide: light it focuses is still sharp
+TREE_LIGHTS = 2  # with one light there is nothing to choose between
+
+# What a truncated path may cost: each kind of bounce a fifth of the 0.5 % that the whole may change the mean,
+# and a tenth of the noise, which a two-seed test of ten frames cannot tell from nothing.
+MEAN_FRACTION = 0.001
+NOISE_FRACTION = 0.1
+PROBES = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)  # depths tried, the shallowest that is enough is taken
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What is in a scene, as seen by one camera over one range of frames.
+
+    Materials are counted once each, and only if an object that renders uses them. Everything moves, blurs and
+    measures in pixels of the rendered picture.
+    """
+
+    motion_pixels: float = 0.0  # fastest, per frame, of what the camera sees
+    moving_lights: int = 0
+    blur_asked: bool = False
+    shutter: float = 0.5  # frames
+    aperture_pixels: float = 0.0  # largest circle of confusion in the picture
+    glossy: int = 0  # materials with any glossy lobe
+    mirrors: int = 0  # of these, those smoother than MIRROR_ROUGHNESS
+    transmissive: int = 0
+    transparent: int = 0  # alpha below one: leaves, curtains
+    subsurface: int = 0
+    volumes: int = 0  # materials, and the world
+    hair: int = 0  # objects
+    lights: int = 0  # lamps, emissive objects, and the world where it shines
+    small_lights: int = 0  # smaller than SMALL_LIGHT times their distance
+    world: str = "none"  # none, constant, image, sky
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if isinstance(value, int | float) and value < 0:
+                raise ValueError(f"SceneFacts.{name}: got {value}, expected nothing below 0")
+        if self.world not in ("none", "constant", "image", "sky"):
+            raise ValueError(f"SceneFacts.world: got {self.world!r}, expected none, constant, image or sky")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One effect, whether the scene calls for it, why, and what it sets in Cycles."""
+
+    effect: str
+    on: bool
+    figure: float | str
+    threshold: float | str
+    reason: str
+    settings: dict[str, Any]
+
+    def __str__(self) -> str:
+        figure = f"{self.figure:.3g}" if isinstance(self.figure, float) else self.figure
+        return f"{'+' if self.on else '-'} {self.effect:<15} {figure} (threshold {self.threshold}): {self.reason}"
+
+
+def effects_of(facts: SceneFacts) -> list[Decision]:
+    """Decide which effects a scene calls for.
+
+    Parameters
+    ----------
+    facts
+        What is in the scene.
+
+    Returns
+    -------
+    list of Decision
+        One per effect. Their settings, one after the other over `EVERYTHING`, configure Cycles; `needed_bounces`
+        then lowers the depths that are left.
+
+    Notes
+    -----
+    Every rule here leaves the picture as it is: a kind of bounce is given depth 0 only where no material could
+    cause it. Whether a *possible* bounce is worth its time is for `needed_bounces` to measure.
+    """
+    blurred = facts.motion_pixels * facts.shutter
+    passes = {name: False for name in EVERYTHING if name.startswith("layer.")}
+    focusing = facts.mirrors + facts.transmissive
+    return [
+        Decision(
+            "motion blur",
+            facts.blur_asked and (blurred >= BLUR_PIXELS or facts.moving_lights > 0),
+            float(blurred),
+            f"{BLUR_PIXELS:g} px",
+            ("moves while the shutter is open" if blurred >= BLUR_PIXELS or facts.moving_lights else "nothing moves")
+            if facts.blur_asked
+            else "not asked for",
+            {"render.use_motion_blur": facts.blur_asked and (blurred >= BLUR_PIXELS or facts.moving_lights > 0)},
+        ),
+        Decision(
+            "depth of field",
+            facts.aperture_pixels >= BLUR_PIXELS,
+            float(facts.aperture_pixels),
+            f"{BLUR_PIXELS:g} px",
+            "circle of confusion of the most blurred thing in the picture",
+            {"camera.dof.use_dof": facts.aperture_pixels >= BLUR_PIXELS},
+        ),
+        _counted("glossy paths", facts.glossy, "materials with a glossy lobe", {"cycles.glossy_bounces": 0}),
+        _counted(
+            "transmission",
+            facts.transmissive,
+            "materials that light goes through",
+            {"cycles.transmission_bounces": 0},
+        ),
+        Decision(
+            "caustics",
+            facts.glossy + facts.transmissive > 0,
+            facts.glossy + facts.transmissive,
+            1,
+            "no surface reflects or refracts light onto another"
+            if facts.glossy + facts.transmissive == 0
+            else f"{focusing} mirror-like or refractive materials, {facts.small_lights} small lights; kept, as a "
+            "pilot of few samples cannot find rare paths",
+            {
+                "cycles.caustics_reflective": facts.glossy > 0,
+                "cycles.caustics_refractive": facts.transmissive > 0,
+            },
+        ),
+        _counted(
+            "transparency",
+            facts.transparent,
+            "materials with alpha below one",
+            {"cycles.transparent_max_bounces": 0},
+        ),
+        _counted("volumes", facts.volumes, "materials with a volume, or the world", {"cycles.volume_bounces": 0}),
+        _counted("subsurface", facts.subsurface, "materials; Cycles needs no switch for it", {}),
+        _counted("hair", facts.hair, "objects; Cycles needs no switch for it", {}),
+        Decision(
+            "light tree",
+            facts.lights >= TREE_LIGHTS,
+            facts.lights,
+            TREE_LIGHTS,
+            "lights to choose between",
+            {"cycles.use_light_tree": facts.lights >= TREE_LIGHTS},
+        ),
+        Decision(
+            "sky",
+            facts.world != "none",
+            facts.world,
+            "shines",
+            "the world is sampled as a light" if facts.world != "none" else "the world is black",
+            {"world.cycles.sampling_method": "NONE" if facts.world == "none" else "AUTOMATIC"},
+        ),
+        Decision(
+            "more passes",
+            False,
+            len(passes),
+            "asked for",
+            "colour, guides, depth and vectors are enough",
+            passes,
+        ),
+    ]
+
+
+def _counted(effect: str, count: int, what: str, off: dict[str, Any]) -> Decision:
+    return Decision(effect, count > 0, count, 1, what if count else f"no {what}", {} if count else off)
+
+
+def settings_of(decisions: Iterable[Decision], base: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return the Cycles settings that `decisions` ask for, over `base` (everything on)."""
+    settings = dict(EVERYTHING if base is None else base)
+    for decision in decisions:
+        settings.update(decision.settings)
+    return settings
+
+
+def needed_bounces(
+    render: Callable[[dict[str, Any], int], np.ndarray],
+    settings: dict[str, Any],
+    samples: int,
+    target_samples: int,
+) -> list[Decision]:
+    """Measure how many bounces of each kind the picture needs.
+
+    Parameters
+    ----------
+    render
+        `render(settings, seed)` gives a small picture, (H, W, 3) float32 linear radiance, of `samples` samples per
+        pixel. The same seed must give the same paths.
+    settings
+        As `settings_of` returns them.
+    samples, target_samples
+        Samples per pixel of the pilot, and of the cleanest picture that is going to be rendered.
+
+    Returns
+    -------
+    list of Decision
+        One per kind of bounce that is still possible, and one for paths as a whole.
+
+    Notes
+    -----
+    With one seed, a picture of depth d and one of unlimited depth share all paths up to d, so their difference is
+    the light that comes from deeper, without the noise of the rest. A depth is enough if
+
+        |mean(Δ)| ≤ MEAN_FRACTION · mean(I)   and   mean_b |Δ_b| ≤ NOISE_FRACTION · mean |A − B| / √2 · √(s/n)
+
+    with Δ_b the means of 8×8 blocks, A and B two seeds, s and n the samples of the pilot and of the picture. First
+    moments, because one firefly would drown the second ones.
+    """
+    if samples < 1 or target_samples < 1:
+        raise ValueError(f"samples: got {samples} and {target_samples}, expected at least 1")
+    full = render(settings, 1)
+    noise = float(np.mean(np.abs(full - render(settings, 2)))) / np.sqrt(2) * np.sqrt(samples / target_samples)
+    mean = float(np.mean(full))
+
+    def lost(complete: np.ndarray, trial: dict[str, Any]) -> tuple[float, float]:
+        """Return what the trial's picture misses, as fractions of the mean and of the noise."""
+        missing = complete - render(trial, 1)
+        # A black picture has nothing to lose, and would give 0/0.
+        return (
+            abs(float(missing.mean())) / mean if mean > 0 else 0.0,
+            float(np.abs(_block_means(missing)).mean()) / noise if noise > 0 else 0.0,
+        )
+
+    decisions: list[Decision] = []
+    lean = dict(settings)
+    for kind in (*BOUNCE_KINDS, "transparent", "max"):
+        name = "cycles.transparent_max_bounces" if kind == "transparent" else f"cycles.{kind}_bounces"
+        if settings[name] == 0:
+            continue
+        # The kinds are judged one by one, each against everything; the whole against what the kinds have left.
+        base, complete = (lean, render(lean, 1)) if kind == "max" else (settings, full)
+        depths = [depth for depth in PROBES if depth < settings[name]]
+        low, high, figures = 0, len(depths), (0.0, 0.0)
+        while low < high:  # what is missing falls with the depth: bisection
+            middle = (low + high) // 2
+            trial = lost(complete, {**base, name: depths[middle]})
+            if trial[0] <= MEAN_FRACTION and trial[1] <= NOISE_FRACTION:
+                high, figures = middle, trial
+            else:
+                low = middle + 1
+        enough = depths[high] if high < len(depths) else settings[name]
+        lean[name] = enough
+        decisions.append(
+            Decision(
+                f"{kind} bounces" if kind != "max" else "all bounces",
+                enough > 0,
+                enough,
+                f"{100 * MEAN_FRACTION:g} % of the mean, {NOISE_FRACTION:g} of the noise",
+                f"deeper paths bring {100 * figures[0]:.2g} % of the mean, {figures[1]:.2g} of the noise",
+                {name: enough},
+            )
+        )
+    return decisions
+
+
+def _block_means(image: np.ndarray, size: int = 8) -> np.ndarray:
+    """Return the means of whole blocks of an (H, W, C) image; of all of it where it is smaller than one."""
+    h, w = (max(n // size, 1) * size if n >= size else n for n in image.shape[:2])
+    bh, bw = min(size, h), min(size, w)
+    return np.asarray(image[:h, :w].reshape(h // bh, bh, w // bw, bw, -1).mean(axis=(1, 3)))
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Reading a Blender scene
+
+
+def facts_of(scene: Any, frames: Iterable[int], blur_asked: bool = False) -> SceneFacts:
+    """Read from a Blender scene what is in it.
+
+    Parameters
+    ----------
+    scene
+        A `bpy.types.Scene` with a camera.
+    frames
+        The frames that will be rendered.
+    blur_asked
+        Whether motion blur is wanted, if anything moves.
+    """
+    frames = list(frames)
+    scene.frame_set(frames[len(frames) // 2])
+    objects = [item for item in scene.objects if not item.hide_render]
+    kinds = ("glossy", "mirrors", "transmissive", "transparent", "subsurface", "volumes")
+    counts = dict.fromkeys(kinds, 0)
+    emissive: set[str] = set()
+    for material in {slot.material for item in objects for slot in item.material_slots if slot.material}:
+        lobes = _lobes(material.node_tree)
+        if "emission" in lobes:
+            emissive.add(material.name)
+        for kind in kinds:
+            counts[kind] += kind in lobes
+    eye = scene.camera.matrix_world.translation
+    lamps = [item for item in objects if item.type == "LIGHT" and item.data.energy > 0]
+    glowing = [o for o in objects if any(s.material and s.material.name in emissive for s in o.material_slots)]
+    small = sum(_radius(item) < SMALL_LIGHT * (item.matrix_world.translation - eye).length for item in lamps)
+    world = _world_kind(scene.world)
+    if scene.world is not None and scene.world.node_tree is not None:
+        counts["volumes"] += "volumes" in _lobes(scene.world.node_tree)
+    motion, moving_lights = _motion(scene, frames)
+    return SceneFacts(
+        motion_pixels=motion,
+        moving_lights=moving_lights,
+        blur_asked=blur_asked,
+        shutter=scene.render.motion_blur_shutter,
+        aperture_pixels=_circle_of_confusion(scene) if scene.camera.data.dof.use_dof else 0.0,
+        hair=sum(o.type == "CURVES" or len(getattr(o, "particle_systems", ())) > 0 for o in objects),
+        lights=len(lamps) + len(glowing) + (world != "none"),
+        small_lights=small,
+        world=world,
+        **counts,
+    )
+
+
+# What each shader node can do to light. The Principled one is looked at input by input.
+LOBES: dict[str, set[str]] = {
+    "BSDF_GLOSSY": {"glossy"},
+    "BSDF_METALLIC": {"glossy"},
+    "BSDF_GLASS": {"glossy", "transmissive"},
+    "BSDF_REFRACTION": {"transmissive"},
+    "BSDF_TRANSLUCENT": {"transmissive"},
+    "BSDF_TRANSPARENT": {"transparent"},
+    "BSDF_SHEEN": {"glossy"},
+    "BSDF_HAIR": {"glossy", "transmissive"},
+    "BSDF_HAIR_PRINCIPLED": {"glossy", "transmissive"},
+    "SUBSURFACE_SCATTERING": {"subsurface"},
+    "EMISSION": {"emission"},
+    "VOLUME_SCATTER": {"volumes"},
+    "VOLUME_ABSORPTION": {"volumes"},
+    "PRINCIPLED_VOLUME": {"volumes"},
+    "VOLUME_COEFFICIENTS": {"volumes"},
+}
+PRINCIPLED = {
+    "Metallic": "glossy",
+    "Specular IOR Level": "glossy",
+    "Coat Weight": "glossy",
+    "Sheen Weight": "glossy",
+    "Transmission Weight": "transmissive",
+    "Subsurface Weight": "subsurface",
+    "Emission Strength": "emission",
+}
+
+
+def _lobes(tree: Any) -> set[str]:
+    """Return what the shaders of a node tree, and of the groups in it, can do to light."""
+    found: set[str] = set()
+    for node in tree.nodes if tree is not None else ():
+        if node.type == "GROUP":
+            found |= _lobes(node.node_tree)
+            continue
+        if node.mute or not any(output.is_linked for output in node.outputs):
+            continue
+        lobes = set(LOBES.get(node.type, ()))
+        if node.type == "BSDF_PRINCIPLED":
+            lobes |= {lobe for name, lobe in PRINCIPLED.items() if _largest(node.inputs[name]) > 0}
+            if node.inputs["Alpha"].is_linked or node.inputs["Alpha"].default_value < 1:
+                lobes.add("transparent")
+        rough = node.inputs.get("Roughness")
+        sharp = rough is not None and not rough.is_linked and rough.default_value < MIRROR_ROUGHNESS
+        if sharp and lobes & {"glossy", "transmissive"}:
+            lobes.add("mirrors")
+        found |= lobes
+    return found
+
+
+def _largest(socket: Any) -> float:
+    return 1.0 if socket.is_linked else float(socket.default_value)
+
+
+def _radius(lamp: Any) -> float:
+    """Return the radius of a lamp; of a sun, as seen from a distance of one."""
+    data = lamp.data
+    if data.type == "SUN":
+        return float(data.angle / 2)
+    if data.type == "AREA":
+        return float(data.size / 2)
+    return float(data.shadow_soft_size)
+
+
+def _world_kind(world: Any) -> str:
+    if world is None:
+        return "none"
+    if world.node_tree is None:
+        return "constant" if max(world.color) > 0 else "none"
+    types = {node.type for node in world.node_tree.nodes if any(output.is_linked for output in node.outputs)}
+    if "TEX_SKY" in types:
+        return "sky"
+    if "TEX_ENVIRONMENT" in types:
+        return "image"
+    for node in world.node_tree.nodes:
+        if node.type in ("BACKGROUND", "EMISSION") and node.outputs[0].is_linked:
+            color, strength = node.inputs["Color"], node.inputs["Strength"]
+            if _largest(strength) > 0 and (color.is_linked or max(color.default_value[:3]) > 0):
+                return "constant"
+    return "none"
+
+
+def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[Any, Any]]:
+    """Return where a grid of camera rays over the rendered region meets the scene, and which object it is."""
+    import bpy
+
+    render, camera = scene.render, scene.camera
+    x0, x1, y0, y1 = 0.0, 1.0, 0.0, 1.0
+    if render.use_border:
+        x0, x1, y0, y1 = render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y
+    top_right, bottom_right, bottom_left, _ = (camera.matrix_world @ v for v in camera.data.view_frame(scene=scene))
+    eye = camera.matrix_world.translation
+    graph = bpy.context.evaluated_depsgraph_get()
+    found = []
+    for j in range(down):
+        for i in range(across):
+            x, y = x0 + (x1 - x0) * (i + 0.5) / across, y0 + (y1 - y0) * (j + 0.5) / down
+            target = bottom_left + x * (bottom_right - bottom_left) + y * (top_right - bottom_right)
+            hit, position, _, _, item, _ = scene.ray_cast(graph, eye, (target - eye).normalized())
+            if hit:
+                found.append((position.copy(), item))
+    return found
+
+
+def film_pixel(scene: Any, position: Any) -> np.ndarray:
+    """Return where a point in the world lies in the whole picture, in pixels; nan if behind the camera."""
+    from bpy_extras.object_utils import world_to_camera_view
+
+    render = scene.render
+    scale = render.resolution_percentage / 100
+    view = world_to_camera_view(scene, scene.camera, position)
+    if view.z <= 0:
+        return np.full(2, np.nan)
+    return np.array([view.x * render.resolution_x * scale, view.y * render.resolution_y * scale])
+
+
+def point_motion(scene: Any, frame: int, step: int = 1) -> np.ndarray:
+    """Return how far what the camera sees at `frame` moves until `frame + step`: (N,) pixels.
+
+    Points are carried by their objects' transforms; what deforms inside an object is not seen by this.
+    """
+    scene.frame_set(frame)
+    points = visible_points(scene)
+    local = [item.matrix_world.inverted_safe() @ position for position, item in points]
+    before = [film_pixel(scene, position) for position, _ in points]
+    scene.frame_set(frame + step)
+    after = [film_pixel(scene, item.matrix_world @ p) for p, (_, item) in zip(local, points, strict=True)]
+    scene.frame_set(frame)
+    moved = np.linalg.norm(np.array(after).reshape(-1, 2) - np.array(before).reshape(-1, 2), axis=1)
+    return np.asarray(moved[np.isfinite(moved)])
+
+
+def _motion(scene: Any, frames: list[int]) -> tuple[float, int]:
+    """Return the fastest motion in pixels per frame, and how many lights move."""
+    lamps = [item for item in scene.objects if item.type == "LIGHT" and not item.hide_render]
+    fastest, moving = 0.0, set()
+    for frame in sorted({frames[0], frames[len(frames) // 2], frames[-1]}):
+        motion = point_motion(scene, frame)
+        fastest = max(fastest, float(motion.max())) if motion.size else fastest
+        before = {lamp.name: (lamp.matrix_world.copy(), lamp.data.energy) for lamp in lamps}
+        scene.frame_set(frame + 1)
+        moving |= {lamp.name for lamp in lamps if (lamp.matrix_world, lamp.data.energy) != before[lamp.name]}
+        # A deforming mesh has no transform that tells: its keys do.
+        for item in scene.objects:
+            keys = getattr(item.data, "shape_keys", None) if item.type == "MESH" else None
+            waves = any(modifier.type in ("WAVE", "ARMATURE", "CLOTH") for modifier in item.modifiers)
+            if waves or (keys is not None and keys.animation_data is not None):
+                fastest = max(fastest, 1.0)  # unknown, but not nothing
+    scene.frame_set(frames[len(frames) // 2])
+    return fastest, len(moving)
+
+
+def _circle_of_confusion(scene: Any) -> float:
+    """Return the diameter of the largest circle of confusion in the picture, in pixels."""
+    camera, data = scene.camera, scene.camera.data
+    eye, forward = camera.matrix_world.translation, camera.matrix_world.to_3x3().col[2] * -1
+    focus = data.dof.focus_distance
+    if data.dof.focus_object is not None:
+        focus = (data.dof.focus_object.matrix_world.translation - eye).dot(forward)
+    lens = data.lens / 1000 / data.dof.aperture_fstop  # metres, as Cycles takes it
+    pixels = scene.render.resolution_x * scene.render.resolution_percentage / 100 / (data.sensor_width / data.lens)
+    distances = [max((position - eye).dot(forward), 1e-6) for position, _ in visible_points(scene)] or [1e6]
+    return max(lens * abs(1 / focus - 1 / distance) * pixels for distance in distances)

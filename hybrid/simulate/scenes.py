@@ -1,0 +1,362 @@
+"""Random shots, and shots of scenes from files. Every draw comes from the seed of the shot.
+
+A random shot is a *set* (room, studio, outdoors, night, wall), things in it, lights, a camera on a path, and a crop
+of its film-size picture. Units are metres, z is up. Brightness is left to `exposure`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from hybrid.simulate.effects import visible_points
+from hybrid.simulate.motion import MARGIN, add_motion, aim_crop, place_camera, set_crop
+from hybrid.simulate.shot import ShotSettings
+from hybrid.simulate.things import (
+    Rng,
+    add_box,
+    add_lamp,
+    add_mesh,
+    choose,
+    clutter,
+    color,
+    log_uniform,
+    material,
+    scatter,
+    set_world,
+    warm,
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """A point worth looking at, and where the camera may stand."""
+
+    focus: Vector
+    eye: Vector
+
+
+def room_set(rng: Rng) -> View:
+    """Build a room with windows, furniture and things on it; lit from outside, by lamps, or both."""
+    w, d, h = rng.uniform(3, 7), rng.uniform(4, 8), rng.uniform(2.4, 3.6)
+    walls, floor, ceiling = (
+        material(rng, "diffuse", True),
+        material(rng, None, True),
+        material(rng, "diffuse", True),
+    )
+    if floor.name.startswith(("glass", "emission", "mirror")):
+        floor = material(rng, "plastic", True)
+    add_box((0, 0, -0.05), (w + 0.4, d + 0.4, 0.1), floor)
+    add_box((0, 0, h + 0.05), (w + 0.4, d + 0.4, 0.1), ceiling)
+    add_box((0, d / 2 + 0.1, h / 2), (w + 0.4, 0.2, h), walls)
+    add_box((0, -d / 2 - 0.1, h / 2), (w + 0.4, 0.2, h), walls)
+    daylight = rng.random() < 0.7
+    for side in (-1, 1):
+        x = side * (w / 2 + 0.1)
+        if daylight and (side < 0 or rng.random() < 0.3):
+            sill, top, width = rng.uniform(0.2, 1.0), rng.uniform(1.9, h - 0.2), rng.uniform(1.0, d - 1)
+            add_box((x, 0, sill / 2), (0.2, d, sill), walls)
+            add_box((x, 0, (h + top) / 2), (0.2, d, h - top), walls)
+            for end in (-1, 1):
+                add_box((x, end * (d + width) / 4, (sill + top) / 2), (0.2, (d - width) / 2, top - sill), walls)
+            bars, frame = int(rng.integers(0, 14)), material(rng, "plastic")
+            across = rng.random() < 0.5
+            for k in range(bars):
+                t = (k + 0.5) / bars - 0.5
+                if across:
+                    add_box((x, 0, (sill + top) / 2 + t * (top - sill)), (0.08, width, 0.04), frame)
+                else:
+                    add_box((x, t * width, (sill + top) / 2), (0.08, 0.05, top - sill), frame)
+        else:
+            add_box((x, 0, h / 2), (0.2, d, h), walls)
+    if daylight:
+        set_world(rng, choose(rng, {"sky": 2, "image": 2, "constant": 1}), 1.0)
+        if rng.random() < 0.4:
+            aim = Vector((rng.uniform(0.4, 1), rng.uniform(-0.5, 0.5), -rng.uniform(0.3, 0.9)))
+            add_lamp("SUN", -10 * aim, log_uniform(rng, 2, 12), log_uniform(rng, 0.005, 0.05), (0, 0, 0), warm(rng))
+    else:
+        set_world(rng, "none", 0)
+    for _ in range(int(rng.integers(0 if daylight else 1, 5))):
+        lamp = choose(rng, {"AREA": 2, "POINT": 2, "SPOT": 1})
+        position = (rng.uniform(-0.4, 0.4) * w, rng.uniform(-0.4, 0.4) * d, h - rng.uniform(0.05, 0.8))
+        size = rng.uniform(0.2, 1.2) if lamp == "AREA" else log_uniform(rng, 0.01, 0.15)
+        add_lamp(lamp, position, log_uniform(rng, 10, 80), size, (position[0], position[1], 0), warm(rng))
+    wood = material(rng, "plastic")
+    x, y, height = rng.uniform(-0.15, 0.15) * w, rng.uniform(0, 0.25) * d, rng.uniform(0.4, 0.9)
+    tw, td = rng.uniform(1.0, 2.2), rng.uniform(0.7, 1.3)
+    add_box((x, y, height - 0.03), (tw, td, 0.06), wood)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            add_box((x + sx * (tw / 2 - 0.05), y + sy * (td / 2 - 0.05), height / 2), (0.06, 0.06, height), wood)
+    clutter(rng, (x, y, height), (tw / 2 - 0.1, td / 2 - 0.1), int(rng.integers(8, 22)), (0.07, 0.4))
+    clutter(rng, (0, 0, 0), (w / 2 - 0.4, d / 2 - 0.4), int(rng.integers(4, 14)), (0.2, 0.9))
+    shelf = material(rng, "plastic")
+    for k in range(int(rng.integers(0, 4))):
+        z = 0.8 + 0.5 * k
+        if z < h - 0.4:
+            add_box((x, d / 2 - 0.15, z), (rng.uniform(1, 3), 0.3, 0.03), shelf)
+            clutter(rng, (x, d / 2 - 0.17, z + 0.015), (0.8, 0.05), int(rng.integers(4, 12)), (0.1, 0.35))
+    for _ in range(int(rng.integers(1, 5))):
+        hang_picture(rng, (rng.uniform(-0.4, 0.4) * w, d / 2 - 0.02, rng.uniform(0.4, 0.8) * h))
+    eye = Vector((rng.uniform(-0.3, 0.3) * w, -d / 2 + rng.uniform(0.3, 1.5), rng.uniform(0.9, 1.8)))
+    return View(Vector((x + rng.uniform(-0.3, 0.3) * tw, y, height + rng.uniform(-0.1, 0.4))), eye)
+
+
+def hang_picture(rng: Rng, position: Sequence[float]) -> None:
+    """Hang a framed picture, or now and then a mirror, on a wall that faces −y."""
+    w, h = rng.uniform(0.3, 1.0), rng.uniform(0.3, 0.8)
+    inside = material(rng, "mirror" if rng.random() < 0.2 else None)
+    add_box(position, (w, 0.02, h), inside, "picture")
+    edge = material(rng)
+    for sign in (-1, 1):
+        add_box((position[0] + sign * w / 2, position[1], position[2]), (0.04, 0.05, h + 0.04), edge)
+        add_box((position[0], position[1], position[2] + sign * h / 2), (w + 0.04, 0.05, 0.04), edge)
+
+
+def studio_set(rng: Rng) -> View:
+    """Build a backdrop with a group of things on plinths, lit by area lamps, one perhaps behind slats."""
+    radius = log_uniform(rng, 0.5, 2.0)
+    add_box(
+        (0, 0, -0.05),
+        (30, 30, 0.1),
+        material(rng, choose(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True),
+    )
+    if rng.random() < 0.7:
+        add_box((0, radius * 2.5, 5), (30, 0.1, 10), material(rng, "diffuse", True))
+    for _ in range(int(rng.integers(0, 4))):
+        x, y, height, side = *rng.uniform(-0.8, 0.8, 2) * radius, rng.uniform(0.1, 0.7) * radius, radius * 0.5
+        add_box((x, y, height / 2), (side, side, height), material(rng))
+        clutter(rng, (x, y, height), (side / 3, side / 3), 4, (0.12 * radius, 0.4 * radius))
+    clutter(rng, (0, 0, 0), (radius, radius), int(rng.integers(14, 36)), (0.08 * radius, 0.6 * radius))
+    set_world(rng, choose(rng, {"none": 2, "constant": 1, "image": 3}), log_uniform(rng, 0.05, 1))
+    for k in range(int(rng.integers(1, 4))):
+        angle, distance = rng.uniform(math.pi * 0.9, math.pi * 2.1), radius * rng.uniform(1.5, 3.5)
+        position = Vector((distance * math.cos(angle), distance * math.sin(angle), radius * rng.uniform(0.8, 3)))
+        kind = choose(rng, {"AREA": 3, "SPOT": 1, "POINT": 1})
+        size = radius * (rng.uniform(0.2, 1.5) if kind == "AREA" else log_uniform(rng, 0.01, 0.1))
+        add_lamp(kind, position, 60 * distance**2 * log_uniform(rng, 0.3, 3), size, (0, 0, 0.2 * radius), warm(rng))
+        if k == 0 and rng.random() < 0.3:
+            slats, toward = material(rng, "diffuse"), Vector((0, 0, 0.2 * radius)) - position
+            for t in np.linspace(-1, 1, 11):
+                slat = add_box((0, 0, 0), (radius * 2, 0.02, radius * 0.09), slats)
+                slat.rotation_euler = toward.to_track_quat("Y", "Z").to_euler()
+                slat.location = position + 0.35 * toward + Vector((0, 0, float(t) * radius))
+    angle, distance = rng.uniform(-0.8, 0.8), radius * rng.uniform(1.6, 3)
+    eye = Vector((distance * math.sin(angle), -distance * math.cos(angle), radius * rng.uniform(0.15, 1.4)))
+    return View(Vector((*rng.uniform(-0.4, 0.4, 2) * radius, radius * rng.uniform(0.1, 0.4))), eye)
+
+
+def outdoor_set(rng: Rng) -> View:
+    """Build rough ground under a sky, with scattered instances, walls and things."""
+    side, n = 24.0, 160
+    y, x = np.mgrid[:n, :n] / (n - 1) - 0.5
+    height = np.zeros((n, n))
+    for octave in range(1, 6):
+        for _ in range(3):
+            kx, ky = rng.normal(0, 2**octave, 2)
+            height += 1.2 * 2.0 ** (-1.2 * octave) * np.sin(2 * np.pi * (kx * x + ky * y + rng.random()))
+    height *= rng.uniform(0.1, 1.0) * np.clip(np.hypot(x, y) * 4, 0.1, 1)
+    vertices = np.stack([x * side, y * side, height], -1).reshape(-1, 3)
+    k = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    ground = material(rng, choose(rng, {"diffuse": 4, "plastic": 1}), True)
+    add_mesh("ground", vertices, np.stack([k, k + 1, k + n + 1, k + n], -1), ground, smooth=True)
+
+    def on_ground(spread: float, sizes: tuple[float, float]) -> tuple[Sequence[float], float]:
+        px, py = rng.normal(0, spread, 2).clip(-0.48 * side, 0.48 * side)
+        size = log_uniform(rng, *sizes)
+        i, j = int((py / side + 0.5) * (n - 1)), int((px / side + 0.5) * (n - 1))
+        return (px, py, float(height[i, j]) + 0.2 * size), size
+
+    scatter(rng, int(rng.integers(60, 220)), lambda: on_ground(2.5, (0.06, 0.5)), 5)
+    scatter(rng, int(rng.integers(10, 50)), lambda: on_ground(7.0, (0.5, 2.5)), 3)
+    clutter(rng, (0, 0, 0.05), (1.6, 1.6), int(rng.integers(10, 26)), (0.15, 0.9))
+    for _ in range(int(rng.integers(1, 6))):
+        size = tuple(map(float, rng.uniform(1, 5, 3)))
+        position = (rng.uniform(-8, 8), rng.uniform(3, 11), size[2] / 2 - 0.2)
+        add_box(position, size, material(rng, choose(rng, {"diffuse": 3, "plastic": 1}), True))
+    set_world(rng, choose(rng, {"sky": 3, "image": 2}), 1.0)
+    if rng.random() < 0.3:
+        add_lamp("SUN", (0, 0, 9), log_uniform(rng, 1, 6), 0.01, (*rng.normal(0, 5, 2), 0.0), warm(rng))
+    angle, distance = rng.uniform(-0.7, 0.7), rng.uniform(2.5, 6)
+    eye = Vector((distance * math.sin(angle), -distance * math.cos(angle), rng.uniform(0.7, 2.2)))
+    return View(Vector((*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.1, 0.6))), eye)
+
+
+def night_set(rng: Rng) -> View:
+    """Build columns and blocks on a glossy floor, lit by many small bright lights."""
+    add_box(
+        (0, 0, -0.05),
+        (40, 40, 0.1),
+        material(rng, choose(rng, {"plastic": 2, "coated": 1, "metal": 1}), True),
+    )
+    add_box((0, 8, 3), (30, 0.2, 8), material(rng, "diffuse", True))
+    stone = [material(rng, choose(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True) for _ in range(3)]
+    for _ in range(int(rng.integers(8, 24))):
+        x, y = rng.uniform(-6, 6), rng.uniform(0.5, 7.5)
+        size = (*rng.uniform(0.2, 1.0, 2), rng.uniform(0.3, 4))
+        add_box((x, y, size[2] / 2), size, stone[int(rng.integers(3))])
+    clutter(rng, (0, 0, 0), (2.5, 1.8), int(rng.integers(14, 32)), (0.12, 0.9))
+    hues = [color(rng, 1.0) for _ in range(4)]
+    bulbs = int(log_uniform(rng, 8, 70))
+    glow = [material(rng, "emission") for _ in hues]
+    for lamp, hue in zip(glow, hues, strict=True):
+        lamp.node_tree.nodes["Principled BSDF"].inputs["Emission Color"].default_value = hue
+        lamp.node_tree.nodes["Principled BSDF"].inputs["Emission Strength"].default_value = log_uniform(rng, 30, 300)
+    for number in range(bulbs):
+        position = (rng.uniform(-5, 5), rng.uniform(-3, 7), rng.uniform(0.2, 3.5))
+        if number % 2:
+            add_lamp("POINT", position, log_uniform(rng, 2, 40), 0.03, (0, 0, 0), hues[number % 4][:3])
+        else:
+            bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, radius=rng.uniform(0.015, 0.06), location=position)
+            bpy.context.active_object.data.materials.append(glow[number % 4])
+    set_world(rng, "constant", 0.02)
+    eye = Vector((rng.uniform(-2, 2), -rng.uniform(3, 6), rng.uniform(0.5, 1.8)))
+    return View(Vector((rng.uniform(-1, 1), rng.uniform(-0.5, 1), rng.uniform(0.1, 0.8))), eye)
+
+
+def wall_set(rng: Rng) -> View:
+    """Build a wall with relief, pictures, writing and pipes, lit from the side."""
+    add_box((0, 0.1, 2), (14, 0.2, 6), material(rng, None if rng.random() < 0.3 else "diffuse", True))
+    add_box((0, -3, -0.05), (14, 8, 0.1), material(rng, "plastic", True))
+    for _ in range(int(rng.integers(3, 9))):
+        hang_picture(rng, (rng.uniform(-3, 3), -0.02, rng.uniform(0.5, 2.6)))
+
+    def on_wall() -> tuple[Sequence[float], float]:
+        return (rng.uniform(-3.5, 3.5), -rng.uniform(0, 0.15), rng.uniform(0.2, 3.2)), log_uniform(rng, 0.06, 0.5)
+
+    scatter(rng, int(rng.integers(30, 120)), on_wall, 6)
+    clutter(rng, (0, -0.6, 0), (3, 0.4), int(rng.integers(8, 20)), (0.15, 0.8))
+    set_world(rng, choose(rng, {"none": 1, "constant": 2, "image": 3}), log_uniform(rng, 0.1, 1))
+    for _ in range(int(rng.integers(1, 4))):
+        position = (rng.choice([-1, 1]) * rng.uniform(1, 5), -rng.uniform(0.5, 3), rng.uniform(1, 4))
+        kind = choose(rng, {"AREA": 2, "SPOT": 1, "POINT": 1})
+        add_lamp(kind, position, log_uniform(rng, 100, 900), rng.uniform(0.05, 0.8), (0, 0, 1.2), warm(rng))
+    x = rng.uniform(-2, 2)
+    eye = Vector((x + rng.uniform(-1.5, 1.5), -rng.uniform(1.8, 4), rng.uniform(0.8, 2)))
+    return View(Vector((x, -0.1, rng.uniform(0.5, 2))), eye)
+
+
+CREDIT = ("title", "author", "licence", "licence_url", "original")
+SETS: dict[str, tuple[float, Callable[[Rng], View]]] = {
+    "room": (0.32, room_set),
+    "studio": (0.26, studio_set),
+    "outdoor": (0.18, outdoor_set),
+    "night": (0.12, night_set),
+    "wall": (0.12, wall_set),
+}
+
+
+def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
+    """Build a random shot in an empty Blender scene; return what it came to be.
+
+    Every attempt with one seed is another shot: when the first shows nothing, the next is tried.
+    """
+    rng = np.random.default_rng([shot.seed, attempt])
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
+    scene.frame_set(shot.frames[len(shot.frames) // 2])
+    kind = choose(rng, {name: weight for name, (weight, _) in SETS.items()})
+    view = SETS[kind][1](rng)
+    camera = place_camera(rng, view.focus, view.eye)
+    film = shot.film or draw_film(rng, shot.size)
+    set_crop(scene.render, film, shot.size, shot.center or (0.5, 0.5))
+    center = shot.center or (0.5, 0.5)
+    if shot.center is None and film != shot.size:
+        center = aim_crop(rng, shot, film)
+    if rng.random() < 0.15:
+        points = visible_points(scene)
+        focus = (points[int(rng.integers(len(points)))][0] - camera.location).length if points else 3.0
+        camera.data.dof.use_dof, camera.data.dof.focus_distance = True, focus
+        camera.data.dof.aperture_fstop = log_uniform(rng, 0.7, 5.6)
+    if rng.random() < 0.04:
+        add_haze(rng, (view.focus - view.eye).length)
+    motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_things=True)
+    return {
+        "set": kind,
+        "film": list(film),
+        "center": [round(c, 4) for c in center],
+        "lens": camera.data.lens,
+        **motion,
+    }
+
+
+def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
+    """Draw the size of the whole picture: mostly that of a film, sometimes no more than what is rendered."""
+    drawn = choose(rng, {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18})
+    width, height = map(int, drawn.split("x"))
+    return max(width, size[0]), max(height, size[1])
+
+
+def add_haze(rng: Rng, distance: float) -> None:
+    """Fill the space about the camera with a thin scattering volume, optical depth 0.1 to 0.6 to the focus."""
+    surface = bpy.data.materials.new("haze")
+    surface.use_nodes = True
+    tree = surface.node_tree
+    tree.nodes.clear()
+    volume, output = tree.nodes.new("ShaderNodeVolumeScatter"), tree.nodes.new("ShaderNodeOutputMaterial")
+    volume.inputs["Density"].default_value = log_uniform(rng, 0.1, 0.6) / distance
+    volume.inputs["Anisotropy"].default_value = rng.uniform(0, 0.7)
+    tree.links.new(volume.outputs["Volume"], output.inputs["Volume"])
+    add_box((0, 0, 4), (28, 28, 9), surface, "haze").hide_set(True)
+
+
+def open_shot(shot: ShotSettings) -> dict[str, Any]:
+    """Open a .blend file, choose its camera and crop, and give it motion where it has none."""
+    bpy.ops.wm.open_mainfile(filepath=str(Path(shot.scene).resolve()))
+    scene = bpy.context.scene
+    rng = np.random.default_rng([shot.seed, 0])
+    cameras = sorted(item.name for item in scene.objects if item.type == "CAMERA")
+    if shot.camera is not None and shot.camera not in cameras and shot.camera != "random":
+        raise ValueError(f"camera: got {shot.camera!r}, expected one of {', '.join(cameras)} or random")
+    if shot.camera is not None:
+        scene.camera = scene.objects[str(rng.choice(cameras)) if shot.camera == "random" else shot.camera]
+    if scene.camera is None:
+        raise ValueError(f"scene: {shot.scene} has no camera")
+    scene.frame_set(shot.frames[len(shot.frames) // 2])
+    film = shot.film or shot.size
+    set_crop(scene.render, film, shot.size, shot.center or (0.5, 0.5))
+    center = shot.center or (0.5, 0.5)
+    if shot.center is None and film != shot.size:
+        center = aim_crop(rng, shot, film)
+    description: dict[str, Any] = {
+        "camera_name": scene.camera.name, "film": list(film), "center": [round(c, 4) for c in center],
+        "credit": {key: scene[key] for key in CREDIT if key in scene},
+    }  # fmt: skip
+    animated = any(item.animation_data is not None and item.animation_data.action for item in scene.objects)
+    if shot.motion == "add" or (shot.motion == "auto" and not animated):
+        description |= add_motion(rng, shot, own_things=False)
+    return description
+
+
+def worth_rendering(passes: dict[str, np.ndarray]) -> str | None:
+    """Return why a pilot's picture is not worth rendering, or None if it is."""
+    radiance = np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1)
+    guides = np.concatenate([passes["Denoising Albedo"], passes["Denoising Normal"]], axis=-1).astype(np.float32)
+    if (radiance <= 1e-3 * radiance.mean()).mean() > 0.4:
+        return "most of it is black"
+    if (passes["Depth"] > 1e9).mean() > 0.6:
+        return "most of it is sky"
+    if np.linalg.norm(guides.std(axis=(0, 1))) < 0.12:
+        return "there is next to nothing to see"
+    if np.quantile(radiance, 0.98) > 300 * np.quantile(radiance, 0.3):
+        return "one light drowns everything else"
+    return None
+
+
+def exposure(shot: ShotSettings, passes: dict[str, np.ndarray]) -> float:
+    """Return a factor that puts the picture's geometric mean some stops (σ 1.1, at most 2.5) around middle grey."""
+    rng = np.random.default_rng([shot.seed, 99])
+    radiance = np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1)
+    # Blocks, because single pixels of a few samples are black or very bright by chance.
+    h, w = (n // 4 * 4 for n in radiance.shape)
+    blocks = radiance[:h, :w].reshape(h // 4, 4, w // 4, 4).mean(axis=(1, 3)) if h and w else radiance
+    middle = float(np.exp(np.log(blocks + 1e-3 * blocks.mean()).mean()))
+    return 0.18 / middle * 2 ** float(np.clip(rng.normal(0, 1.1), -2.5, 2.5))

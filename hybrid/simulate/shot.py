@@ -1,0 +1,115 @@
+"""What is asked for: one shot to simulate, in plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class ShotSettings:
+    """One shot: everything needed to render it again, given the scene.
+
+    `size` is what is rendered, a crop around `center` of a camera of `film` pixels. `film`, `center` and `camera`
+    may be None: drawn from the seed for random shots, else the whole picture of the scene's own camera.
+    """
+
+    scene: str  # a .blend file, or "random"
+    seed: int
+    frames: tuple[int, ...]
+    size: tuple[int, int]
+    levels: dict[str, int]  # name → samples per pixel
+    reference: int = 0  # samples per pixel in all; 0: none
+    film: tuple[int, int] | None = None
+    center: tuple[float, float] | None = None
+    camera: str | None = None
+    motion: str = "auto"  # auto: only where the scene has none; keep; add
+    movers: int | None = None  # objects to add; None: drawn, where motion is added
+    motion_blur: bool = False
+    halves: bool = False
+    effects: str = "auto"  # or all
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise ValueError("frames: got none, expected at least one")
+        if not self.levels:
+            raise ValueError("levels: got none, expected at least one")
+        for name, spp in {**self.levels, "reference": self.reference}.items():
+            if spp < (name != "reference"):
+                raise ValueError(f"level {name}: got {spp} samples per pixel, expected at least 1")
+            if self.halves and spp == 1:
+                raise ValueError(f"level {name}: got 1 sample per pixel, expected at least 2 for half buffers")
+        if min(self.size) < 8:
+            raise ValueError(f"size: got {self.size[0]}x{self.size[1]}, expected at least 8x8")
+        if self.film is not None and (self.film[0] < self.size[0] or self.film[1] < self.size[1]):
+            raise ValueError(
+                f"film: got {self.film[0]}x{self.film[1]}, expected at least the size, {self.size[0]}x{self.size[1]}"
+            )
+        if self.motion not in ("auto", "keep", "add"):
+            raise ValueError(f"motion: got {self.motion!r}, expected auto, keep or add")
+        if self.effects not in ("auto", "all"):
+            raise ValueError(f"effects: got {self.effects!r}, expected auto or all")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings as JSON holds them."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> ShotSettings:
+        """Return the settings that `to_json` wrote."""
+        pairs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+        return cls(**pairs)
+
+
+def frame_seed(seed: int, level: str, frame: int) -> int:
+    """Return the seed of one picture, in [0, 2³¹): unrelated to that of any other frame, level or shot."""
+    digest = hashlib.sha256(f"{seed} {level} {frame}".encode()).digest()
+    return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
+
+
+def parse_levels(text: str, samples: int) -> dict[str, int]:
+    """Read noise levels: `n,n/e,4`, or with names, `noisy=n,half=n/2`.
+
+    Parameters
+    ----------
+    text
+        Levels, with commas between; each a number, `n`, or `n/NUMBER` (`e` being Euler's), with or without a name.
+        Levels without a name are called `noisy` if there is one, `a`, `b`, `c`, … otherwise.
+    samples
+        n, samples per pixel.
+
+    Returns
+    -------
+    dict
+        Name → samples per pixel, rounded down, at least 1.
+    """
+    parts = text.replace(" ", "").split(",")
+    levels: dict[str, int] = {}
+    for number, part in enumerate(parts):
+        name, _, expression = part.rpartition("=")
+        name = name or ("noisy" if len(parts) == 1 else chr(ord("a") + number))
+        match = re.fullmatch(r"(?:(n)(?:/(e|\d+(?:\.\d+)?))?)|(\d+)", expression)
+        if match is None or not re.fullmatch(r"\w+", name):
+            raise ValueError(f"levels: got {part!r}, expected NUMBER, n or n/NUMBER, or NAME= and one of these")
+        if name in levels or name.startswith("reference"):
+            raise ValueError(f"levels: got the name {name!r} twice or one kept for references")
+        divisor = {"e": math.e, None: 1.0}.get(match[2]) or float(match[2])
+        if divisor == 0:
+            raise ValueError(f"levels: got {part!r}, expected no division by zero")
+        levels[name] = max(int(match[3]) if match[3] else int(samples / divisor), 1)
+    return levels
+
+
+def spp_of(text: str, seed: int) -> int:
+    """Read samples per pixel: a number, or `LOW-HIGH`, from which the seed draws (uniformly in the logarithm)."""
+    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
+    if match is None or int(match[1]) < 1 or (match[2] is not None and int(match[2]) < int(match[1])):
+        raise ValueError(f"spp: got {text!r}, expected a number or LOW-HIGH, from 1 up")
+    if match[2] is None:
+        return int(match[1])
+    low, high = math.log(int(match[1])), math.log(int(match[2]) + 1)
+    return min(int(math.exp(low + (high - low) * frame_seed(seed, "spp", 0) / 2**31)), int(match[2]))
