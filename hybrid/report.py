@@ -1,0 +1,515 @@
+"""The results of a comparison as one HTML page, and as PNG, CSV, JSON and Markdown for scripts and papers.
+
+The page holds everything it shows: it asks for no library, font or file, and a content security policy keeps it
+from doing so. `report_page.html`, `.css` and `.js` beside this module are its template.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid import chart
+from hybrid.results import (
+    CHART_METRICS,
+    COSTS,
+    METRICS,
+    Cost,
+    MethodResult,
+    Metric,
+    Statistic,
+    best_and_ties,
+    column_title,
+    format_bytes,
+    format_seconds,
+    format_value,
+    format_worth,
+    markdown_table,
+    pareto_front,
+    plain,
+    present_metrics,
+    to_csv,
+    to_json,
+)
+from hybrid.transfer import measure_exposure
+
+Array = NDArray[np.float32]
+Box = tuple[int, int, int, int]
+
+# Radiance is embedded as a logarithm in steps of 1.5 % (finer than 8 bits of sRGB show from mid-grey up), and
+# linearly below 1/64 of the shot's mean level. 1023 codes reach 40,000 times that level.
+CODES_PER_STOP = 48
+CODES = 1024
+NOT_FINITE = CODES - 1
+MAP_LEVELS = 64  # of a map in [0, 1]; a colour scale shows no more
+SMALLEST_CROP = 160  # pixels across; below that frames are left out instead
+
+
+@dataclass(frozen=True)
+class ReportImages:
+    """The pictures of one method, read when asked for.
+
+    `name` is that of its `MethodResult`. `frame` gives the (H, W, 3) linear radiance of a frame number.
+    `maps` gives (H, W) maps in [0, 1] by their title, such as "FLIP", "Confidence", "Temporal contribution".
+    """
+
+    name: str
+    frame: Callable[[int], Array]
+    maps: Mapping[str, Callable[[int], Array]] = field(default_factory=dict)
+
+
+def write_report(
+    folder: Path | str,
+    shot: str,
+    results: Sequence[MethodResult],
+    images: Sequence[ReportImages] = (),
+    reference: Callable[[int], Array] | None = None,
+    frames: Sequence[int] = (),
+    *,
+    exposure: float = 1.0,
+    metrics: Sequence[Metric] = METRICS,
+    facts: Mapping[str, str] | None = None,
+    crop: Box | None = None,
+    megabytes: float = 14.0,
+) -> Path:
+    """Write ``report.html``, ``results.json``, ``results.csv``, ``results.md`` and ``chart.png`` into a folder.
+
+    Parameters
+    ----------
+    folder : is made where it does not exist.
+    shot : title of the page.
+    results : in the order of the tables. The one named "noisy" is what gains are counted from.
+    images : of those methods that have pictures, in the order of the viewer; each read one frame at a time.
+    reference : (H, W, 3) linear radiance of a frame number. Needed with `images`.
+    frames : numbers of the consecutive frames whose pictures are embedded.
+    exposure : the factor e of the tone curve e·x / (1 + e·x) of the metrics: 0 EV in the viewer.
+    metrics : definitions of the keys of ``MethodResult.metrics``; what is not defined is left out.
+    facts : what to know about the measurement (machine, versions, the reference's noise …), shown as a list.
+    crop : (x, y, width, height) in pixels of what is embedded; by default everything, or where the methods
+        differ most if everything is too much for `megabytes`.
+    megabytes : limit on the embedded pictures. What is left out to keep it is said on the page.
+
+    Returns
+    -------
+    Path
+        Of the page.
+
+    Raises
+    ------
+    ValueError
+        Two results of one name; images without a result, a reference or frames; pictures of different
+        shapes; a crop outside the picture.
+    """
+    _check(results, images, reference, frames)
+    shown = present_metrics(results, metrics)
+    charted = [m for m in shown if m.key in CHART_METRICS]
+    pictures, parts = None, ""
+    if images and reference is not None:
+        labels = {r.name: r.label for r in results}
+        pictures, parts = _embed(images, labels, reference, list(frames), crop, megabytes * 1e6)
+    document = {
+        "shot": shot,
+        "facts": dict(facts or {}),
+        "metrics": [asdict(m) for m in shown],
+        "results": [plain(r) for r in results],
+        "fronts": {f"{m.key} {c}": pareto_front(results, m, c) for m in shown for c in COSTS},
+    }
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "results.json").write_text(to_json(document, indent=1), encoding="utf-8")
+    (folder / "results.csv").write_text(to_csv(results, shown), encoding="utf-8")
+    (folder / "results.md").write_text(markdown_table(results, metrics), encoding="utf-8")
+    layout = chart.lay_out(results, charted[0], "seconds_per_megapixel") if charted else None
+    if layout is not None:
+        cv2.imwrite(str(folder / "chart.png"), chart.to_pixels(layout))
+    page = _fill(
+        _template("html"),
+        title=escape(shot),
+        css=_template("css"),
+        js=_template("js"),
+        verdict=_verdict(results, shown),
+        charts=_charts(results, charted),
+        tables=_tables(results, shown),
+        definitions=_definitions(shown),
+        facts=_facts(facts or {}, pictures),
+        # In a script element only "<" could end it; "&" is for readers that take the page for XML.
+        data=to_json({**document, "chart": [m.key for m in charted], "exposure": exposure, "pictures": pictures})
+        .replace("&", "\\u0026")
+        .replace("<", "\\u003c"),
+        pictures=parts,
+    )
+    path = folder / "report.html"
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _check(
+    results: Sequence[MethodResult],
+    images: Sequence[ReportImages],
+    reference: Callable[[int], Array] | None,
+    frames: Sequence[int],
+) -> None:
+    """Refuse what would make a page that contradicts itself."""
+    names = [r.name for r in results]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"results must have different names, {name!r} appears {names.count(name)} times")
+    if "reference" in names:
+        raise ValueError("results must not be named 'reference': the viewer keeps that name")
+    for entry in images:
+        if entry.name not in names:
+            raise ValueError(f"images of {entry.name!r} belong to no result; there are {', '.join(names)}")
+    if images and (reference is None or not frames):
+        raise ValueError("images need a reference and at least one frame")
+
+
+# --- the template -------------------------------------------------------------------------------------
+
+
+def _template(kind: str) -> str:
+    return (files("hybrid") / f"report_page.{kind}").read_text(encoding="utf-8")
+
+
+def _fill(template: str, **parts: str) -> str:
+    """Put the parts in place of ``{{name}}``, in one pass: what a part holds is never looked at again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], template)
+
+
+def _verdict(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """The page's head: the leader by the first measure, its gain, worth and cost, as large figures."""
+    rated = [r for r in results if metrics and metrics[0].key in r.metrics]
+    best, ties = best_and_ties(rated, metrics[0]) if rated else (None, set())
+    if best is None:
+        return '<p class="lead">No method could be measured.</p>'
+    metric, by_name = metrics[0], {r.name: r for r in results}
+    leader, noisy = by_name[best], by_name.get("noisy")
+    value = leader.metrics[metric.key].mean
+    tie = [r.label for r in results if r.name in ties]
+    lead = f"<strong>{escape(leader.label)}</strong> comes closest to the reference"
+    if tie:
+        lead += f", in a tie with {escape(', '.join(tie[:3]))}" + (f" and {len(tie) - 3} more" if tie[3:] else "")
+    figures = [(format_value(value, metric), metric.unit, metric.label)]
+    if noisy is not None and noisy is not leader and metric.key in noisy.metrics and not metric.logarithmic:
+        gain = value - noisy.metrics[metric.key].mean
+        figures.append((("+" if gain > 0 else "") + format_value(gain, metric), metric.unit, "over the noisy input"))
+    if leader.worth is not None and math.isfinite(leader.worth):
+        figures.append((format_worth(leader.worth), "", "the samples it is worth"))
+    if leader.seconds_per_megapixel is not None:
+        figures.append((format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
+    items = "".join(
+        f"<div><dt>{escape(label)}</dt><dd>{escape(text)}<small>{escape(unit)}</small></dd></div>"
+        for text, unit, label in figures
+    )
+    return f'<p class="lead">{lead}.</p><dl class="figures">{items}</dl>'
+
+
+def _charts(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """The axis selectors, the legend, and one chart for each pair of axes, all but the first hidden."""
+    if not metrics:
+        return ""
+    ups = "".join(f'<option value="{escape(m.key)}">{escape(column_title(m))}</option>' for m in metrics)
+    names = {"seconds_per_megapixel": "Seconds per megapixel-frame", "peak_bytes": "Peak memory"}
+    overs = "".join(f'<option value="{cost}">{names[cost]}</option>' for cost in COSTS)
+    legend = "".join(
+        f'<li><label><input type="checkbox" checked data-family="{i}">{chart.legend_marker(i)}'
+        f"<span>{escape(name)}</span></label></li>"
+        for i, name in enumerate(chart.families(results))
+    )
+    figures: list[str] = []
+    for metric in metrics:
+        for cost in COSTS:
+            layout = chart.lay_out(results, metric, cost)
+            drawing = chart.to_svg(layout, metric) if layout else "<p>No finite figure to draw.</p>"
+            hidden = " hidden" if figures else ""
+            figures.append(
+                f'<div class="plot" data-axes="{escape(metric.key)} {cost}"{hidden}>{drawing}'
+                f"{_advice(results, metric, cost)}</div>"
+            )
+    return (
+        f'<aside class="side"><label class="field">Accuracy<select id="axis-up">{ups}</select></label>'
+        f'<label class="field">Cost<select id="axis-over">{overs}</select></label>'
+        f'<fieldset class="legend"><legend>Families</legend><ul>{legend}</ul></fieldset>'
+        '<p class="hint"><svg class="marker" viewBox="-11 -11 22 22" aria-hidden="true"><circle r="6.5"/></svg> '
+        'filled: on the front<br><svg class="marker hollow" viewBox="-11 -11 22 22" aria-hidden="true">'
+        '<circle r="6"/></svg> hollow: something else is as good for less</p></aside>'
+        f'<div class="main" id="plots">{"".join(figures)}<div id="tip" role="status" hidden></div></div>'
+    )
+
+
+def _advice(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> str:
+    """The front as a list: what to use from which budget on."""
+    by_name = {r.name: r for r in results}
+    items = []
+    for name in pareto_front(results, metric, cost):
+        r = by_name[name]
+        spent = getattr(r, cost)
+        budget = format_bytes(spent) if cost == "peak_bytes" else f"{format_seconds(spent)} s"
+        figure = f"{format_value(r.metrics[metric.key].mean, metric)} {metric.unit}".strip()
+        items.append(
+            f"<li><span>{escape('nothing' if spent == 0 else budget)}</span> "
+            f"<b>{escape(r.label)}</b> <i>{escape(figure)}</i></li>"
+        )
+    per = "per megapixel-frame" if cost == "seconds_per_megapixel" else "of memory"
+    return f'<div class="advice"><h3>What to use, from this budget {per} on</h3><ol>{"".join(items)}</ol></div>'
+
+
+def _tables(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """The tables: methods, those absent, and the sweeps folded away."""
+    present = [r for r in results if r.absent_reason is None]
+    methods, swept = [r for r in present if not r.sweep], [r for r in present if r.sweep]
+    absent = "".join(
+        f"<li><b>{escape(r.label)}</b> {escape(r.absent_reason)}</li>" for r in results if r.absent_reason is not None
+    )
+    out = _table(methods, metrics)
+    if absent:
+        out += f'<div class="absent"><h3>Absent</h3><ul>{absent}</ul></div>'
+    if swept:
+        out += f"<details><summary>Sweep: {len(swept)} settings</summary>{_table(swept, metrics)}</details>"
+    return out
+
+
+def _table(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    verdicts = {m.key: best_and_ties(results, m) for m in metrics}
+    scales = {m.key: _scale([r.metrics[m.key] for r in results if m.key in r.metrics], m) for m in metrics}
+    heads = "".join(
+        f'<th scope="col"><a href="#metric-{i}">{escape(m.label)}</a><small>{escape(m.unit) or "&nbsp;"}'
+        f"{dict(higher=' ↑', lower=' ↓', zero=' → 0')[m.better]}</small></th>"
+        for i, m in enumerate(metrics)
+    )
+    rows = []
+    for name in chart.families(results):
+        members = [r for r in results if r.family == name]
+        rows.append(f'<tr class="family"><th scope="rowgroup" colspan="{len(metrics) + 4}">{escape(name)}</th></tr>')
+        for r in members:
+            cells = "".join(_cell(r, m, scales[m.key], *verdicts[m.key]) for m in metrics)
+            settings = ", ".join(f"{k} {v}" for k, v in r.settings.items())
+            spread = f"{format_seconds(r.spread[0])} – {format_seconds(r.spread[1])}" if r.spread else "&nbsp;"
+            rows.append(
+                f'<tr><th scope="row">{escape(r.label)}<small>{escape(settings)}</small></th>{cells}'
+                f"<td>{format_seconds(r.seconds_per_megapixel)}<small>{spread}</small></td>"
+                f"<td>{format_bytes(r.peak_bytes)}</td><td>{format_worth(r.worth)}</td></tr>"
+            )
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="Results"><table><thead><tr>'
+        f'<th scope="col">Method</th>{heads}<th scope="col">Time<small>s / megapixel ↓</small></th>'
+        '<th scope="col">Peak memory<small>&nbsp;↓</small></th><th scope="col">Worth<small>samples ↑</small></th>'
+        f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _scale(statistics: Sequence[Statistic], metric: Metric) -> Callable[[float], float]:
+    """A map from a figure to percent of a cell's width, over the range of all methods."""
+
+    def along(value: float) -> float:
+        return math.log10(max(value, 1e-12)) if metric.logarithmic else value
+
+    ends = [along(v) for s in statistics for v in (s.minimum, s.maximum) if math.isfinite(v)] or [0.0]
+    low, wide = min(ends), (max(ends) - min(ends)) or 1.0
+    return lambda value: 100 * min(max((along(value) - low) / wide, 0), 1) if math.isfinite(value) else 100.0
+
+
+def _cell(r: MethodResult, metric: Metric, scale: Callable[[float], float], best: str | None, ties: set[str]) -> str:
+    """A figure, whether it is the best or ties with it, and a bar of its range, interval and mean."""
+    s = r.metrics.get(metric.key)
+    if s is None:
+        return "<td>–</td>"
+    kind, mark = "", ""
+    if r.name == best:
+        kind, mark = ' class="best"', '<em title="best">best</em>'
+    elif r.name in ties:
+        kind, mark = ' class="tie"', '<em title="cannot be told from the best">tie</em>'
+    low, high, a, b, m = (f"{scale(v):.1f}%" for v in (s.minimum, s.maximum, s.low, s.high, s.mean))
+    shown = [format_value(v, metric) for v in (s.minimum, s.maximum, s.low, s.high)]
+    says = f"frames from {shown[0]} to {shown[1]}; 95 % interval of the mean {shown[2]} to {shown[3]}"
+    return (
+        f'<td{kind} title="{escape(says)}">{mark}{format_value(s.mean, metric)}'
+        f'<span class="whisker" style="--low:{low};--high:{high};--a:{a};--b:{b};--m:{m}">'
+        "<i></i><b></b><u></u></span></td>"
+    )
+
+
+def _definitions(metrics: Sequence[Metric]) -> str:
+    return "".join(
+        f'<div id="metric-{i}"><dt>{escape(column_title(m))}</dt><dd>{escape(m.definition)}</dd></div>'
+        for i, m in enumerate(metrics)
+    )
+
+
+def _facts(facts: Mapping[str, str], pictures: Mapping[str, object] | None) -> str:
+    entries = dict(facts)
+    if pictures:
+        entries["Pictures on this page"] = str(pictures["extent"])
+    return "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(str(v))}</dd></div>" for k, v in entries.items())
+
+
+# --- pictures -----------------------------------------------------------------------------------------
+
+
+def _embed(
+    images: Sequence[ReportImages],
+    labels: Mapping[str, str],
+    reference: Callable[[int], Array],
+    frames: list[int],
+    crop: Box | None,
+    limit: float,
+) -> tuple[dict[str, object], str]:
+    """Encode the pictures and maps: what the page's script needs to know, and the elements that hold them."""
+    sources = [ReportImages("reference", reference), *images]
+    middle = reference(frames[len(frames) // 2])
+    height, width = middle.shape[:2]
+    box = crop or (0, 0, width, height)
+    if min(box[:2]) < 0 or min(box[2:]) < 1 or box[0] + box[2] > width or box[1] + box[3] > height:
+        raise ValueError(f"crop must lie inside the picture of {width}x{height}, is {box}")
+    level = measure_exposure(middle)
+    kept = frames
+    # 4.5 bits a sample is what rendered frames take; where it is not enough the loop shrinks further.
+    expected = len(sources) * len(kept) * box[2] * box[3] * 3 * 4.5 / 8 * 4 / 3
+    while True:
+        if expected > limit:
+            busy = _busiest_point(sources, frames[len(frames) // 2], level, middle.shape)
+            box, kept = _shrink(box, kept, limit / expected, busy, crop is not None)
+        parts, row = _encode_all(sources, kept, box, level, middle.shape)
+        expected = sum(len(part) for part in parts)
+        if expected <= limit or (len(kept) == 1 and (crop is not None or box[2] <= SMALLEST_CROP)):
+            break
+    extent = f"frames {kept[0]} to {kept[-1]}" if len(kept) > 1 else f"frame {kept[0]}"
+    if len(kept) < len(frames):
+        extent += f" of {frames[0]} to {frames[-1]}"
+    extent += f", {box[2]} × {box[3]} pixels"
+    if box[2:] != (width, height):
+        extent += f" at ({box[0]}, {box[1]}) of {width} × {height}"
+    if len(kept) < len(frames) or (crop is None and box[2:] != (width, height)):
+        extent += f"; the rest is left out to keep the page below {limit / 1e6:.0f} MB. The figures are of everything"
+    extent += (
+        ". Stored in steps of 1.5 %, from 1/4000 of the mean level to 40,000 times it; negative values as 0. Maps "
+        "called FLIP or of a method's own come from the program; the error is computed here, from these pictures."
+    )
+    info = {
+        "width": box[2],
+        "height": box[3],
+        "origin": box[:2],
+        "frames": kept,
+        "codes": CODES,
+        "codesPerStop": CODES_PER_STOP,
+        "black": level / 64,
+        "mapLevels": MAP_LEVELS,
+        "row": row,
+        "extent": extent,
+        "sources": [{"name": s.name, "label": labels.get(s.name, "Reference"), "maps": list(s.maps)} for s in sources],
+    }
+    return info, "\n".join(parts)
+
+
+def _encode_all(
+    sources: Sequence[ReportImages], frames: Sequence[int], box: Box, level: float, shape: tuple[int, ...]
+) -> tuple[list[str], int]:
+    """Script elements with every picture and map, and the row in which the methods flicker most."""
+    parts = []
+    flicker = np.zeros(box[3])
+    truth: list[NDArray[np.int32]] = []
+    for i, source in enumerate(sources):
+        before = None
+        for k, number in enumerate(frames):
+            codes = _to_codes(_cut(source.frame(number), box, shape, source.name), level)
+            parts.append(_element(f"p{i}-{k}", codes, CODES))
+            if i == 0:
+                truth.append(codes)
+            error = codes - truth[k]
+            if before is not None:
+                flicker += np.abs(error - before).mean(axis=(1, 2))
+            before = error
+            for j, (title, read) in enumerate(source.maps.items()):
+                values = _cut(read(number), box, shape[:2], f"{source.name}, {title}")
+                levels = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (MAP_LEVELS - 1)).astype(np.int32)
+                parts.append(_element(f"m{i}-{j}-{k}", levels[..., None], MAP_LEVELS))
+    return parts, int(np.argmax(flicker))
+
+
+def _cut(image: Array, box: Box, shape: tuple[int, ...], name: str) -> Array:
+    if image.shape != shape:
+        raise ValueError(f"pictures must be alike: {name} has the shape {image.shape}, expected {shape}")
+    x, y, width, height = box
+    return image[y : y + height, x : x + width]
+
+
+def _to_codes(image: Array, level: float) -> NDArray[np.int32]:
+    """Radiance as codes, evenly spaced in log(1 + x / black); the last code means "not finite"."""
+    finite = np.isfinite(image)
+    scaled = np.maximum(np.where(finite, image, 0), 0) / (level / 64)
+    codes = np.minimum(np.rint(np.log2(1 + scaled) * CODES_PER_STOP), NOT_FINITE - 1)
+    return np.where(finite, codes, NOT_FINITE).astype(np.int32)
+
+
+def _busiest_point(
+    sources: Sequence[ReportImages], number: int, level: float, shape: tuple[int, ...]
+) -> tuple[int, int]:
+    """The pixel (x, y) around which the methods differ most from each other in one frame."""
+    height, width = shape[:2]
+    total, squares = np.zeros((2, height, width), np.float32)
+    for source in sources:
+        picture = _cut(source.frame(number), (0, 0, width, height), shape, source.name)
+        codes = _to_codes(picture, level).mean(axis=-1).astype(np.float32)
+        total += codes
+        squares += codes**2
+    spread = np.maximum(squares / len(sources) - (total / len(sources)) ** 2, 0)
+    y, x = np.unravel_index(np.argmax(cv2.boxFilter(spread, -1, (width // 4 + 1, height // 4 + 1))), spread.shape)
+    return int(x), int(y)
+
+
+def _shrink(box: Box, frames: list[int], ratio: float, towards: tuple[int, int], fixed: bool) -> tuple[Box, list[int]]:
+    """Leave out pixels (around the busy point), and frames where the crop is the smallest or the caller's."""
+    x, y, width, height = box
+    ratio *= 0.97
+    if not fixed and width > SMALLEST_CROP:
+        side = max(math.sqrt(ratio), SMALLEST_CROP / width)
+        ratio /= side**2
+        w, h = max(int(width * side), 1), max(int(height * side), 1)
+        x = min(max(towards[0] - w // 2, x), x + width - w)
+        y = min(max(towards[1] - h // 2, y), y + height - h)
+        width, height = w, h
+    if ratio < 0.97:
+        keep = max(1, int(len(frames) * ratio))
+        start = (len(frames) - keep) // 2
+        frames = frames[start : start + keep]
+    return (x, y, width, height), frames
+
+
+def _element(name: str, codes: NDArray[np.int32], levels: int) -> str:
+    return f'<script type="text/plain" id="{name}">{_compress(codes, levels)}</script>'
+
+
+def _compress(codes: NDArray[np.int32], levels: int) -> str:
+    """Compress (H, W, C) integers below `levels` (a power of two) without loss, as base64 text.
+
+    Notes
+    -----
+    Red and blue are stored as differences to green, each plane as differences to a prediction from the pixels left,
+    above and above left (the median predictor of JPEG-LS, Weinberger et al. 2000, doi:10.1109/83.855427), all
+    modulo `levels`, signs folded so that small differences are small numbers; then low bytes, high bytes, and
+    zlib. PNG would take the browser's 8 bits per channel only, and a third more room.
+    """
+    half = levels // 2
+    planes = np.moveaxis(codes, -1, 0)
+    if len(planes) == 3:
+        red, green, blue = planes
+        planes = np.stack([green, (red - green + half) % levels, (blue - green + half) % levels])
+    above = np.pad(planes[:, :-1], ((0, 0), (1, 0), (0, 0)))
+    left = np.concatenate([above[:, :, :1], planes[:, :, :-1]], axis=2)
+    corner = np.concatenate([np.pad(above[:, :-1, :1], ((0, 0), (1, 0), (0, 0))), above[:, :, :-1]], axis=2)
+    small, large = np.minimum(left, above), np.maximum(left, above)
+    guess = np.where(corner >= large, small, np.where(corner <= small, large, left + above - corner))
+    rest = (planes - guess + half) % levels - half
+    folded = np.where(rest < 0, -2 * rest - 1, 2 * rest).astype(np.uint16)
+    raw = (folded & 255).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
+    return base64.b64encode(zlib.compress(raw, 9)).decode("ascii")
