@@ -156,6 +156,29 @@ def compare(
     Console().print(result_table(results))
 
 
+@app.command()
+def prepare(
+    shot: ShotArgument,
+    target: Annotated[str, typer.Option(help="the same frames with independent noise, and not more of it")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips")],
+    name: Annotated[str, typer.Option(help="of the shot; validation shots are chosen by it")],
+    pseudo_reference: Annotated[
+        bool, typer.Option(help="take the target's pseudo-reference instead of its noisy frames")
+    ] = False,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """Make training clips: aligned windows, and what their centres should have been."""
+    from rich.progress import track
+
+    neural = _neural()
+    opened, wanted = _open(shot, frames, layer), _open(target, frames, layer)
+    output.mkdir(parents=True, exist_ok=True)
+    clips = neural.write_clips(opened, wanted, output, name, pseudo_reference=pseudo_reference)
+    written = len(list(track(clips, "prepare", total=len(opened))))
+    typer.echo(f"wrote {written} clips to {output}")
+
+
 def _neural():  # type: ignore[no-untyped-def]
     """The boundary to torch, or a clear word on how to get it."""
     try:

@@ -29,6 +29,8 @@ from flow.warp import warp
 from hybrid.frames import Frame, Shot
 from hybrid.metrics import Reference, flip, mean_bias, psnr, relmse, smape, ssim, temporal_psnr
 from hybrid.oidn import Quality, denoise_oidn
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate
 from hybrid.results import (
     METRICS,
     MethodResult,
@@ -42,7 +44,7 @@ from hybrid.results import (
     summarize,
 )
 from hybrid.timing import peak_memory
-from nlm.average import replace_nonfinite
+from nlm.average import average, replace_nonfinite, robust_average
 
 Array = NDArray[np.float32]
 Method = Callable[[Shot], Iterator[tuple[int, Array]]]
@@ -89,8 +91,39 @@ def _finite(image: Array) -> Array:
     return replace_nonfinite(image)[0]
 
 
+def classical(shot: Shot, *, estimator: Callable[[AlignedWindow], Array]) -> Iterator[tuple[int, Array]]:
+    """A classical estimate of every aligned window, with the stages that the shot calls for."""
+    aligner = Aligner(shot, plan_shot(shot).effects)
+    for number in shot.numbers:
+        yield number, estimator(aligner.align(number))
+
+
+def aligned_average(aligned: AlignedWindow) -> Array:
+    """The mean over time, weighted by confidence."""
+    return average(aligned.color, aligned.confidence) * aligned.modulation
+
+
+def aligned_robust_average(aligned: AlignedWindow) -> Array:
+    """The same without the darkest and the brightest frame."""
+    return robust_average(aligned.color, aligned.confidence) * aligned.modulation
+
+
+def network(shot: Shot, *, preset: str) -> Iterator[tuple[int, Array]]:
+    """The Robust Average network with the weights of a preset."""
+    from hybrid import neural  # torch may be absent
+
+    denoiser = neural.Denoiser(neural.shipped_weights(preset))
+    aligner = Aligner(shot, plan_shot(shot).effects, radius=denoiser.radius)
+    for number in shot.numbers:
+        yield number, denoiser(aligner.align(number)).color
+
+
 METHODS: dict[str, Method] = {
     "noisy": noisy,
+    "aligned average": partial(classical, estimator=aligned_average),
+    "aligned robust average": partial(classical, estimator=aligned_robust_average),
+    **{name: partial(classical, estimator=partial(estimate, preset=preset)) for name, preset in PRESETS.items()},
+    "network fast": partial(network, preset="fast"),
     "OIDN high": partial(oidn, quality="high"),
     "OIDN best": partial(oidn, quality="high", prefilter=True),
 }

@@ -10,15 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from network.checkpoint import load_model
 from numpy.typing import NDArray
 
 import network
+from hybrid.frames import Shot
 from hybrid.pipeline import Denoised
-from hybrid.pseudo_reference import BALANCED, AlignedWindow, estimate
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import BALANCED, FINAL, AlignedWindow, Aligner, estimate
 from hybrid.timing import Timings
+from network.checkpoint import load_model
+from network.clips import Clip
 from network.inputs import window_exposure
 from network.models import denoise_tile, for_inference
+from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
@@ -140,6 +144,74 @@ class Denoiser:
             aovs_out[name] = filtered[..., start:stop] * modulation
             start = stop
         return Denoised(irradiance * aligned.modulation, aovs_out)
+
+
+def write_clips(
+    shot: Shot,
+    target: Shot,
+    folder: Path,
+    name: str,
+    *,
+    radius: int = 2,
+    pseudo_reference: bool = False,
+) -> Iterator[Path]:
+    """Write a training clip for each frame that two renders of one shot have in common.
+
+    Parameters
+    ----------
+    shot : Shot
+        What the network is to see.
+    target : Shot
+        The same frames with independent noise, and not more of it (Noise2Noise: the mean of the target is clean).
+    folder : Path
+        Where ``NAME.NUMBER.npz`` is written.
+    name : str
+        Of the clips. What comes before its first dot is the shot's: sets are split by it.
+    radius : int
+        Frames on each side of the centre.
+    pseudo_reference : bool
+        Take the classical estimate of the target's window instead of its noisy frame.
+
+    Yields
+    ------
+    Path
+        After each clip.
+
+    Raises
+    ------
+    ValueError
+        If the two have no frame in common.
+
+    References
+    ----------
+    Lehtinen et al. 2018, Noise2Noise, arXiv:1803.04189; paper, section "Training Data".
+    """
+    numbers = [number for number in shot.numbers if target.has(number)]
+    if not numbers:
+        raise ValueError(f"target: expected frames {shot.numbers[0]}-{shot.numbers[-1]}, got none of them")
+    aligner = Aligner(shot, plan_shot(shot).effects, radius=radius)
+    target_aligner = Aligner(target, plan_shot(target).effects, radius=radius)
+    for number in numbers:
+        aligned = aligner.align(number)
+        color = aligned.mixed(aligned.color)
+        if pseudo_reference:
+            wanted = estimate(target_aligner.align(number), FINAL)
+        else:
+            wanted, _ = replace_nonfinite(target.read(number).color)
+        clip = Clip(
+            color=color,
+            albedo=np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo),
+            normal=np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal),
+            confidence=aligned.confidence,
+            modulation=aligned.modulation,
+            estimate=estimate(aligned, ESTIMATE) / aligned.modulation,
+            target=wanted,
+            target_kind="pseudo_reference" if pseudo_reference else "noisy",
+            shot=name.partition(".")[0],
+        )
+        path = folder / f"{name}.{number:04d}.npz"
+        clip.save(path)
+        yield path
 
 
 def _tensor(window: Array) -> torch.Tensor:

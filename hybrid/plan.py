@@ -42,8 +42,8 @@ GATE_ABOVE = 0.002
 # One firefly in a hundred thousand pixels is twenty in a 1080p frame: visible.
 OUTLIERS_ABOVE = 1e-5
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
-# under depth of field or behind glass they differ by several per cent.
-GUIDE_NOISE_ABOVE = 0.01
+# with few samples, under depth of field or behind glass by more.
+GUIDE_NOISE_ABOVE = 0.003
 # A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32

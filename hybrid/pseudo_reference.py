@@ -491,9 +491,9 @@ class Preset:
     guided_subsample: int
 
 
-DRAFT = Preset("draft", 0, 0, guided_radius=4, guided_eps=1e-3, guided_subsample=4)
-BALANCED = Preset("balanced", 3, 3, guided_radius=2, guided_eps=1e-3, guided_subsample=2)
-FINAL = Preset("final", 6, 3, guided_radius=2, guided_eps=1e-3, guided_subsample=1)
+DRAFT = Preset("draft", 0, 0, guided_radius=1, guided_eps=1e-3, guided_subsample=1)
+BALANCED = Preset("balanced", 2, 3, guided_radius=1, guided_eps=1e-2, guided_subsample=1)
+FINAL = Preset("final", 5, 3, guided_radius=1, guided_eps=1e-2, guided_subsample=1)
 PRESETS = {preset.name: preset for preset in (DRAFT, BALANCED, FINAL)}
 
 

@@ -10,7 +10,7 @@ Array = NDArray[np.float32]
 # Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely
 # specular surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a
 # neighbour's light can get by crossing an edge between materials; KPCN's 0.00316 allows a factor of 300.
-ALBEDO_FLOOR = 0.05
+ALBEDO_FLOOR = 0.1
 
 
 def demodulate(radiance: Array, albedo: Array) -> Array:
