@@ -62,10 +62,11 @@ def apply(scene: Any, settings: dict[str, Any]) -> None:
     for name, value in settings.items():
         root, *path, last = name.split(".")
         owner = roots[root] if root in roots else getattr(scene, root)
+        if owner is None:  # a scene may have no world
+            continue
         for step in path:
             owner = getattr(owner, step)
-        if owner is not None:  # a scene may have no world
-            setattr(owner, last, value)
+        setattr(owner, last, value)
 
 
 def render_frame(scene: Any, path: Path, samples: int, seed: int, subset: tuple[int, int] | None = None) -> None:

@@ -435,13 +435,15 @@ def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[An
         x0, x1, y0, y1 = render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y
     top_right, bottom_right, bottom_left, _ = (camera.matrix_world @ v for v in camera.data.view_frame(scene=scene))
     eye = camera.matrix_world.translation
+    forward, flat = -camera.matrix_world.to_3x3().col[2], camera.data.type == "ORTHO"
     graph = bpy.context.evaluated_depsgraph_get()
     found = []
     for j in range(down):
         for i in range(across):
             x, y = x0 + (x1 - x0) * (i + 0.5) / across, y0 + (y1 - y0) * (j + 0.5) / down
             target = bottom_left + x * (bottom_right - bottom_left) + y * (top_right - bottom_right)
-            hit, position, _, _, item, _ = scene.ray_cast(graph, eye, (target - eye).normalized())
+            start, toward = (target - forward * (target - eye).dot(forward), forward) if flat else (eye, target - eye)
+            hit, position, _, _, item, _ = scene.ray_cast(graph, start, toward.normalized())
             if hit:
                 found.append((position.copy(), item))
     return found

@@ -33,10 +33,10 @@ def set_crop(render: Any, film: tuple[int, int], size: tuple[int, int], center: 
 
 
 def aim_crop(rng: Rng, shot: ShotSettings, film: tuple[int, int]) -> tuple[float, float]:
-    """Choose where in the film to crop: of ten places, the one that shows most things."""
+    """Choose where in the film to crop: of twenty places, the one that shows most things."""
     scene = bpy.context.scene
     best, best_score = (0.5, 0.5), -1.0
-    for _ in range(10):
+    for _ in range(20):
         center = (float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.25, 0.75)))
         set_crop(scene.render, film, shot.size, center)
         points = visible_points(scene, 8, 5)
@@ -51,7 +51,7 @@ def place_camera(rng: Rng, focus: Vector, eye: Vector) -> Any:
     """Add a camera at `eye` that looks at `focus`; nearer, if something is right in front of the lens."""
     scene = bpy.context.scene
     data = bpy.data.cameras.new("camera")
-    data.lens, data.sensor_width, data.clip_start = log_uniform(rng, 22, 85), 36, 0.005
+    data.lens, data.sensor_width, data.clip_start = log_uniform(rng, 18, 65), 36, 0.005
     camera = add_object("camera", data, None)
     scene.camera = camera
     bpy.context.view_layer.update()
@@ -269,7 +269,6 @@ def move_light(rng: Rng, shot: ShotSettings) -> dict[str, Any]:
 def add_motion(rng: Rng, shot: ShotSettings, own_things: bool) -> dict[str, Any]:
     """Set a shot in motion: draw what moves, and key it."""
     scene = bpy.context.scene
-    bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     kind = choose(rng, {"usual": 0.76, "still": 0.07, "light": 0.1, "mirror": 0.07})
     found: dict[str, Any] = {"motion": kind, "camera": "still", "movers": [], "lights": []}
     movers = shot.movers if shot.movers is not None else int(rng.choice([0, 1, 2, 3], p=[0.25, 0.35, 0.25, 0.15]))

@@ -32,7 +32,7 @@ def log_uniform(rng: Rng, low: float, high: float) -> float:
 
 def color(rng: Rng, brightness: float | None = None) -> tuple[float, float, float, float]:
     """Draw a linear color: mostly muted, its largest component `brightness`, by default 0.04 to 0.85."""
-    hue, saturation = rng.random(), rng.beta(1.2, 1.8)
+    hue, saturation = rng.random(), rng.beta(1.2, 2.6)
     rgb = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     rgb = (1 - saturation + saturation * rgb) * (log_uniform(rng, 0.04, 0.85) if brightness is None else brightness)
     return (float(rgb[0]), float(rgb[1]), float(rgb[2]), 1.0)

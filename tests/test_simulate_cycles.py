@@ -1,0 +1,165 @@
+"""Cycles itself, tiny: what a shot's files hold, vectors, levels, effects. Skipped where bpy is not installed."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from hybrid.simulate.command import simulate
+from hybrid.simulate.shot import ShotSettings
+
+pytestmark = pytest.mark.cycles
+pytest.importorskip("bpy", reason="renders with Cycles: pip install ravg[simulate]")
+
+SIZE = (64, 36)
+
+# A textured floor and wall, a cube that moves 3 px a frame to the right, one lamp, no glossy or glass anything.
+SCENE = """
+import bpy, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+def surface(scale):
+    made = bpy.data.materials.new("m"); made.use_nodes = True
+    tree = made.node_tree
+    shader = tree.nodes["Principled BSDF"]
+    shader.inputs["Specular IOR Level"].default_value = 0
+    noise, where = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeTexCoord")
+    noise.inputs["Scale"].default_value = scale
+    tree.links.new(where.outputs["Object"], noise.inputs["Vector"])
+    tree.links.new(noise.outputs["Color"], shader.inputs["Base Color"])
+    return made
+def add(location, size, material):
+    bpy.ops.mesh.primitive_cube_add(size=1, location=location)
+    item = bpy.context.active_object
+    item.scale = size
+    item.data.materials.append(material)
+    return item
+add((0, 5, 0), (20, 1, 20), surface(1.0))
+cube = add((0, 1, 0), (1.2, 1.2, 1.2), surface(2.0))
+camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+scene.collection.objects.link(camera)
+camera.location, camera.rotation_euler, scene.camera = (0, -5, 0), (1.5707963, 0, 0), camera
+camera.data.type, camera.data.ortho_scale = "ORTHO", 6.4
+for frame in range(-2, 6):
+    cube.location.x = 0.3 * (frame - 2)
+    cube.keyframe_insert("location", frame=frame)
+lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
+scene.collection.objects.link(lamp)
+lamp.data.energy, lamp.rotation_euler = 3, (0.9, 0, 0.5)
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "cube.blend"
+    subprocess.run([sys.executable, "-c", SCENE, str(path)], check=True, capture_output=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def rendered(scene, tmp_path_factory):
+    """Render the cube once with two equal levels, one lower, half buffers, and a reference."""
+    out = tmp_path_factory.mktemp("shot")
+    shot = ShotSettings(str(scene), 1, (1, 2), SIZE, {"a": 8, "b": 8, "c": 4}, reference=32, halves=True)
+    simulate([(shot, out)], threads=2)
+    return out
+
+
+def read(path):
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels.astype(np.float64) for name, channel in file.channels().items()}
+
+
+def layer(channels, name, parts="RGB"):
+    return np.stack([channels[f"ViewLayer.{name}.{part}"] for part in parts], axis=-1)
+
+
+def test_every_frame_and_level_has_the_layers_that_a_user_s_own_render_has(rendered):
+    names = sorted(path.name for path in rendered.glob("*.exr"))
+    levels = ("a", "b", "c", "reference", "reference_a", "reference_b")
+    assert names == sorted(f"{level}.{frame:04d}.exr" for level in levels for frame in (1, 2))
+    channels = read(rendered / "a.0002.exr")
+    for name in ("Combined.R", "Denoising Albedo.R", "Denoising Normal.X", "Depth.Z", "Vector.X", "Vector.W"):
+        assert channels[f"ViewLayer.{name}"].shape == SIZE[::-1]
+    assert not any("Position" in name or "UV" in name for name in channels), "passes nobody asked for"
+    assert not list(rendered.glob(".*.exr")), "temporary files"
+
+
+def test_meta_says_what_is_needed_to_render_it_again(rendered):
+    meta = json.loads((rendered / "meta.json").read_text())
+    assert meta["shot"]["seed"] == 1
+    assert meta["plan"]["cycles"]["cycles.glossy_bounces"] == 0
+    assert meta["plan"]["facts"]["glossy"] == 0
+    assert meta["plan"]["facts"]["motion_pixels"] == pytest.approx(3, abs=0.2)
+    assert {"a.0001.exr", "reference.0002.exr"} <= set(meta["seconds"])
+
+
+def test_noise_levels_are_independent(rendered):
+    """The mean squared difference of two levels is the sum of their variances; a shared seed would give less."""
+    a, b, c = (layer(read(rendered / f"{level}.0002.exr"), "Combined") for level in "abc")
+    truth = layer(read(rendered / "reference.0002.exr"), "Combined")
+    apart = [((x - y) ** 2).mean() for x, y in ((a, b), (a, c))]
+    # Against a reference of 32 samples each variance counts 1/32 too much: taken off.
+    variance = [((x - truth) ** 2).mean() * spp / (spp + spp**2 / 32) for x, spp in ((a, 8), (b, 8), (c, 4))]
+    # 64·36·3 values: the mean of squares is known to a few percent; the correction above to some more.
+    assert apart[0] == pytest.approx(variance[0] + variance[1], rel=0.15)
+    assert apart[1] == pytest.approx(variance[0] + variance[2], rel=0.15)
+
+
+def test_half_buffers_average_to_the_picture_and_tell_its_variance(rendered):
+    channels = read(rendered / "a.0002.exr")
+    color, half_a, half_b = (layer(channels, name) for name in ("Combined", "Half A", "Half B"))
+    # Half floats hold 11 bits.
+    np.testing.assert_allclose(color, (half_a + half_b) / 2, rtol=1e-3, atol=1e-4)
+    b = layer(read(rendered / "b.0002.exr"), "Combined")
+    estimated, true = ((half_a - half_b) ** 2).mean() / 4, ((color - b) ** 2).mean() / 2
+    # Cycles' samples are stratified: 8 are better than twice as good as 4, so halves of few samples err upwards
+    # (1.26 measured here, 1.00 at 16 samples in a scene with more noise).
+    assert 0.8 < estimated / true < 1.6
+
+
+def test_vectors_lead_to_the_same_point_one_frame_on(rendered):
+    """The cube moves 3 px a frame to the right, the wall not at all."""
+    vector = layer(read(rendered / "a.0001.exr"), "Vector", "XYZW")
+    middle = vector[16:20, 27:33]  # well inside the cube
+    # The previous frame is at (x + X, y − Y), the next at (x − Z, y + W).
+    np.testing.assert_allclose(middle[..., 0], -3, atol=0.05)
+    np.testing.assert_allclose(-middle[..., 2], 3, atol=0.05)
+    np.testing.assert_allclose(vector[:4], 0, atol=0.02)
+
+
+def test_with_motion_blur_vectors_come_from_an_unblurred_pass(scene, rendered, tmp_path):
+    shot = ShotSettings(str(scene), 1, (1,), SIZE, {"noisy": 8}, motion_blur=True)
+    simulate([(shot, tmp_path)], threads=2)
+    blurred, sharp = read(tmp_path / "noisy.0001.exr"), read(rendered / "a.0001.exr")
+    # Other samples of the same edges: half of the pixels have no edge.
+    difference = np.abs(layer(blurred, "Vector", "XYZW") - layer(sharp, "Vector", "XYZW")).max(axis=-1)
+    assert np.median(difference) < 0.02
+    assert (difference > 0.5).mean() < 0.1
+    assert set(blurred) == {name for name in sharp if ".Half " not in name}
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    assert meta["plan"]["cycles"]["render.use_motion_blur"]
+
+
+def test_what_is_left_out_does_not_change_the_picture(scene, rendered, tmp_path):
+    """The same seed with everything on: what the missing effects would have brought is all the difference."""
+    shot = ShotSettings(str(scene), 1, (1,), SIZE, {"a": 8}, effects="all")
+    simulate([(shot, tmp_path)], threads=2)
+    lean, full = (layer(read(folder / "a.0001.exr"), "Combined") for folder in (rendered, tmp_path))
+    assert lean.mean() == pytest.approx(full.mean(), rel=0.005)
+
+
+def test_a_random_shot_shows_something_and_is_the_same_twice(tmp_path):
+    # effects="all" leaves out the pilot, which takes longer than these pictures.
+    shot = ShotSettings("random", 1, (1,), SIZE, {"noisy": 4}, film=(480, 270), effects="all")
+    for name in ("once", "twice"):
+        simulate([(shot, tmp_path / name)], threads=2)
+    once, twice = (layer(read(tmp_path / name / "noisy.0001.exr"), "Combined") for name in ("once", "twice"))
+    np.testing.assert_array_equal(once, twice)
+    assert np.isfinite(once).all()
+    assert (once.mean(axis=-1) > 0).mean() > 0.5
+    assert once.std() > 0.05 * once.mean()
