@@ -568,6 +568,7 @@ function startViewer(pictures) {
   find("play").addEventListener("click", () => play(!state.playing));
   find("row").max = height - 1;
   find("row").addEventListener("input", (event) => setRow(Number(event.target.value)));
+  find("extent").textContent = pictures.extent + ".";
   find("viewer").hidden = false;
   find("time").hidden = frames.length < 2;
   document.querySelector(".transport").hidden = frames.length < 2;

@@ -267,13 +267,19 @@ def _markdown_cell(text: str) -> str:
     return re.sub(r"\s+", " ", text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
 
 
+def settings_as_text(result: MethodResult) -> dict[str, str]:
+    """Print the settings for people: floats with four significant digits."""
+    return {
+        str(k).replace("_", " "): f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in result.settings.items()
+    }
+
+
 def plain(result: MethodResult) -> dict[str, object]:
     """A result as plain dicts, settings as text: what they hold is the caller's business."""
-    settings = {str(k): str(v) for k, v in result.settings.items()}
     # asdict copies mappings by their own type, which a MappingProxy does not survive.
     metrics = {k: asdict(v) for k, v in result.metrics.items()}
     values = {name: getattr(result, name) for name in result.__dataclass_fields__}
-    return {**values, "settings": settings, "metrics": metrics}
+    return {**values, "settings": settings_as_text(result), "metrics": metrics}
 
 
 def to_json(document: object, indent: int | None = None) -> str:
@@ -303,7 +309,7 @@ def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     writer.writerow([*facts, *costs, *(f"{m.key}_{part}" for m in metrics for part in parts)])
     for r in results:
         row: list[object] = [r.name, r.label, r.family, int(r.sweep), r.absent_reason]
-        row += [to_json({str(k): str(v) for k, v in r.settings.items()}).strip(), r.seconds_per_megapixel]
+        row += [to_json(settings_as_text(r)).strip(), r.seconds_per_megapixel]
         row += [*(r.spread or (None, None)), r.peak_bytes, r.worth]
         for m in metrics:
             row += [getattr(r.metrics[m.key], p) if m.key in r.metrics else None for p in parts]

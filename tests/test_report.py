@@ -288,7 +288,7 @@ def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 FLAGS += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files"]
-LEVELS = {"reference": 0.5, "noisy": 0.05, "average": 0.5, "final": 2.0}
+LEVELS = {"reference": 0.5, "noisy": 0.05, "average": 0.5, "final": 2.0, "bright": 8.0}
 EXPOSURE = 2.0
 
 
@@ -308,7 +308,7 @@ def browser() -> Iterator[Any]:
 def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def spot(number: int) -> np.ndarray:
         image = scene(LEVELS["noisy"])(number)
-        image[4, 6] = 8.0  # one pixel to find again after zooming
+        image[4, 6] = LEVELS["bright"] * (1 + 0.5 * (number - 8))  # one pixel to find again after zooming
         return image
 
     half = np.tile(np.linspace(0, 1, 32, dtype=np.float32), (18, 1))
@@ -365,14 +365,22 @@ def shown(page: Any, method: str, number: int = 9, ev: float | None = None) -> l
     return [round(255 * (1.055 * tone ** (1 / 2.4) - 0.055))] * 3
 
 
+def see(page: Any, expected: list[int], x: float, y: float = 0.5) -> None:
+    """Wait until a place on the canvas has a colour: a busy machine may draw late."""
+    for _ in range(100):
+        if close(found := color(page, x, y), expected):
+            return
+    pytest.fail(f"at ({x:.2f}, {y:.2f}) the canvas is {found}, expected {expected}")
+
+
 def close(a: list[int], b: list[int]) -> bool:
     return max(abs(p - q) for p, q in zip(a, b, strict=True)) <= 2  # 1.5 % steps of radiance, and rounding
 
 
 def test_the_slider_divides_two_pictures_and_follows_mouse_and_keys(page: Any) -> None:
     # It opens on the noisy input and the last of the front.
-    assert close(color(page, 0.25), shown(page, "noisy"))
-    assert close(color(page, 0.75), shown(page, "final"))
+    see(page, shown(page, "noisy"), 0.25)
+    see(page, shown(page, "final"), 0.75)
     assert not close(shown(page, "noisy"), shown(page, "final"))
     divider = page.locator("#divider")
     divider.scroll_into_view_if_needed()
@@ -381,34 +389,34 @@ def test_the_slider_divides_two_pictures_and_follows_mouse_and_keys(page: Any) -
     page.mouse.down()
     page.mouse.move(stage["x"] + 0.9 * stage["width"], box["y"] + 20, steps=4)
     page.mouse.up()
-    assert close(color(page, 0.75), shown(page, "noisy"))
-    assert divider.get_attribute("aria-valuenow") == "90"
+    see(page, shown(page, "noisy"), 0.75)
+    until(page, "document.getElementById('divider').ariaValueNow === '90'")
     divider.focus()
     page.keyboard.press("Home")
-    assert close(color(page, 0.25), shown(page, "final"))
+    see(page, shown(page, "final"), 0.25)
     for _ in range(10):
         page.keyboard.press("ArrowRight")
-    assert divider.get_attribute("aria-valuenow") == "20"
-    assert close(color(page, 0.1), shown(page, "noisy"))
-    assert close(color(page, 0.3), shown(page, "final"))
+    until(page, "document.getElementById('divider').ariaValueNow === '20'")
+    see(page, shown(page, "noisy"), 0.1)
+    see(page, shown(page, "final"), 0.3)
 
 
 def test_any_two_methods_can_be_compared(page: Any) -> None:
     page.select_option("#left", label="Average")
     page.select_option("#right", label="Reference")
-    assert close(color(page, 0.25), shown(page, "average"))
+    see(page, shown(page, "average"), 0.25)
     page.locator("#swap").click()
-    assert page.locator("#labels div").all_inner_texts()[0].startswith("Reference")
+    until(page, "document.querySelector('#labels div').textContent.startsWith('Reference')")
 
 
 def test_frames_are_scrubbed_and_played(page: Any) -> None:
     page.locator("#frame").focus()
     page.keyboard.press("ArrowRight")
-    assert page.locator("#frame-text").inner_text() == "frame 10"
-    assert close(color(page, 0.75), shown(page, "final", number=10))
+    until(page, "document.getElementById('frame-text').textContent === 'frame 10'")
+    see(page, shown(page, "final", number=10), 0.75)
     page.locator("#canvas").focus()
     page.keyboard.press(",")
-    assert close(color(page, 0.75), shown(page, "final", number=9))
+    see(page, shown(page, "final", number=9), 0.75)
     page.select_option("#rate", "24")
     page.keyboard.press("Escape")
     page.locator("#canvas").focus()
@@ -421,19 +429,20 @@ def test_frames_are_scrubbed_and_played(page: Any) -> None:
 def test_exposure_moves_both_pictures_as_the_curve_says(page: Any) -> None:
     before = float(page.input_value("#ev"))
     page.locator("#canvas").focus()
-    for _ in range(4):
+    for _ in range(6):
         page.keyboard.press("]")
-    assert close(color(page, 0.25), shown(page, "noisy", ev=before + 2))
-    assert close(color(page, 0.75), shown(page, "final", ev=before + 2))
+    see(page, shown(page, "noisy", ev=before + 3), 0.25)
+    see(page, shown(page, "final", ev=before + 3), 0.75)
 
 
 def test_zoom_and_pan_are_the_same_in_both_panes(page: Any) -> None:
     page.select_option("#right", label="Noisy")
     page.check("[name=layout][value=pair]", force=True)
     page.locator("#canvas").focus()
-    for _ in range(9):
+    for _ in range(4):
         page.keyboard.press("+")
-    for key, times in (("ArrowLeft", 60), ("ArrowUp", 60), ("ArrowRight", 2)):
+    # From the middle, (16, 9), to the bright pixel around (6.5, 4.5); a press is a tenth of what is in sight, 0.63.
+    for key, times in (("ArrowLeft", 15), ("ArrowUp", 7)):
         for _ in range(times):
             page.keyboard.press(key)
     script = """() => { const c = document.getElementById('canvas'), half = c.width >> 1;
@@ -441,37 +450,36 @@ def test_zoom_and_pan_are_the_same_in_both_panes(page: Any) -> None:
         const same = []; for (let y = 30; y < c.height; y += 7) for (let x = 12; x < half - 12; x += 7)
             same.push([data[4 * (y * c.width + x)], data[4 * (y * c.width + x + half)]]);
         return same; }"""
+    until(page, "parseFloat(document.getElementById('zoom-text').textContent) > 20")
     color(page, 0.5)
     pairs = page.evaluate(script)
     assert all(a == b for a, b in pairs)
-    assert float(page.locator("#zoom-text").inner_text().rstrip("×")) > 20
+    assert len({a for a, _ in pairs}) > 1  # the bright pixel is in sight
 
 
 def test_one_pixel_is_where_it_belongs(page: Any) -> None:
     page.locator("#divider").focus()
     page.keyboard.press("End")
-    bright = color(page, 6.5 / 32, 4.5 / 18)
-    assert min(bright) > 200
-    assert close(color(page, 8.5 / 32, 4.5 / 18), shown(page, "noisy"))
+    see(page, shown(page, "bright"), 6.5 / 32, 4.5 / 18)
+    see(page, shown(page, "noisy"), 8.5 / 32, 4.5 / 18)
     box = page.locator("#canvas").bounding_box()
     page.mouse.move(box["x"] + 6.5 / 32 * box["width"], box["y"] + 4.5 / 18 * box["height"])
     until(page, "document.getElementById('readout').textContent.startsWith('(6, 4)')")
-    # 8 to half a step of 1.5 %
-    assert float(page.locator("#readout").inner_text().split("Noisy")[1].split()[0]) == pytest.approx(8, rel=0.0075)
+    # 8 × 1.5 on frame 9, to half a step of 1.5 %
+    assert float(page.locator("#readout").inner_text().split("Noisy")[1].split()[0]) == pytest.approx(12, rel=0.0075)
 
 
 def test_errors_and_maps_are_drawn_on_a_scale(page: Any) -> None:
     page.select_option("#right", label="Average")  # the reference itself
     page.select_option("#view", label="Error")
-    assert max(color(page, 0.75)) <= 5  # magma's zero
-    assert min(color(page, 0.25)) > 150  # off its end: noisy is a tenth of the reference
+    see(page, [0, 0, 4], 0.75)  # magma's zero
+    see(page, [0xFC, 0xFD, 0xBF], 0.25)  # and its end: noisy is a tenth of the reference
     page.select_option("#right", label="Final")
     page.select_option("#view", label="Confidence")
     page.locator("#divider").focus()
     page.keyboard.press("Home")
-    low, high = color(page, 0.01, 0.9), color(page, 0.99, 0.9)
-    assert np.abs(np.subtract(low, [0x44, 0x01, 0x54])).max() <= 3
-    assert np.abs(np.subtract(high, [0xFD, 0xE7, 0x25])).max() <= 3
+    see(page, [0x44, 0x01, 0x54], 0.01, 0.9)  # viridis from end to end
+    see(page, [0xFD, 0xE7, 0x25], 0.99, 0.9)
     page.check("[name=layout][value=all]", force=True)
     until(page, "document.querySelectorAll('#labels div').length === 4")
 
@@ -502,7 +510,7 @@ def test_the_axes_can_be_chosen_and_the_points_tell_their_settings(page: Any) ->
     page.keyboard.press("Home")
     assert "Average" in tip.inner_text()
     page.keyboard.press("Enter")  # sends it to the viewer
-    assert close(color(page, 0.75), shown(page, "average"))
+    see(page, shown(page, "average"), 0.75)
     page.keyboard.press("Escape")
     assert tip.is_hidden()
     plot.locator(".point[data-name=slow] .target").hover()
