@@ -1,0 +1,228 @@
+"""Thresholded kernels, and applying them."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network.kernels import apply_kernels, filter_window, mean_of, predict_kernel, threshold_kernel
+
+pytestmark = pytest.mark.neural
+
+
+def uniform(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def eta(weights: list[float], t: float, centre: int) -> list[float]:
+    """The paper's activation, tap by tap."""
+    above = [max(0.0, w - t) for w in weights]
+    total = sum(above)
+    if total == 0:
+        return [1.0 if i == centre else 0.0 for i in range(len(weights))]
+    return [a / total for a in above]
+
+
+def by_loops(kernels: torch.Tensor, frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    n, t, c, h, w = frames.shape
+    size = round((kernels.shape[1] / t) ** 0.5)
+    numerators, denominators = torch.zeros(n, t, c, h, w).double(), torch.zeros(n, t, 1, h, w).double()
+    for b, f, y, x, row, column in itertools.product(range(n), range(t), range(h), range(w), range(size), range(size)):
+        yy, xx = y + row - size // 2, x + column - size // 2
+        if 0 <= yy < h and 0 <= xx < w:
+            k = kernels[b, f * size * size + row * size + column, y, x]
+            numerators[b, f, :, y, x] += k * frames[b, f, :, yy, xx]
+            denominators[b, f, 0, y, x] += k
+    return numerators, denominators
+
+
+@pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
+def test_threshold_kernel_is_the_papers_equation(t: float) -> None:
+    weights = uniform(2, 9, 3, 4) * 0.4 - 0.15
+    weights[0, :, 0, 0] = -1
+    kernel = threshold_kernel(weights, t, centre=4)
+    for n, y, x in itertools.product(range(2), range(3), range(4)):
+        expected = torch.tensor(eta(weights[n, :, y, x].tolist(), t, 4), dtype=torch.float64)
+        torch.testing.assert_close(kernel[n, :, y, x], expected)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
+def test_predicted_kernel_is_normalised_thresholded_and_normalised(t: float) -> None:
+    weights = uniform(1, 9, 3, 4, seed=1) * 7 - 2
+    weights[0, :, 1, 1] = -3
+    expected = threshold_kernel(threshold_kernel(weights, 0, centre=4), t, centre=4)
+    torch.testing.assert_close(predict_kernel(weights, t, centre=4), expected)
+
+
+def test_the_default_threshold_is_half_of_one_over_k() -> None:
+    weights = uniform(1, 8, 2, 2)
+    for activation in (threshold_kernel, predict_kernel):
+        assert torch.equal(activation(weights, centre=0), activation(weights, 1 / 16, centre=0))
+
+
+def test_equal_weights_survive_every_threshold_that_is_allowed() -> None:
+    kernel = threshold_kernel(torch.full((1, 25, 1, 1), 1 / 25, dtype=torch.float64), 0.0399, centre=12)
+    torch.testing.assert_close(kernel, torch.full_like(kernel, 1 / 25))
+
+
+@pytest.mark.parametrize("t", [1 / 9, 0.2, -0.01, float("nan")])
+def test_a_threshold_of_one_over_k_or_more_is_an_error(t: float) -> None:
+    for activation in (threshold_kernel, predict_kernel):
+        with pytest.raises(ValueError, match=r"threshold: expected 0 <= t < 1/K"):
+            activation(torch.ones(1, 9, 1, 1), t, centre=4)
+
+
+def test_a_centre_that_is_no_tap_is_an_error() -> None:
+    with pytest.raises(ValueError, match="centre: expected a tap from 0 to 8, got 9"):
+        predict_kernel(torch.ones(1, 9, 1, 1), centre=9)
+
+
+def test_nothing_above_the_threshold_gives_the_identity_and_no_gradient() -> None:
+    weights = torch.full((1, 9, 1, 2), -1.0, dtype=torch.float64)
+    weights[0, :, 0, 1] = 1
+    weights.requires_grad_()
+    kernel = predict_kernel(weights, centre=4)
+    assert kernel[0, :, 0, 0].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
+    (gradient,) = torch.autograd.grad((kernel * uniform(1, 9, 1, 2)).sum(), weights)
+    assert torch.equal(gradient[..., 0], torch.zeros(1, 9, 1, dtype=torch.float64))
+    assert bool(gradient[..., 1].any())
+
+
+def test_predicted_kernels_do_not_depend_on_the_scale_of_the_weights() -> None:
+    weights = uniform(1, 25, 3, 3)
+    torch.testing.assert_close(predict_kernel(weights * 1000, centre=12), predict_kernel(weights, centre=12))
+
+
+def test_a_higher_threshold_removes_taps_and_never_adds_one() -> None:
+    weights = uniform(1, 25, 8, 8)
+    used = [predict_kernel(weights, t, centre=12) > 0 for t in (0, 0.01, 0.02, 0.03, 0.039)]
+    for less, more in itertools.pairwise(used):
+        assert not bool((more & ~less).any())
+        assert int(more.sum()) < int(less.sum())
+
+
+def test_kernels_are_float32_even_of_bfloat16_weights() -> None:
+    kernel = predict_kernel(uniform(1, 126, 4, 4).bfloat16(), centre=62)
+    assert kernel.dtype == torch.float32
+    torch.testing.assert_close(kernel.sum(1), torch.ones(1, 4, 4))
+
+
+@pytest.mark.parametrize("activation", [threshold_kernel, predict_kernel])
+def test_activation_gradient(activation) -> None:  # type: ignore[no-untyped-def]
+    weights = (uniform(2, 9, 3, 2, seed=5) * 0.5 - 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: activation(w, 0.06, centre=4), weights)
+
+
+def test_activation_gradient_with_a_threshold_per_sample() -> None:
+    weights = uniform(2, 9, 3, 2, seed=5).requires_grad_()
+    threshold = torch.tensor([0.02, 0.1], dtype=torch.float64).view(2, 1, 1, 1)
+    assert torch.autograd.gradcheck(lambda w: predict_kernel(w, threshold, centre=4), weights)
+
+
+# 3×4 and 1×2 pixels are smaller than the 5×5 kernel, so that some taps are outside everywhere.
+@pytest.mark.parametrize(("size", "shape"), [(1, (4, 5)), (3, (4, 5)), (5, (3, 4)), (5, (1, 2))])
+def test_applying_kernels_against_loops(size: int, shape: tuple[int, int]) -> None:
+    kernels, frames = uniform(2, 3 * size * size, *shape), uniform(2, 3, 2, *shape, seed=1)
+    for got, expected in zip(apply_kernels(kernels, frames), by_loops(kernels, frames), strict=True):
+        torch.testing.assert_close(got, expected)
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (1, 2)])
+def test_gradient_of_applying_kernels(shape: tuple[int, int]) -> None:
+    kernels = uniform(2, 18, *shape).requires_grad_()
+    frames = uniform(2, 2, 2, *shape, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(apply_kernels, (kernels, frames))
+
+
+def test_an_impulse_shows_where_each_tap_reads() -> None:
+    """Tap (frame 1, row 0, column 2) of a 3×3 kernel reads the pixel above and to the right, in frame 1."""
+    kernels = torch.zeros(1, 27, 5, 5)
+    kernels[0, 9 + 2] = 1
+    frames = torch.zeros(1, 3, 1, 5, 5)
+    frames[0, 1, 0, 1, 3] = 1
+    numerators, _ = apply_kernels(kernels, frames)
+    assert numerators.nonzero().tolist() == [[0, 1, 0, 2, 2]]
+
+
+def test_constants_are_preserved_also_at_the_border() -> None:
+    kernels = predict_kernel(uniform(1, 75, 6, 7).float(), centre=37)
+    frames = torch.full((1, 3, 3, 6, 7), 1e6)
+    filtered = mean_of(*apply_kernels(kernels, frames), frames[:, 1])
+    torch.testing.assert_close(filtered, frames[:, 1])  # float32 rounding
+
+
+def test_inside_the_image_the_shares_of_the_frames_sum_to_one() -> None:
+    kernels = predict_kernel(uniform(1, 75, 8, 8).float(), centre=37)
+    _, denominators = apply_kernels(kernels, torch.zeros(1, 3, 1, 8, 8))
+    torch.testing.assert_close(denominators.sum(1)[..., 2:-2, 2:-2], torch.ones(1, 1, 4, 4))
+
+
+def test_a_firefly_outside_the_support_of_the_kernel_leaves_no_trace() -> None:
+    kernels = torch.zeros(1, 25, 9, 9)
+    kernels[:, 12] = 1
+    frames = torch.ones(1, 1, 3, 9, 9)
+    frames[..., 4, 5] = 1e30
+    filtered = mean_of(*apply_kernels(kernels, frames), frames[:, 0])
+    assert torch.equal(filtered[..., :5], torch.ones(1, 3, 9, 5))
+
+
+def test_the_estimate_counts_with_its_frame() -> None:
+    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 27 + 27, 5, 4, seed=1)
+    window, window_share = apply_kernels(kernels[:, :27], color)
+    estimates = uniform(1, 3, 2, 5, 4, seed=2)
+    more, more_share = apply_kernels(kernels[:, 27:], estimates)
+    numerators, denominators = filter_window(kernels, color, 3, estimates)
+    torch.testing.assert_close(numerators, window + more)
+    torch.testing.assert_close(denominators, window_share + more_share)
+
+    more, more_share = apply_kernels(kernels[:, 27:36], estimates[:, :1])
+    numerators, denominators = filter_window(kernels[:, :36], color, 3, estimates[:, :1])
+    torch.testing.assert_close(numerators[:, 1], window[:, 1] + more[:, 0])
+    torch.testing.assert_close(denominators[:, 1], window_share[:, 1] + more_share[:, 0])
+    assert torch.equal(numerators[:, ::2], window[:, ::2])
+
+
+def test_a_layer_without_an_estimate_is_filtered_by_the_windows_taps() -> None:
+    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 28, 5, 4, seed=1)
+    for got, expected in zip(filter_window(kernels, color, 3), apply_kernels(kernels[:, :27], color), strict=True):
+        assert torch.equal(got, expected)
+
+
+def test_kernels_are_linear_so_that_layers_still_sum() -> None:
+    kernels, a, b = uniform(1, 27, 5, 4), uniform(1, 3, 3, 5, 4, seed=1), uniform(1, 3, 3, 5, 4, seed=2)
+
+    def filtered(x: torch.Tensor) -> torch.Tensor:
+        return mean_of(*filter_window(kernels, x, 3), x[:, 1])
+
+    torch.testing.assert_close(filtered(a + b), filtered(a) + filtered(b))
+
+
+def test_without_any_weight_the_image_is_the_fallback() -> None:
+    fallback = uniform(1, 3, 4, 4)
+    image = mean_of(torch.zeros(1, 2, 3, 4, 4), torch.zeros(1, 2, 1, 4, 4), fallback)
+    torch.testing.assert_close(image, fallback)
+
+
+@pytest.mark.parametrize(
+    ("kernels", "frames", "message"),
+    [
+        ((1, 27, 4, 4), (1, 3, 4, 4), r"expected \(N, T·K·K, H, W\)"),
+        ((2, 27, 4, 4), (1, 3, 1, 4, 4), r"expected \(N, T·K·K, H, W\)"),
+        ((1, 26, 4, 4), (1, 3, 1, 4, 4), "kernels: expected T·K·K taps with K odd for T = 3, got 26"),
+        ((1, 12, 4, 4), (1, 3, 1, 4, 4), "kernels: expected T·K·K taps with K odd for T = 3, got 12"),
+        ((1, 27, 4, 5), (1, 3, 1, 4, 4), "kernels: expected the frames' size"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_an_error(kernels, frames, message) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
+        apply_kernels(torch.zeros(kernels), torch.zeros(frames))
+
+
+def test_an_estimate_of_another_number_of_frames_is_an_error() -> None:
+    with pytest.raises(ValueError, match="estimate: expected 1 or 3 frames, got 2"):
+        filter_window(torch.zeros(1, 29, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 2, 1, 4, 4))

@@ -1,0 +1,169 @@
+"""Image losses, their bias under noise, and their conversion from space to time."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network.kernels import apply_kernels, mean_of, predict_kernel
+from network.losses import SUBSET_EPSILON, frame_pairs, l1, relmse, smape, temporal_loss, tone_mapped_psnr
+
+pytestmark = pytest.mark.neural
+
+LOSSES = [l1, smape, relmse]
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def by_loops(name: str, d: torch.Tensor, r: torch.Tensor, s: float) -> float:
+    """Each equation, pixel by pixel, for one sample (C, H, W)."""
+    values = []
+    for y in range(d.shape[1]):
+        for x in range(d.shape[2]):
+            level = sum(d[:, y, x].tolist()) / len(d)
+            for a, b in zip(d[:, y, x].tolist(), r[:, y, x].tolist(), strict=True):
+                if name == "l1":
+                    values.append(abs(a - b) / s)
+                elif name == "smape":
+                    values.append(abs(a - b) / (abs(a) + abs(b) + 0.01 * s))
+                else:
+                    e = abs(a - b) / math.sqrt(level**2 + 0.1 * s**2)
+                    values.append(e**2 if e <= 4 else 4**2 + 2 * 4 * (e - 4))
+    return sum(values) / len(values)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_against_loops(loss) -> None:  # type: ignore[no-untyped-def]
+    prediction, target = uniform(2, 3, 4, 5), uniform(2, 3, 4, 5, seed=1)
+    target[1, :, 2, 2] = 40  # beyond relmse's limit
+    scale = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    expected = [by_loops(loss.__name__, prediction[i], target[i], float(scale[i])) for i in range(2)]
+    torch.testing.assert_close(loss(prediction, target, scale), torch.tensor(expected, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_do_not_depend_on_the_scale(loss) -> None:  # type: ignore[no-untyped-def]
+    prediction, target, scale = uniform(1, 3, 4, 5), uniform(1, 3, 4, 5, seed=1), uniform(1, seed=2)
+    torch.testing.assert_close(loss(prediction * 1e4, target * 1e4, scale * 1e4), loss(prediction, target, scale))
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_of_equal_and_of_black_images_are_zero(loss) -> None:  # type: ignore[no-untyped-def]
+    image, scale = uniform(1, 3, 4, 5), torch.ones(1, dtype=torch.float64)
+    assert loss(image, image, scale).tolist() == [0]
+    assert loss(image * 0, image * 0, scale).tolist() == [0]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_of_losses(loss) -> None:  # type: ignore[no-untyped-def]
+    prediction, target = uniform(1, 3, 2, 2).requires_grad_(), uniform(1, 3, 2, 2, seed=1)
+    scale = torch.ones(1, dtype=torch.float64)
+    if loss is relmse:  # its denominator is meant to have none
+        (gradient,) = torch.autograd.grad(relmse(prediction, target, scale).sum(), prediction)
+        level = prediction.detach().mean(1, keepdim=True)
+        expected = 2 * (prediction - target) / (level**2 + 0.1) / prediction.numel()
+        torch.testing.assert_close(gradient, expected.detach())
+    else:
+        assert torch.autograd.gradcheck(lambda x: loss(x, target, scale), prediction)
+
+
+def pull_at_the_mean(loss) -> float:  # type: ignore[no-untyped-def]
+    """Slope of the loss at the true mean, where targets have the skewed noise of path tracing (gamma, mean 1).
+
+    Positive: the loss falls towards darker predictions. In relative units, so that losses compare.
+    """
+    generator = torch.Generator().manual_seed(0)
+    # Sum of two exponentials over 2: mean 1, standard deviation 0.71, median 0.84.
+    target = -torch.log(torch.rand(2, 1, 3, 200, 200, generator=generator, dtype=torch.float64)).mean(0)
+    target = target / target.mean()
+    prediction = torch.ones_like(target, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(prediction, target, torch.ones(1, dtype=torch.float64)).sum(), prediction)
+    return float(gradient.sum() / gradient.abs().sum())
+
+
+def test_relmse_does_not_bias_the_mean_and_the_others_darken_it() -> None:
+    # Exactly zero but for rounding: the sample's own mean is 1.
+    assert abs(pull_at_the_mean(lambda *a: relmse(*a, limit=math.inf))) < 1e-9
+    # 59 % of such targets are below their mean; L1 counts heads: 0.59 − 0.41.
+    assert pull_at_the_mean(l1) == pytest.approx(0.19, abs=0.02)
+    assert pull_at_the_mean(smape) > 0.1
+    # Values beyond four times the mean are 0.3 % here: the limit costs next to nothing.
+    assert 0 <= pull_at_the_mean(relmse) < 0.01
+
+
+def test_the_limit_bounds_what_one_firefly_does() -> None:
+    target = torch.ones(1, 3, 8, 8, dtype=torch.float64)
+    target[0, :, 3, 3] = 1e6
+    prediction = torch.ones_like(target, requires_grad=True)
+    (gradient,) = torch.autograd.grad(relmse(prediction, target, torch.ones(1)).sum(), prediction)
+    assert float(gradient.abs().max()) <= 2 * 4 / 192 + 1e-12  # 2 · limit over the number of values
+
+
+def test_pairs_are_one_frame_before_and_one_after() -> None:
+    assert frame_pairs(5) == [(0, 3), (1, 4)]  # the paper's: first and fourth, second and fifth
+    assert frame_pairs(3) == [(0, 2)]
+    assert frame_pairs(7) == [(0, 4), (1, 5), (2, 6)]
+    assert frame_pairs(1) == []
+
+
+@pytest.mark.parametrize("frames", [1, 3, 5])
+@pytest.mark.parametrize("whole", [0.0, 0.25])
+def test_temporal_loss_is_the_loss_of_renormalised_subsets(frames: int, whole: float) -> None:
+    """Zero the excluded frames' weights, renormalise the kernel, apply it: section 5 of the paper."""
+    kernels = predict_kernel(uniform(2, frames * 9, 6, 5), 0.0, centre=frames * 9 // 2)
+    color, target = uniform(2, frames, 3, 6, 5, seed=1), uniform(2, 3, 6, 5, seed=2)
+    modulation, scale = uniform(2, 3, 6, 5, seed=3), torch.tensor([0.5, 2.0], dtype=torch.float64)
+    numerators, denominators = apply_kernels(kernels, color)
+
+    terms = [((frames // 2,), 1.0)] + [(pair, 1.0) for pair in frame_pairs(frames)]
+    terms += [(tuple(range(frames)), whole)] if whole else []
+    expected = 0
+    for subset, weight in terms:
+        kept = torch.zeros(frames, 1, dtype=torch.float64)
+        kept[list(subset)] = 1
+        part = kernels * kept.expand(frames, 9).reshape(1, -1, 1, 1)
+        part = part / part.sum(1, keepdim=True)
+        image = mean_of(*apply_kernels(part, color), color[:, frames // 2], 0) * modulation
+        expected = expected + weight * l1(image, target, scale * modulation.mean((1, 2, 3)))
+    expected = expected / sum(weight for _, weight in terms)
+    got = temporal_loss(l1, numerators, denominators, color, target, modulation, scale, whole)
+    # A subset has a share of about 1/5 or more; its fallback weighs 1e-3 beside that.
+    torch.testing.assert_close(got, expected, rtol=2e-2, atol=0)
+    assert SUBSET_EPSILON == 1e-3
+
+
+def test_frames_without_weight_are_judged_by_their_own_pixels() -> None:
+    """All weight on the centre: the pairs' images are the plain means of the pairs, and nothing is NaN."""
+    color, target = uniform(1, 5, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
+    numerators, denominators = torch.zeros(1, 5, 3, 4, 4).double(), torch.zeros(1, 5, 1, 4, 4).double()
+    numerators[:, 2], denominators[:, 2] = color[:, 2], 1
+    one = torch.ones(1, dtype=torch.float64)
+    got = temporal_loss(l1, numerators, denominators, color, target, torch.ones_like(target), one)
+    images = [color[:, 2], color[:, [0, 3]].mean(1), color[:, [1, 4]].mean(1)]
+    torch.testing.assert_close(got, sum(l1(image, target, one) for image in images) / 3)
+
+
+def test_temporal_loss_does_not_depend_on_the_scale() -> None:
+    color, target, modulation = uniform(1, 3, 3, 4, 4), uniform(1, 3, 4, 4, seed=1), uniform(1, 3, 4, 4, seed=2)
+    sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
+    scale = torch.ones(1, dtype=torch.float64)
+    once = temporal_loss(relmse, *sums, color, target, modulation, scale, 1.0)
+    numerators, denominators = sums
+    scaled = temporal_loss(
+        relmse, numerators * 512, denominators, color * 512, target * 512, modulation, scale * 512, 1.0
+    )
+    torch.testing.assert_close(scaled, once)
+
+
+def test_psnr_on_the_tone_curve() -> None:
+    a, b = torch.full((1, 3, 4, 4), 1.0), torch.full((1, 3, 4, 4), 3.0)
+    # 1/2 against 3/4: an error of 1/4.
+    assert tone_mapped_psnr(a, b).tolist() == pytest.approx([-20 * math.log10(0.25)], abs=1e-5)
+    assert tone_mapped_psnr(-a, 0 * a).tolist() == pytest.approx([120])  # negative counts as 0; 1e-12 is the floor

@@ -1,0 +1,439 @@
+"""The networks: what goes in, which kernels come out, and what connects the frames."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network.inputs import network_inputs, window_exposure
+from network.kernels import filter_window, mean_of
+from network.models import (
+    KernelConfig,
+    KernelHead,
+    RAResNet,
+    RAResNetConfig,
+    RAUNet,
+    RAUNetConfig,
+    denoise_tile,
+    fast,
+    for_inference,
+    paper,
+)
+
+pytestmark = pytest.mark.neural
+
+SMALL = KernelConfig(frames=3, size=3, estimate_frames=1)
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def window(n: int = 1, t: int = 3, h: int = 8, w: int = 12) -> dict[str, torch.Tensor]:
+    """A made-up aligned window."""
+    return {
+        "color": uniform(n, t, 3, h, w),
+        "albedo": uniform(n, t, 3, h, w, seed=1),
+        "normal": uniform(n, t, 3, h, w, seed=2) * 2 - 1,
+        "confidence": uniform(n, t, 1, h, w, seed=3),
+    }
+
+
+def small_unet(kernel: KernelConfig = SMALL, **sizes: tuple[int, ...]) -> RAUNet:
+    torch.manual_seed(0)
+    return RAUNet(RAUNetConfig(kernel, **{"widths": (4, 8, 8), **sizes}))
+
+
+def small_resnet(kernel: KernelConfig = SMALL) -> RAResNet:
+    torch.manual_seed(0)
+    return RAResNet(RAResNetConfig(kernel, width=4, blocks=4, ra_after=(1, 2, 4), skips=2))
+
+
+@torch.no_grad()
+def run(model: RAUNet | RAResNet, data: dict[str, torch.Tensor], present: float = 0.0) -> torch.Tensor:
+    """Kernels of a window, with an estimate that is its mean."""
+    n = len(data["color"])
+    takes = model.config.kernel.estimate_frames > 0
+    here = torch.full((n,), present)
+    estimate = data["color"].mean(1, keepdim=True) if takes else None
+    features = network_inputs(
+        **data, exposure=window_exposure(data["color"]), takes_estimate=takes, estimate=estimate, present=here
+    )
+    return model(features, data["confidence"], here)
+
+
+# Inputs
+
+
+def test_exposure_is_the_mean_of_an_image_without_outliers() -> None:
+    color = uniform(2, 3, 3, 16, 16) + 0.5  # nothing is above four times the mean
+    torch.testing.assert_close(window_exposure(color), color.mean((1, 2, 3, 4)))
+
+
+def test_exposure_scales_with_the_image() -> None:
+    color = uniform(1, 3, 3, 16, 16) ** 8  # skewed, so that the limit is at work
+    for scale in (2.0**-20, 2.0**20):
+        assert torch.equal(window_exposure(color * scale), window_exposure(color) * scale)  # powers of two: exact
+    torch.testing.assert_close(window_exposure(color * 1234.5), window_exposure(color) * 1234.5)
+
+
+def test_a_firefly_does_not_move_the_exposure() -> None:
+    color = uniform(1, 5, 3, 32, 32)
+    before = window_exposure(color)
+    color[0, 2, :, 5, 5] = 1e6
+    # 1 pixel of 5120 now counts as at most 4 means.
+    torch.testing.assert_close(window_exposure(color), before, rtol=5e-3, atol=0)
+
+
+def test_the_exposure_of_a_black_window_is_one() -> None:
+    assert window_exposure(torch.zeros(2, 3, 3, 4, 4)).tolist() == [1, 1]
+
+
+def test_channels_and_their_order() -> None:
+    data = window()
+    estimate = uniform(1, 1, 3, 8, 12, seed=9)
+    features = network_inputs(**data, exposure=torch.tensor([0.5]), takes_estimate=True, estimate=estimate)
+    expected = torch.cat(
+        [
+            torch.log1p(data["color"] / 0.5),
+            torch.log1p(data["albedo"]),
+            data["normal"],
+            data["confidence"],
+            torch.log1p(estimate / 0.5).expand(1, 3, 3, 8, 12),
+            torch.ones(1, 3, 1, 8, 12),
+        ],
+        2,
+    )
+    torch.testing.assert_close(features, expected)
+    without = network_inputs(**data, exposure=torch.tensor([0.5]), takes_estimate=False, estimate=estimate)
+    torch.testing.assert_close(without, expected[:, :, :10])
+
+
+def test_what_is_missing_is_zero() -> None:
+    data = window()
+    features = network_inputs(
+        data["color"], None, None, data["confidence"], torch.ones(1), takes_estimate=True, estimate=None
+    )
+    assert not bool(features[:, :, 3:9].any())
+    assert not bool(features[:, :, 10:].any())
+
+
+def test_an_estimate_that_is_not_present_is_not_seen() -> None:
+    data = window(n=2)
+    estimate = uniform(2, 1, 3, 8, 12, seed=9)
+    present = torch.tensor([0.0, 1.0])
+    features = network_inputs(**data, exposure=torch.ones(2), takes_estimate=True, estimate=estimate, present=present)
+    assert not bool(features[0, :, 10:].any())
+    torch.testing.assert_close(features[1, 0, 10:13], torch.log1p(estimate[1, 0]))
+
+
+def test_features_do_not_depend_on_the_scale_of_the_radiance() -> None:
+    data = window()
+    scaled = {**data, "color": data["color"] * 4096}
+    features, same = (
+        network_inputs(**d, exposure=window_exposure(d["color"]), takes_estimate=False) for d in (data, scaled)
+    )
+    assert torch.equal(features, same)  # a power of two
+
+
+def test_extreme_radiance_stays_finite_and_moderate() -> None:
+    data = window()
+    data["color"][0, 0, 0, 0] = torch.tensor([1e6, -3.0, 0.0] * 4)
+    features = network_inputs(**data, exposure=torch.tensor([0.5]), takes_estimate=False)
+    assert float(features.max()) < 16  # log1p(2e6) = 14.5
+    assert float(features[:, :, :3].min()) == 0
+
+
+@pytest.mark.parametrize("name", ["albedo", "normal", "confidence"])
+def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
+    data = window()
+    data[name] = data[name][..., :-1]
+    with pytest.raises(ValueError, match=f"{name}: expected shape"):
+        network_inputs(**data, exposure=torch.ones(1), takes_estimate=False)
+
+
+def test_an_exposure_or_an_estimate_of_another_shape_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
+        network_inputs(**window(), exposure=torch.ones(2), takes_estimate=False)
+    with pytest.raises(ValueError, match="estimate: expected shape"):
+        network_inputs(**window(), exposure=torch.ones(1), takes_estimate=True, estimate=torch.zeros(1, 3, 8, 12))
+
+
+# Kernels of an untrained model
+
+
+def silent_head(config: KernelConfig) -> KernelHead:
+    """A head that predicts no correction."""
+    head = KernelHead(4, config)
+    for parameter in head.parameters():
+        torch.nn.init.zeros_(parameter)
+    return head
+
+
+def test_without_an_estimate_and_at_full_confidence_the_kernels_start_uniform() -> None:
+    config = KernelConfig()
+    kernels = silent_head(config)(torch.zeros(5, 4, 6, 6), torch.ones(1, 5, 1, 6, 6), torch.zeros(1))
+    torch.testing.assert_close(kernels, torch.full((1, 125, 6, 6), 1 / 125))
+
+
+@pytest.mark.parametrize("estimate_frames", [0, 1, 3])
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9])
+def test_the_kernels_start_at_the_confidence_and_half_the_estimate(estimate_frames: int, threshold: float) -> None:
+    config = KernelConfig(frames=3, size=3, estimate_frames=estimate_frames, threshold=threshold)
+    confidence = torch.tensor([0.5, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(2, 3, 1, 4, 4)
+    present = torch.tensor([0.0, 1.0])
+    kernels = silent_head(config)(torch.zeros(6, 4, 4, 4), confidence, present)
+    share = 0.5 if estimate_frames else 0.0
+    for sample, here in ((0, 0.0), (1, share)):
+        frames = kernels[sample, :27].unflatten(0, (3, 9)).sum(1)
+        expected = torch.tensor([1 / 3, 2 / 3, 0]).view(3, 1, 1).expand(3, 4, 4) * (1 - here)
+        torch.testing.assert_close(frames, expected, rtol=0, atol=2e-3)  # 1e-3 is added to each confidence
+        torch.testing.assert_close(kernels[sample, 27:].sum(0), torch.full((4, 4), here), rtol=0, atol=1e-6)
+
+
+def test_a_correction_reaches_any_kernel() -> None:
+    """Also all weight on one tap of a frame without confidence."""
+    config = KernelConfig(frames=3, size=3, estimate_frames=1)
+    head = silent_head(config)
+    with torch.no_grad():
+        head.window.bias.fill_(-2)
+        head.window.bias[7] = 50
+        head.estimate.bias.fill_(-2)
+        head.window.weight[7, 0, 1, 1] = -100  # and only where the feature is not 1: in frame 2
+    features = torch.ones(3, 4, 5, 5)
+    features[2] = 0
+    confidence = torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(1, 3, 1, 5, 5)
+    kernels = head(features, confidence, torch.ones(1))
+    expected = torch.zeros(28)
+    expected[18 + 7] = 1
+    torch.testing.assert_close(kernels[0, :, 2, 2], expected)
+
+
+def test_a_higher_threshold_at_run_time_uses_fewer_taps() -> None:
+    model = small_unet()
+    with torch.no_grad():
+        model.head.window.weight.mul_(30)  # an untrained head is nearly uniform
+    data = window()
+    features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True)
+    used = [int((model(features, data["confidence"], torch.zeros(1), t) > 0).sum()) for t in (0, 0.3, 0.6, 0.95)]
+    assert used[0] > used[1] > used[2] > used[3]
+
+
+@pytest.mark.parametrize("threshold", [1.0, -0.1])
+def test_a_threshold_of_one_or_more_is_an_error(threshold: float) -> None:
+    data = window()
+    features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True)
+    with pytest.raises(ValueError, match="threshold: expected 0 <= t·K < 1"):
+        small_unet()(features, data["confidence"], torch.zeros(1), threshold)
+    with pytest.raises(ValueError, match="threshold: expected 0 <= t·K < 1"):
+        KernelConfig(threshold=threshold)
+
+
+# Models
+
+
+@pytest.mark.parametrize("build", [small_unet, small_resnet])
+@pytest.mark.parametrize("frames", [1, 3, 5, 7])
+def test_kernels_of_any_window_length_are_kernels(build, frames: int) -> None:  # type: ignore[no-untyped-def]
+    model = build(replace(SMALL, frames=frames))
+    for present in (0.0, 1.0):
+        kernels = run(model, window(n=2, t=frames), present)
+        assert kernels.shape == (2, frames * 9 + 1, 8, 12)
+        assert float(kernels.min()) >= 0
+        torch.testing.assert_close(kernels.sum(1), torch.ones(2, 8, 12))
+        assert bool(kernels[:, -1].any()) == bool(present)
+
+
+def test_an_estimate_of_every_frame() -> None:
+    model = small_unet(replace(SMALL, estimate_frames=3, estimate_size=3))
+    data, estimates = window(), uniform(1, 3, 3, 8, 12, seed=5)
+    features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True, estimate=estimates)
+    kernels = model(features, data["confidence"], torch.ones(1))
+    assert kernels.shape[1] == 27 + 27
+    _, share = filter_window(kernels, data["color"], 3, estimates)
+    # Of a kernel with 1.0 over all, inside the border, some is in every frame.
+    torch.testing.assert_close(share.sum(1)[..., 1:-1, 1:-1], torch.ones(1, 1, 6, 10))
+    assert bool((share > 0).all())
+
+
+@pytest.mark.parametrize("build", [small_unet, small_resnet])
+def test_samples_of_a_batch_do_not_touch_each_other(build) -> None:  # type: ignore[no-untyped-def]
+    model, data = build(), window(n=2)
+    second = {name: value[1:] for name, value in data.items()}
+    torch.testing.assert_close(run(model, data)[1:], run(model, second), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("scales", [(), (0,), (1,), (2,), (0, 1, 2)])
+def test_only_robust_average_blocks_connect_the_frames(scales: tuple[int, ...]) -> None:
+    """What the head says of frame 0, before the frames' taps are normalised together, when frame 2 changes."""
+    model = small_unet(ra_scales=scales)
+    seen: list[torch.Tensor] = []
+    model.head.window.register_forward_hook(lambda module, inputs, output: seen.append(output))
+    data = window()
+    run(model, data)
+    data["albedo"] = data["albedo"].clone()
+    data["albedo"][:, 2] = 0
+    run(model, data)
+    assert torch.equal(seen[0][0], seen[1][0]) == (not scales)
+    assert not torch.equal(seen[0][2], seen[1][2])
+
+
+def test_the_paper_network_has_the_parameters_it_should() -> None:
+    """The parts' counts, width 80 and 3×3 convolutions; the sum is not the paper's 24 M."""
+    conv = 80 * 80 * 9 + 80
+    expected = {
+        "stem": 10 * 80 * 9 + 80,
+        "blocks": 24 * 2 * conv,
+        "average": 6 * (160 * 80 * 9 + 80 + 80 * 9 + 1),
+        "skip": 4 * (160 * 80 + 80),
+        "head": 80 * 25 * 9 + 25,
+    }
+    model = paper()
+    found = {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()}
+    assert found == expected
+    assert sum(expected.values()) == 3_541_471
+
+
+def test_the_fast_network_is_small() -> None:
+    model = fast()
+    assert sum(p.numel() for p in model.parameters()) < 250_000
+    pixels, total = 16 * 16, 0
+
+    def count(module: torch.nn.Conv2d, inputs: tuple[torch.Tensor], output: torch.Tensor) -> None:
+        nonlocal total
+        total += output.numel() * module.weight[0].numel()
+
+    for module in model.modules():
+        if isinstance(module, torch.nn.Conv2d):
+            module.register_forward_hook(count)
+    run(model, window(t=5, h=16, w=16))
+    assert total / pixels < 250_000  # multiplications per pixel, all five frames
+
+
+def test_presets_are_reproducible_and_leave_the_global_generator_alone() -> None:
+    torch.manual_seed(1)
+    expected = torch.rand(1)
+    torch.manual_seed(1)
+    first, second, other = fast(seed=3), fast(seed=3), fast(seed=4)
+    assert torch.equal(torch.rand(1), expected)
+    assert torch.equal(first.stem.weight, second.stem.weight)
+    assert not torch.equal(first.stem.weight, other.stem.weight)
+
+
+@pytest.mark.parametrize(("height", "width", "axis"), [(9, 12, "height"), (8, 10, "width"), (0, 12, "height")])
+def test_each_side_must_be_a_multiple(height: int, width: int, axis: str) -> None:
+    model = small_unet()
+    assert model.multiple == 4
+    with pytest.raises(ValueError, match=f"expected a {axis} that is a multiple of 4"):
+        model(torch.zeros(1, 3, 14, height, width), torch.ones(1, 3, 1, height, width), torch.zeros(1))
+
+
+@pytest.mark.parametrize("shape", [(1, 5, 14, 8, 8), (1, 3, 10, 8, 8), (3, 14, 8, 8)])
+def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"features: expected \(N, 3, 14, H, W\)"):
+        small_unet()(torch.zeros(shape), torch.ones(1, 3, 1, 8, 8), torch.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: KernelConfig(frames=4), "frames: expected an odd number >= 1, got 4"),
+        (lambda: KernelConfig(size=0), "size: expected an odd number"),
+        (lambda: KernelConfig(estimate_size=2), "estimate_size: expected an odd number"),
+        (lambda: KernelConfig(estimate_frames=3), "estimate_frames: expected 0, 1 or 5, got 3"),
+        (lambda: RAUNetConfig(widths=()), "widths: expected at least one"),
+        (lambda: RAUNetConfig(ra_scales=(3,)), "ra_scales: expected scales 0 to 2"),
+        (lambda: RAResNetConfig(ra_after=(3, 25)), "ra_after: expected ascending blocks 1 to 24"),
+        (lambda: RAResNetConfig(skips=7), "skips: expected 0 to 6, got 7"),
+        (lambda: RAResNetConfig(conv_size=4), "conv_size: expected an odd number"),
+    ],
+)
+def test_configurations_say_what_is_wrong(make, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# Denoising
+
+
+def denoised(model: RAUNet, data: dict[str, torch.Tensor], **more: torch.Tensor) -> torch.Tensor:
+    return denoise_tile(model, **data, **more)[0]
+
+
+def test_denoising_is_scale_equivariant() -> None:
+    model, data = small_unet(), window()
+    estimate = uniform(1, 1, 3, 8, 12, seed=5)
+    once = denoised(model, data, estimate=estimate)
+    for scale in (1e-3, 37.0, 1e4):
+        scaled = denoised(model, {**data, "color": data["color"] * scale}, estimate=estimate * scale)
+        torch.testing.assert_close(scaled, once * scale, rtol=1e-4, atol=0)  # float32 features, threshold edges
+
+
+def test_a_constant_stays_constant() -> None:
+    data = window()
+    data["color"] = torch.full_like(data["color"], 3.7)
+    torch.testing.assert_close(denoised(small_unet(), data), torch.full((1, 3, 8, 12), 3.7))
+
+
+def test_denoising_stays_within_the_range_of_its_input() -> None:
+    """A convex mean cannot leave it: no negative radiance, no overshoot beside a firefly."""
+    data = window()
+    data["color"][0, 1, :, 4, 4] = 1e6
+    out = denoised(small_unet(), data)
+    assert float(out.min()) >= float(data["color"].min())
+    assert float(out.max()) <= 1e6
+    assert bool(torch.isfinite(out).all())
+    black = denoised(small_unet(), {**data, "color": torch.zeros_like(data["color"])})
+    assert not bool(black.any())
+
+
+def test_a_model_with_an_estimate_also_runs_without() -> None:
+    model, data = small_unet(), window()
+    out, share, _ = denoise_tile(model, **data)
+    assert bool(torch.isfinite(out).all())
+    torch.testing.assert_close(share.sum(1)[..., 1:-1, 1:-1], torch.ones(1, 1, 6, 10))
+
+
+def test_a_model_without_estimates_ignores_one() -> None:
+    model, data = small_unet(replace(SMALL, estimate_frames=0)), window()
+    with_one = denoised(model, data, estimate=uniform(1, 1, 3, 8, 12, seed=5))
+    assert torch.equal(with_one, denoised(model, data))
+
+
+def test_layers_are_filtered_with_the_kernels_of_the_color() -> None:
+    model, data = small_unet(), window()
+    out, _, aovs = denoise_tile(model, **data, aovs=torch.cat([data["color"], data["color"][:, :, :1] * 2], 2))
+    torch.testing.assert_close(aovs, torch.cat([out, out[:, :1] * 2], 1))
+
+
+def test_bfloat16_is_close_to_float32() -> None:
+    data = window(h=16, w=16)
+    full = denoised(for_inference(small_unet(), bfloat16=False), data)
+    half = denoised(for_inference(small_unet(), bfloat16=True), data)
+    assert not torch.equal(half, full)
+    assert half.dtype == torch.float32
+    # bfloat16 has 8 bits; a weight may be off by 1 % and a pixel, being a mean of many, by less.
+    torch.testing.assert_close(half, full, rtol=1e-2, atol=1e-2)
+
+
+def test_a_tile_is_denoised_as_the_frame_is_if_it_has_its_halo() -> None:
+    """Beyond its receptive field the network cannot see where a tile was cut."""
+    model = small_unet(widths=(4, 4), ra_scales=(1,))
+    data = window(h=48, w=48)
+    exposure = window_exposure(data["color"])
+    whole = denoised(model, data, exposure=exposure)
+    tile = denoised(model, {k: v[..., :32, :32] for k, v in data.items()}, exposure=exposure)
+    # The field's radius is 26 here, half of it from the chain of three RA steps at half scale.
+    torch.testing.assert_close(tile[..., :4, :4], whole[..., :4, :4], rtol=1e-4, atol=1e-5)
+
+
+def test_the_image_is_the_ratio_of_the_sums() -> None:
+    model, data = small_unet(), window()
+    kernels = run(model, data, present=0.0)
+    expected = mean_of(*filter_window(kernels, data["color"], 3), data["color"][:, 1])
+    torch.testing.assert_close(denoised(model, data), expected, rtol=1e-4, atol=1e-5)
