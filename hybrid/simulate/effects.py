@@ -33,6 +33,7 @@ EVERYTHING: dict[str, Any] = {
     "layer.use_pass_object_index": True,
     "layer.cycles.pass_debug_sample_count": True,
 }
+PASSES = tuple(name for name in EVERYTHING if name.startswith("layer."))
 BOUNCE_KINDS = ("diffuse", "glossy", "transmission", "volume")
 
 BLUR_PIXELS = 0.1  # a tenth of the pixel filter's width cannot be seen through it
@@ -115,7 +116,7 @@ def effects_of(facts: SceneFacts) -> list[Decision]:
     cause it. Whether a *possible* bounce is worth its time is for `needed_bounces` to measure.
     """
     blurred = facts.motion_pixels * facts.shutter
-    passes = {name: False for name in EVERYTHING if name.startswith("layer.")}
+    passes = dict.fromkeys(PASSES, False)
     focusing = facts.mirrors + facts.transmissive
     return [
         Decision(
