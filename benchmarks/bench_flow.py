@@ -1,0 +1,125 @@
+"""Measure what each stage of `flow` costs; JSON on standard output.
+
+    python benchmarks/bench_flow.py --size 1920x1080 --threads 1
+
+CPU seconds of the process, after a warm-up (which compiles): median, least and greatest of the repeats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numba
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flow.confidence import estimate_confidence, mix_centre
+from flow.guide import prefilter_guide
+from flow.motion import compose_flow, forward_backward_error, invert_flow, normalize_motion
+from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.warp import warp
+
+# CPU seconds at 1920 x 1080 of the prototypes this replaces.
+PROTOTYPE = {"refine_flow 3/3/30": 1.2, "refine_flow 2/2/15": 0.38}
+
+
+def parse_arguments(argv: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=5)
+    return parser.parse_args(argv)
+
+
+def measure(function: Callable[[], object], repeats: int) -> dict[str, float]:
+    function()
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        seconds.append(time.process_time() - start)
+    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
+
+
+def make_pair(width: int, height: int) -> dict[str, np.ndarray]:
+    """A textured frame, its neighbour under a smooth motion of a few pixels, and noise on both."""
+    rng = np.random.default_rng(0)
+    texture = sum(
+        cv2.GaussianBlur(rng.normal(size=(height, width, 3)).astype(np.float32), (0, 0), s) * s for s in (1, 3, 9)
+    )
+    albedo = np.clip(0.5 + 0.3 * texture, 0, 1).astype(np.float32)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    flow = np.stack([3 + 0.002 * (x - width / 2), -2 + 0.002 * (y - height / 2)], axis=-1)
+    neighbour = warp(albedo, -flow)[0]
+    color, neighbour_color = (a * rng.gamma(4, 0.25, a.shape).astype(np.float32) for a in (albedo, neighbour))
+    normal = np.dstack([np.zeros_like(albedo[..., :2]), np.ones_like(x)])
+    return {"color": color, "neighbour_color": neighbour_color, "albedo": albedo, "neighbour_albedo": neighbour,
+            "normal": normal, "flow": flow, "vectors": np.dstack([-flow * [1, -1], flow * [-1, 1]])}  # fmt: skip
+
+
+def main(argv: list[str]) -> int:
+    options = parse_arguments(argv)
+    width, height = map(int, options.size.split("x"))
+    cv2.setNumThreads(options.threads)
+    numba.set_num_threads(options.threads)
+    pair = make_pair(width, height)
+    flow, color, albedo, normal = (pair[name] for name in ("flow", "color", "albedo", "normal"))
+    centre, noise = prefilter_guide(color, albedo, normal)
+    neighbour, _ = prefilter_guide(pair["neighbour_color"], pair["neighbour_albedo"], normal)
+    rng = np.random.default_rng(1)
+    start = flow + rng.normal(size=flow.shape).astype(np.float32)
+    stack = np.dstack([color, albedo, normal, color[..., :1]])
+    warped, inside = warp(albedo, flow)
+    light = {"scales": 2, "warps": 2, "iterations": 15}
+    stages: dict[str, Callable[[], object]] = {
+        "normalize_motion": lambda: normalize_motion(pair["vectors"], "cycles"),
+        "compose_flow": lambda: compose_flow(flow, flow),
+        "invert_flow": lambda: invert_flow(flow),
+        "forward_backward_error": lambda: forward_backward_error(flow, -flow),
+        "warp bilinear 3": lambda: warp(color, flow),
+        "warp bilinear 10": lambda: warp(stack, flow),
+        "warp bicubic 10": lambda: warp(stack, flow, interpolation="bicubic"),
+        "prefilter_guide": lambda: prefilter_guide(color, albedo),
+        "prefilter_guide with normal": lambda: prefilter_guide(color, albedo, normal),
+        "refine_flow 3/3/30": lambda: refine_flow(centre[..., 0], neighbour[..., 0], start, noise=noise[..., 0]),
+        "refine_flow 3/3/30, 2 guides": lambda: refine_flow(centre, neighbour, start, noise=noise),
+        "refine_flow 2/2/15": lambda: refine_flow(
+            centre[..., 0], neighbour[..., 0], start, noise=noise[..., 0], **light
+        ),
+        "refine_flow 2/2/15, 2 guides": lambda: refine_flow(centre, neighbour, start, noise=noise, **light),
+        "select_flow": lambda: select_flow([flow, start], centre, neighbour, noise=noise),
+        "dense_flow": lambda: dense_flow(centre, neighbour, noise=noise),
+        "estimate_confidence": lambda: estimate_confidence(
+            flow, inside=inside, reverse=-flow, albedo=albedo, warped_albedo=warped, normal=normal, warped_normal=normal
+        ),
+        "mix_centre": lambda: mix_centre(warped, albedo, inside.astype(np.float32)),
+    }
+    cpu_seconds = {name: measure(function, options.repeats) for name, function in stages.items()}
+    for name, prototype in PROTOTYPE.items():
+        cpu_seconds[name]["ratio_to_prototype"] = cpu_seconds[name]["median"] / (
+            prototype * width * height / (1920 * 1080)
+        )
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+    report = {
+        "size": [width, height], "threads": options.threads, "repeats": options.repeats, "seed": 0,
+        "cpu_seconds": cpu_seconds, "commit": commit, "machine": platform.machine(),
+        "python": platform.python_version(),
+        "numpy": np.__version__, "opencv": cv2.__version__, "numba": numba.__version__,
+    }  # fmt: skip
+    json.dump(report, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,162 @@
+"""How far a warped pixel may be trusted, and what stands in for it where it may not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from flow.motion import forward_backward_error
+
+
+def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
+    """Sundaram's test: 1 where going there and back ends near the start."""
+    error = forward_backward_error(flow, reverse)
+    # The loop is f + r, so r at the arrival is about -f within the error: |r| is taken as |f| + error at most.
+    length = np.hypot(flow[..., 0], flow[..., 1])
+    return error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5
+
+
+def _agree_albedo(
+    albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: np.ndarray | float
+) -> np.ndarray:
+    """exp(-d² / σ²) of the difference, relative where the albedo is above 1 (emitters, sky)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        difference = np.atleast_3d(albedo - warped)
+        greatest = np.maximum(np.atleast_3d(albedo).max(axis=-1), np.atleast_3d(warped).max(axis=-1))
+        scale = np.square(np.maximum(greatest, 1))
+        # Two noisy values differ by √2 times their noise; twice that costs no more than 1/e.
+        tolerated = np.square(sigma) + 8 * np.square(noise) / scale
+        return np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * tolerated))
+
+
+def _agree_normal(normal: np.ndarray, warped: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
+    """clamp((n·n' - 0.8) / 0.2) of the directions; 1 where neither has a surface, 0 where only one has."""
+    square, warped_square, product = (
+        np.einsum("yxc,yxc->yx", a, b) for a, b in ((normal, normal), (warped, warped), (normal, warped))
+    )
+    # Below a tenth of the samples on a surface, the direction is that of a stray sample.
+    surface, warped_surface = square > 0.01, warped_square > 0.01
+    cosine = product / np.sqrt(np.maximum(square * warped_square, 1e-4))
+    # Noise of deviation σ per component turns each of the two by about √2 σ, and lowers the cosine by 2 σ².
+    agreement = np.clip((cosine + 2 * np.square(noise) - 0.8) / 0.2, 0, 1)
+    return np.where(surface & warped_surface, agreement, surface == warped_surface)
+
+
+def estimate_confidence(
+    flow: np.ndarray,
+    *,
+    inside: np.ndarray,
+    reverse: np.ndarray | None = None,
+    albedo: np.ndarray | None = None,
+    warped_albedo: np.ndarray | None = None,
+    normal: np.ndarray | None = None,
+    warped_normal: np.ndarray | None = None,
+    depth: np.ndarray | None = None,
+    warped_depth: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
+    albedo_noise: np.ndarray | float = 0.0,
+    normal_noise: np.ndarray | float = 0.0,
+    albedo_sigma: float = 0.1,
+) -> np.ndarray:
+    """Estimate how far each pixel of a warped neighbour shows what the centre shows.
+
+    Parameters
+    ----------
+    flow
+        (H, W, 2) float, pixels, finite, centre to neighbour.
+    inside
+        (H, W) bool, as `flow.warp.warp` gives it.
+    reverse
+        (H, W, 2) float, neighbour to centre, or None.
+    albedo, warped_albedo
+        (H, W) or (H, W, C) float, of the centre and of the warped neighbour. One may come with the other only; so
+        for the next two pairs.
+    normal, warped_normal
+        (H, W, 3) float, any one space; any length, 0 where there is no surface.
+    depth, warped_depth
+        (H, W) float > 0, any unit. Only for motion that hardly changes the distance.
+    valid
+        (H, W) bool: vectors and pixels known to be good.
+    albedo_noise, normal_noise
+        Standard deviation of a component, scalar or (H, W): under depth of field guides are noisy, and differ
+        without being wrong. `flow.guide.estimate_noise` gives it.
+    albedo_sigma
+        Difference (norm over channels) at which the confidence falls to 1/e.
+
+    Returns
+    -------
+    numpy.ndarray
+        (H, W) float32 in [0, 1]. Non-finite guides give 0.
+
+    Raises
+    ------
+    ValueError
+        Half a pair, or shapes that do not agree.
+
+    Notes
+    -----
+    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / σ_a²) · clamp((n·n′ − 0.8) / 0.2)
+    · clamp((0.2 − |Δd| / max(d, d′)) / 0.1) · valid, then the minimum of 3 x 3 pixels, because what surrounds an
+    occlusion is mixed into its border. Δa is divided by the albedo where that is above 1. What moves without the
+    geometry (shadows, reflections) is invisible here.
+
+    References
+    ----------
+    Sundaram, Brox, Keutzer: Dense point trajectories by GPU-accelerated large displacement optical flow. 2010.
+    doi:10.1007/978-3-642-15549-9_32
+    """
+    shape = flow.shape[:2]
+    if flow.ndim != 3 or flow.shape[2] != 2:
+        raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
+    pairs = {"albedo": (albedo, warped_albedo), "normal": (normal, warped_normal), "depth": (depth, warped_depth)}
+    for name, (centre, warped) in pairs.items():
+        if (centre is None) != (warped is None):
+            raise ValueError(f"{name} and warped_{name} come together, got only one of them")
+        if centre is not None and warped is not None and (centre.shape != warped.shape or centre.shape[:2] != shape):
+            raise ValueError(f"{name} has shape {centre.shape}, warped_{name} {warped.shape}, expected both {shape}")
+    for name, mask in (("inside", inside), ("valid", valid)):
+        if mask is not None and mask.shape != shape:
+            raise ValueError(f"{name} has shape {mask.shape}, expected {shape}")
+
+    confidence = inside.astype(np.float32)
+    if valid is not None:
+        confidence *= valid
+    if reverse is not None:
+        confidence *= _agree_forward_backward(flow, reverse)
+    with np.errstate(invalid="ignore"):
+        if albedo is not None and warped_albedo is not None:
+            confidence *= _agree_albedo(albedo, warped_albedo, albedo_sigma, albedo_noise)
+        if normal is not None and warped_normal is not None:
+            confidence *= _agree_normal(normal, warped_normal, normal_noise)
+        if depth is not None and warped_depth is not None:
+            farther = np.maximum(np.abs(depth), np.abs(warped_depth))
+            relative = np.abs(depth - warped_depth) / np.maximum(farther, np.finfo(np.float32).tiny)
+            confidence *= np.clip((0.2 - relative) / 0.1, 0, 1)
+    confidence = np.nan_to_num(confidence, nan=0.0).astype(np.float32)
+    return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
+
+
+def mix_centre(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """Put the centre in the place of a warped neighbour where that cannot be trusted.
+
+    Parameters
+    ----------
+    warped, centre
+        (H, W) or (H, W, C) float, any unit.
+    confidence
+        (H, W) float in [0, 1].
+
+    Returns
+    -------
+    numpy.ndarray
+        float32, the shape of `centre`: c · warped + (1 − c) · centre; exactly the centre where c is 0, whatever
+        `warped` holds there.
+    """
+    if warped.shape != centre.shape or confidence.shape != centre.shape[:2]:
+        raise ValueError(
+            f"warped has shape {warped.shape}, confidence {confidence.shape}, expected those of centre, {centre.shape}"
+        )
+    weight = np.asarray(confidence, np.float32).reshape(*confidence.shape, *(1,) * (centre.ndim - 2))
+    with np.errstate(invalid="ignore", over="ignore"):
+        mixed = weight * np.asarray(warped, np.float32) + (1 - weight) * np.asarray(centre, np.float32)
+    return np.where(weight > 0, mixed, np.asarray(centre, np.float32))
