@@ -1,0 +1,308 @@
+"""Averages over an aligned window, robust to outliers; removal of fireflies and of non-finite pixels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def average(window: Floats, weight: Floats) -> Floats:
+    """Average the frames of an aligned window by their weight.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) float32
+        Aligned frames, in any unit; the centre is ``T // 2``.
+    weight : (T, H, W) float32
+        Trust in each pixel of each frame, at least 0.
+
+    Returns
+    -------
+    (H, W, C) float32
+        The average; the centre's value where all weights are 0.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other or T is even.
+    """
+    return _average(*check_window(window, weight))
+
+
+def robust_average(window: Floats, weight: Floats) -> Floats:
+    """Average the frames of an aligned window without each pixel's minimum and maximum.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) float32
+        Aligned frames, in any unit; the centre is ``T // 2``.
+    weight : (T, H, W) float32
+        Trust in each pixel of each frame, at least 0.
+
+    Returns
+    -------
+    (H, W, C) float32
+        The robust average; the centre's value where all weights are 0.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other or T is even.
+
+    Notes
+    -----
+    For n ≥ 3 equal weights this is ravg(S) = (Σ S − min S − max S) / (n − 2). With unequal ones the minimum
+    and the maximum lose the share clamp(Σw / max w − 2, 0, 1) of their weight: as many frames as the
+    most trusted one is worth must be there before anything is discarded, so that a trusted centre is never
+    thrown away in favour of frames that hardly count.
+
+    Values are ordered channel by channel, as in the paper. Ordering whole pixels by luminance neither
+    helps the error (0.02 dB worse on Cycles renders) nor the colour (the channels' biases differ as much).
+
+    The noise of path tracing is skewed, so the result is darker than the mean: by 1.5 to 7 % at 10 to 30
+    samples a pixel, and by a third where most samples are 0. Use `average` after `reject_outliers` where energy
+    matters more than robustness to misaligned frames.
+
+    References
+    ----------
+    Kalojanov and Thurston, Robust Average Networks for Monte Carlo Denoising, "Robust Average Blocks".
+    """
+    return _robust_average(*check_window(window, weight))
+
+
+def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) -> tuple[Floats, Mask]:
+    """Replace fireflies: values far above everything around them in space and time.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) float32
+        Aligned frames, in any unit; the centre is ``T // 2``.
+    weight : (T, H, W) float32
+        Trust in each pixel of each frame; where it is 0 the pixel is neither evidence nor replaced.
+    threshold : float
+        How many robust scales above the median an outlier lies.
+
+    Returns
+    -------
+    cleaned : (T, H, W, C) float32
+        The window with its outliers replaced. A copy.
+    mask : (T, H, W) bool
+        Where values were replaced.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other, T is even, or `threshold` is not positive.
+
+    Notes
+    -----
+    In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
+    largest value, n the number of frames trusted at that pixel (at least 2, and beyond the firefly itself).
+    A value is an outlier where it exceeds m + `threshold` · (u − m) and eight times the mean of the others.
+    A light that is there in every frame, even one pixel wide, is among the n largest and stays; a firefly is
+    in one frame, and warping spreads it over no more than four pixels. In the centre, which is not warped, it is
+    a single pixel: one with two such neighbours is an object, a moving highlight say, and stays too. The spread
+    (u − m) widens with the skew of the noise, which a median absolute deviation does not; it is further divided by
+    the share of values above 0. On black, u = 0, nothing is rejected: there a spark may be all the light there is.
+
+    An outlier becomes the weighted mean of those neighbours that are none: no dark hole, for the mean keeps
+    the neighbours' energy, and no halo, for nothing else is touched. What a firefly carries is lost: in
+    expectation, it belongs to the picture. On renders without visible fireflies the mean falls by less than 0.1 %.
+    """
+    if not threshold > 0:
+        raise ValueError(f"threshold: expected a positive number, got {threshold!r}")
+    window, weight = check_window(window, weight)
+    return _reject_outliers(window, weight, np.float32(threshold))
+
+
+def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
+    """Fill pixels that hold NaN or infinities from the nearest finite ones.
+
+    Parameters
+    ----------
+    image : (H, W, C) float32
+        Any unit. A pixel counts as non-finite if any of its channels is.
+
+    Returns
+    -------
+    filled : (H, W, C) float32
+        A copy, finite everywhere; 0 if no pixel is finite.
+    mask : (H, W) bool
+        Where pixels were replaced.
+
+    Raises
+    ------
+    ValueError
+        If `image` does not have three axes.
+
+    Notes
+    -----
+    A normalised box filter whose radius doubles until it reaches a finite pixel everywhere.
+    """
+    if image.ndim != 3:
+        raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
+    if np.isfinite(image.sum(dtype=np.float64)):  # by far the quickest way to see that nothing is missing
+        return image.astype(np.float32), np.zeros(image.shape[:2], np.bool_)
+    mask: Mask = np.any(~np.isfinite(image), axis=-1, keepdims=True)[..., 0]
+    filled = np.where(mask[..., None], np.float32(0), image).astype(np.float32, copy=False)
+    if mask.all():
+        return filled, mask
+    # float64: the sum of a box may exceed float32 where its mean does not
+    values, known = np.asarray(filled, np.float64), np.asarray(~mask, np.float64)
+    missing, radius = mask.copy(), 1
+    while missing.any():
+        size = (2 * radius + 1, 2 * radius + 1)
+        count = cv2.boxFilter(known, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        now = missing & (count > 0.5)
+        filled[now] = total.reshape(image.shape)[now] / count[now][:, None]
+        missing &= ~now
+        radius *= 2
+    return filled, mask
+
+
+def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[Floats, Floats]:
+    """Return both as contiguous float32, or raise ValueError if their shapes do not fit."""
+    if window.ndim != 4 or window.shape[0] % 2 == 0:
+        raise ValueError(f"window: expected (frames, height, width, channels) with odd frames, got {window.shape}")
+    if weight.shape != window.shape[:3]:
+        raise ValueError(f"{name}: expected shape {window.shape[:3]} to fit the window, got {weight.shape}")
+    return np.ascontiguousarray(window, np.float32), np.ascontiguousarray(weight, np.float32)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _average(window, weight):  # type: ignore[no-untyped-def]
+    T, H, W, C = window.shape
+    out = np.empty((H, W, C), np.float32)
+    for y in prange(H):
+        for x in range(W):
+            total = np.float32(0)
+            for t in range(T):
+                total += weight[t, y, x]
+            for c in range(C):
+                value = np.float32(0)
+                for t in range(T):
+                    if weight[t, y, x] > 0:  # a NaN that nobody trusts must not count
+                        value += weight[t, y, x] * window[t, y, x, c]
+                out[y, x, c] = value / total if total > 0 else window[T // 2, y, x, c]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _robust_average(window, weight):  # type: ignore[no-untyped-def]
+    T, H, W, C = window.shape
+    out = np.empty((H, W, C), np.float32)
+    for y in prange(H):
+        for x in range(W):
+            total, most, trusted = np.float32(0), np.float32(0), 0
+            for t in range(T):
+                w = weight[t, y, x]
+                total += w
+                most = max(most, w)
+                trusted += w > 0
+            share = np.float32(0)
+            if trusted >= 3:
+                share = min(max(total / most - np.float32(2), np.float32(0)), np.float32(1))
+            for c in range(C):
+                low, high = np.float32(np.inf), np.float32(-np.inf)
+                first, last = 0, 0
+                for t in range(T):
+                    if weight[t, y, x] > 0:
+                        v = window[t, y, x, c]
+                        if v < low:
+                            low, first = v, t
+                        if v >= high:  # not the minimum again where all are equal
+                            high, last = v, t
+                value, left = np.float32(0), np.float32(0)
+                for t in range(T):
+                    w = weight[t, y, x]
+                    if t in (first, last):  # left out, not subtracted: 1e6 would leave its rounding
+                        w *= 1 - share
+                    if w > 0:
+                        value += w * window[t, y, x, c]
+                        left += w
+                out[y, x, c] = value / left if left > 0 else window[T // 2, y, x, c]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
+    T, H, W, C = window.shape
+    cleaned, mask = window.copy(), np.zeros((T, H, W), np.bool_)
+    level = np.empty((T, H, W), np.float32)
+    for y in prange(H):
+        for t in range(T):
+            for x in range(W):
+                total = np.float32(0)
+                for c in range(C):
+                    total += window[t, y, x, c]
+                level[t, y, x] = total / C
+    for y in prange(H):
+        values = np.empty(9 * T, np.float32)
+        mean = np.empty(C, np.float32)
+        top, bottom = max(y - 1, 0), min(y + 2, H)
+        # three columns' sums, so that most pixels are passed over at little cost
+        sums, counts = np.zeros(W, np.float64), np.zeros(W, np.int64)
+        for t in range(T):
+            for ny in range(top, bottom):
+                for x in range(W):
+                    if weight[t, ny, x] > 0:
+                        sums[x] += level[t, ny, x]
+                        counts[x] += 1
+        for x in range(W):
+            left, right = max(x - 1, 0), min(x + 2, W)
+            total, count = 0.0, 0
+            for nx in range(left, right):
+                total += sums[nx]
+                count += counts[nx]
+            highest, frames = np.float32(-np.inf), 0
+            for t in range(T):
+                if weight[t, y, x] > 0:
+                    frames += 1
+                    highest = max(highest, level[t, y, x])
+            # of the others, so that a firefly does not hide itself where there are few
+            floor = 8 * (total - highest) / max(count - 1, 1)
+            if not highest > floor:
+                continue
+            n = 0
+            for t in range(T):
+                for ny in range(top, bottom):
+                    for nx in range(left, right):
+                        if weight[t, ny, nx] > 0:
+                            values[n] = level[t, ny, nx]
+                            n += 1
+            ordered = np.sort(values[:n])
+            median, upper = ordered[n // 2], ordered[max(n - max(frames, 2), 0)]
+            lit = 0
+            for i in range(n):
+                lit += ordered[i] > 0
+            # where few pixels have found the light, each of them is far above the others
+            limit = median + threshold * (upper - median) * np.float32(n) / np.float32(max(lit, 1))
+            if not (highest > limit and upper > 0):
+                continue
+            mean[:] = 0
+            trust = np.float32(0)
+            for t in range(T):
+                for ny in range(top, bottom):
+                    for nx in range(left, right):
+                        if weight[t, ny, nx] > 0 and level[t, ny, nx] <= limit:
+                            trust += weight[t, ny, nx]
+                            for c in range(C):
+                                mean[c] += weight[t, ny, nx] * window[t, ny, nx, c]
+            for t in range(T):
+                if weight[t, y, x] > 0 and level[t, y, x] > max(limit, floor):
+                    bright = 0
+                    for ny in range(top, bottom):
+                        for nx in range(left, right):
+                            bright += level[t, ny, nx] > limit
+                    if t == T // 2 and bright > 2:
+                        continue
+                    mask[t, y, x] = True
+                    for c in range(C):
+                        cleaned[t, y, x, c] = mean[c] / trust
+    return cleaned, mask

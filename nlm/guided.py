@@ -1,0 +1,309 @@
+"""Guided filter with any number of guide channels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from nlm.average import replace_nonfinite
+
+Floats = NDArray[np.float32]
+
+# Rows that one thread filters with the same running sums.
+_STRIP = 64
+
+
+def guided_filter(image: Floats, guide: Floats, *, radius: int, eps: float = 1e-2, subsample: int = 1,
+                  weight: Floats | None = None) -> Floats:
+    """Fit the image, in every box, by an affine function of the guide.
+
+    Parameters
+    ----------
+    image : (H, W, C) float32
+        What is filtered, in any unit. Non-finite pixels are left out and filled.
+    guide : (H, W, G) float32
+        What steers it: albedo, normal, depth … in any units: each channel is brought to mean 0 and
+        variance 1 over the image first.
+    radius : int
+        Of the boxes, in pixels of the image.
+    eps : float
+        Regularisation ε as a share of each guide's variance: structure fainter than its root is smoothed.
+    subsample : int
+        1, 2 or 4: the coefficients are found on an image so many times smaller.
+    weight : (H, W) float32, optional
+        Trust in each pixel of the image, at least 0.
+
+    Returns
+    -------
+    (H, W, C) float32
+        The filtered image, within the range of the input in the (4·radius + 1)² box that it depends on,
+        so not negative where that is not.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit, or a parameter is out of its range.
+
+    Notes
+    -----
+    In each box a = (Σ_I + ε·1)⁻¹ cov(I, p) and b = mean(p) − a · mean(I), Σ_I the covariance of the guide;
+    the output is mean(a) · I + mean(b), the means over all boxes that cover the pixel. Boxes are cut at
+    the frame's edge.
+    G × G systems are solved by Cholesky, in float64, as are the running sums: a firefly of 1e6 would leave its
+    rounding in float32 ones.
+
+    References
+    ----------
+    He, Sun and Tang, Guided Image Filtering, 2013, doi:10.1109/TPAMI.2012.213
+    He and Sun, Fast Guided Filter, 2015, arXiv:1505.00996
+    """
+    if image.ndim != 3 or guide.ndim != 3 or guide.shape[:2] != image.shape[:2]:
+        raise ValueError(f"guide: expected (height, width, channels) as large as the image's {image.shape},"
+                         f" got {guide.shape}")
+    if weight is not None and weight.shape != image.shape[:2]:
+        raise ValueError(f"weight: expected shape {image.shape[:2]}, got {weight.shape}")
+    if radius < 1:
+        raise ValueError(f"radius: expected at least 1, got {radius}")
+    if not eps > 0:
+        raise ValueError(f"eps: expected a positive number, got {eps}")
+    if subsample not in (1, 2, 4):
+        raise ValueError(f"subsample: expected 1, 2 or 4, got {subsample}")
+    image, missing = replace_nonfinite(image)
+    trust = (~missing).astype(np.float32) if weight is None else np.where(missing, np.float32(0), weight)
+    guide = _standardise(np.ascontiguousarray(replace_nonfinite(guide)[0]))
+
+    image, trust = np.ascontiguousarray(image), np.asarray(trust[..., None], np.float32)
+    small_image, small_guide, small_trust = image, guide, trust
+    if subsample > 1:
+        small_image, small_guide, small_trust = (_shrink(full, subsample) for full in (image * trust, guide, trust))
+        # the mean over trusted pixels only; what is not trusted at all weighs nothing
+        small_image /= np.where(small_trust > 0, small_trust, np.float32(1))
+    small_radius = max(radius // subsample, 1)
+    coefficients = _solve(small_image, small_guide, small_trust, small_radius, float(eps))
+    output = _apply(_box_sum(coefficients, small_radius), guide, image, subsample)
+    box = np.ones((4 * radius + 1, 4 * radius + 1), np.uint8)
+    low, high = (np.asarray(fold(image, box)).reshape(image.shape) for fold in (cv2.erode, cv2.dilate))
+    return np.asarray(np.clip(output, low, high), np.float32)
+
+
+def _standardise(guide: Floats) -> Floats:
+    """Bring each channel to mean 0 and variance 1; a constant channel becomes 0."""
+    pixels = guide.shape[0] * guide.shape[1]
+    first, second = _row_moments(guide).sum(axis=0) / pixels
+    mean, deviation = first, np.sqrt(np.maximum(second - first * first, 0))
+    # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
+    constant = deviation <= 1e-6 * np.abs(mean)
+    scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))
+    return _scale(guide, mean.astype(np.float32), scale.astype(np.float32))
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
+def _row_moments(image):  # type: ignore[no-untyped-def]
+    """Sums over each row of x and of x², (H, 2, C)."""
+    H, W, C = image.shape
+    sums = np.zeros((H, 2, C))
+    for y in prange(H):
+        for x in range(W):
+            for c in range(C):
+                value = float(image[y, x, c])
+                sums[y, 0, c] += value
+                sums[y, 1, c] += value * value
+    return sums
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
+def _scale(image, centre, scale):  # type: ignore[no-untyped-def]
+    """Return (image − centre) · scale, channel by channel."""
+    H, W, C = image.shape
+    out = np.empty((H, W, C), np.float32)
+    for y in prange(H):
+        for x in range(W):
+            for c in range(C):
+                out[y, x, c] = (image[y, x, c] - centre[c]) * scale[c]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
+def _shrink(image, step):  # type: ignore[no-untyped-def]
+    """Mean of each step × step block, of what there is of it at the lower and right edge."""
+    H, W, C = image.shape
+    out = np.zeros((-(-H // step), -(-W // step), C), np.float32)
+    for y in prange(out.shape[0]):
+        bottom = min(y * step + step, H)
+        for sy in range(y * step, bottom):
+            for x in range(W):
+                for c in range(C):
+                    out[y, x // step, c] += image[sy, x, c]
+        for x in range(out.shape[1]):
+            count = (bottom - y * step) * (min(x * step + step, W) - x * step)
+            for c in range(C):
+                out[y, x, c] /= count
+    return out
+
+
+@njit(cache=True, nogil=True, boundscheck=False, inline="always")
+def _add_moments(sums, image, guide, weight):  # type: ignore[no-untyped-def]
+    """Add (or with a negative weight take away) Σ w, w I, w I Iᵀ, w p, w I pᵀ of one pixel."""
+    G, C = guide.size, image.size
+    sums[0] += weight
+    n = 1
+    for i in range(G):
+        wi = weight * guide[i]
+        sums[1 + i] += wi
+        n = 1 + G + i * (i + 1) // 2
+        for j in range(i + 1):
+            sums[n + j] += wi * guide[j]
+        n = 1 + G + G * (G + 1) // 2 + C + i * C
+        for c in range(C):
+            sums[n + c] += wi * image[c]
+    n = 1 + G + G * (G + 1) // 2
+    for c in range(C):
+        sums[n + c] += weight * image[c]
+
+
+@njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+def _solve_box(out, sums, matrix, right, G, C, eps):  # type: ignore[no-untyped-def]
+    """Coefficients of one box, a (C × G) then b (C) then 1; all 0 where nothing is trusted."""
+    if not sums[0] > 0:
+        out[:] = 0
+        return
+    inverse = 1.0 / sums[0]
+    quadratic, linear = 1 + G, 1 + G + G * (G + 1) // 2
+    for i in range(G):
+        mean = sums[1 + i] * inverse
+        for j in range(i + 1):
+            matrix[i, j] = sums[quadratic + i * (i + 1) // 2 + j] * inverse - mean * (sums[1 + j] * inverse)
+        matrix[i, i] = max(matrix[i, i], 0.0) + eps
+        for c in range(C):
+            right[i, c] = sums[linear + C + i * C + c] * inverse - mean * (sums[linear + c] * inverse)
+    for i in range(G):  # Cholesky, its lower triangle in place, its diagonal inverted
+        for j in range(i):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = value * matrix[j, j]
+        value = matrix[i, i]
+        for k in range(i):
+            value -= matrix[i, k] * matrix[i, k]
+        matrix[i, i] = 1.0 / np.sqrt(max(value, 0.5 * eps))  # never below eps but for rounding
+    for c in range(C):
+        for i in range(G):
+            value = right[i, c]
+            for k in range(i):
+                value -= matrix[i, k] * right[k, c]
+            right[i, c] = value * matrix[i, i]
+        offset = sums[linear + c] * inverse
+        for i in range(G - 1, -1, -1):
+            value = right[i, c]
+            for k in range(i + 1, G):
+                value -= matrix[k, i] * right[k, c]
+            right[i, c] = value * matrix[i, i]
+            out[c * G + i] = right[i, c]
+            offset -= right[i, c] * (sums[1 + i] * inverse)
+        out[C * G + c] = offset
+    out[C * G + C] = 1
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
+def _solve(image, guide, weight, radius, eps):  # type: ignore[no-untyped-def]
+    """Coefficients of the box around each pixel, (H, W, C·G + C + 1)."""
+    H, W, C = image.shape
+    G = guide.shape[2]
+    out = np.empty((H, W, C * G + C + 1), np.float32)
+    for strip in prange(-(-H // _STRIP)):
+        first, last = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
+        columns = np.zeros((W, 1 + G + G * (G + 1) // 2 + C + G * C))
+        box = np.empty(columns.shape[1])
+        matrix, right = np.empty((G, G)), np.empty((G, C))
+        for y in range(max(first - radius, 0), min(first + radius, H)):
+            for x in range(W):
+                _add_moments(columns[x], image[y, x], guide[y, x], float(weight[y, x, 0]))
+        for y in range(first, last):
+            enter, leave = y + radius, y - radius - 1
+            for x in range(W):
+                if enter < H:
+                    _add_moments(columns[x], image[enter, x], guide[enter, x], float(weight[enter, x, 0]))
+                if leave >= max(first - radius, 0):
+                    _add_moments(columns[x], image[leave, x], guide[leave, x], -float(weight[leave, x, 0]))
+            box[:] = 0
+            for x in range(min(radius, W)):
+                for m in range(box.size):
+                    box[m] += columns[x, m]
+            for x in range(W):
+                if x + radius < W:
+                    for m in range(box.size):
+                        box[m] += columns[x + radius, m]
+                if x - radius - 1 >= 0:
+                    for m in range(box.size):
+                        box[m] -= columns[x - radius - 1, m]
+                _solve_box(out[y, x], box, matrix, right, G, C, eps)
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
+def _box_sum(values, radius):  # type: ignore[no-untyped-def]
+    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge."""
+    H, W, M = values.shape
+    out = np.empty((H, W, M), np.float32)
+    for strip in prange(-(-H // _STRIP)):
+        first, last = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
+        columns, box = np.zeros((W, M)), np.empty(M)
+        for y in range(max(first - radius, 0), min(first + radius, H)):
+            for x in range(W):
+                for m in range(M):
+                    columns[x, m] += values[y, x, m]
+        for y in range(first, last):
+            enter, leave = y + radius, y - radius - 1
+            for x in range(W):
+                if enter < H:
+                    for m in range(M):
+                        columns[x, m] += values[enter, x, m]
+                if leave >= max(first - radius, 0):
+                    for m in range(M):
+                        columns[x, m] -= values[leave, x, m]
+            box[:] = 0
+            for x in range(min(radius, W)):
+                for m in range(M):
+                    box[m] += columns[x, m]
+            for x in range(W):
+                if x + radius < W:
+                    for m in range(M):
+                        box[m] += columns[x + radius, m]
+                if x - radius - 1 >= 0:
+                    for m in range(M):
+                        box[m] -= columns[x - radius - 1, m]
+                for m in range(M):
+                    out[y, x, m] = box[m]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True, boundscheck=False, error_model="numpy")
+def _apply(coefficients, guide, image, step):  # type: ignore[no-untyped-def]
+    """Apply coefficients, enlarged bilinearly, to the guide; keep the image where there are none."""
+    H, W, G = guide.shape
+    C = image.shape[2]
+    h, w, M = coefficients.shape
+    out = np.empty((H, W, C), np.float32)
+    for y in prange(H):
+        here, row = np.empty(M, np.float32), np.empty((w, M), np.float32)
+        sy = min(max((y + 0.5) / step - 0.5, 0.0), h - 1.0)
+        top = int(sy)
+        below, fy = coefficients[min(top + 1, h - 1)], np.float32(sy - top)
+        for x in range(w):
+            for m in range(M):
+                row[x, m] = coefficients[top, x, m] + fy * (below[x, m] - coefficients[top, x, m])
+        for x in range(W):
+            sx = min(max((x + 0.5) / step - 0.5, 0.0), w - 1.0)
+            left = int(sx)
+            right, fx = min(left + 1, w - 1), np.float32(sx - left)
+            for m in range(M):
+                here[m] = row[left, m] + fx * (row[right, m] - row[left, m])
+            boxes = here[M - 1]
+            for c in range(C):
+                value = here[C * G + c]
+                for i in range(G):
+                    value += here[c * G + i] * guide[y, x, i]
+                out[y, x, c] = value / boxes if boxes > 0 else image[y, x, c]
+    return out

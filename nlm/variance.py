@@ -1,0 +1,193 @@
+"""Variance of a pixel's value: from half buffers, from the aligned window, from the image alone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from nlm.average import check_window
+from nlm.nonlocal_means import joint_nlm
+
+Floats = NDArray[np.float32]
+
+# How far above its surroundings' median a pixel's variance may lie before it is cut. A variance from five
+# Gaussian samples stays below 4 times its mean in 997 of 1000 cases; Monte Carlo noise has longer tails.
+_CAP = 16.0
+# Variance of a bilinearly warped frame over the centre's: the mean of (2/3)² (any fraction of a pixel along
+# both axes), 2/3 (along one) and 1 (none). It counts only where side frames are few.
+_WARPED = 0.7
+
+
+def variance_from_halves(a: Floats, b: Floats) -> Floats:
+    """Variance of the mean of two independent half buffers.
+
+    Parameters
+    ----------
+    a, b : (H, W, C) float32
+        The same picture twice, each with half of the samples.
+
+    Returns
+    -------
+    (H, W, C) float32
+        (a − b)² / 4: one degree of freedom per pixel, so smooth it before use.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    if a.shape != b.shape:
+        raise ValueError(f"b: expected shape {a.shape} like a, got {b.shape}")
+    return np.square(a - b, dtype=np.float32) * np.float32(0.25)
+
+
+def variance_from_window(window: Floats, confidence: Floats, *, radius: int = 2) -> Floats:
+    """Variance of the centre frame's pixels, from how much the aligned frames differ.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) float32
+        Aligned frames, finite, in any unit; the centre is ``T // 2``.
+    confidence : (T, H, W) float32
+        In [0, 1].
+    radius : int
+        Of the box that the estimate is smoothed with.
+
+    Returns
+    -------
+    (H, W, C) float32
+        Smoothed variance, in squared units.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other or T is even.
+
+    Notes
+    -----
+    (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the side frames;
+    then `smooth_variance`, which bounds what a single outlier contributes. Unlike the sample variance of
+    all frames this hardly depends on how much of their noise warping has taken from the side frames (which
+    halves the sample variance at half a pixel). With fewer than two side frames' worth of trust it
+    fades into `variance_from_residual`. Light that moves looks like noise; texture does, where the flow is wrong.
+    """
+    window, confidence = check_window(window, confidence, "confidence")
+    deviation, trust = _centre_deviation(window, confidence)
+    temporal = smooth_variance(deviation, radius)
+    if trust.min() >= 1:
+        return temporal
+    spatial = variance_from_residual(window[window.shape[0] // 2], radius=radius)
+    return spatial + trust[..., None] * (temporal - spatial)
+
+
+def variance_from_residual(image: Floats, *, radius: int = 2) -> Floats:
+    """Variance of the noise in a single image, from what is left of it after a high-pass filter.
+
+    Parameters
+    ----------
+    image : (H, W, C) float32
+        Finite, in any unit.
+    radius : int
+        Of the box that the estimate is smoothed with.
+
+    Returns
+    -------
+    (H, W, C) float32
+        Smoothed variance, in squared units. Fine texture counts as noise.
+
+    Notes
+    -----
+    The square of the difference of two Laplacians, which no plane and no straight edge along an axis passes, over
+    the sum of the squares of its coefficients, 36.
+
+    References
+    ----------
+    Immerkær, Fast noise variance estimation, 1996, doi:10.1006/cviu.1996.0060
+    """
+    kernel = np.array([1, -2, 1], np.float32)
+    residual = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return smooth_variance(np.square(residual.reshape(image.shape)) * np.float32(1 / 36), radius)
+
+
+def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
+    """Box-filter a variance of few degrees of freedom, bounding what a single pixel contributes.
+
+    Parameters
+    ----------
+    variance : (H, W, C) float32
+        At least 0, finite.
+    radius : int
+        Of the box.
+
+    Returns
+    -------
+    (H, W, C) float32
+        The smoothed variance.
+
+    Notes
+    -----
+    A pixel is cut at 16 times the 5×5 median of the 3×3 means. These keep the level of noise where most
+    pixels happen to be 0, and an isolated outlier touches fewer than half of them.
+    """
+    means = np.asarray(cv2.blur(variance, (3, 3)), np.float32).reshape(variance.shape)
+    # plane by plane: medianBlur takes at most four channels
+    median = np.stack([cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])], -1)
+    cut = np.minimum(variance, np.float32(_CAP) * median)
+    return cv2.blur(cut, (2 * radius + 1, 2 * radius + 1)).reshape(variance.shape)
+
+
+def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 2, patch_radius: int = 1) -> Floats:
+    """Take the noise out of the centre frame's guides: albedo and normals under depth of field or behind glass.
+
+    Parameters
+    ----------
+    guides : (T, H, W, F) float32
+        Aligned guides, finite, of about unit range.
+    confidence : (T, H, W) float32
+        In [0, 1].
+    radius, patch_radius : int
+        Of the non-local means, see `joint_nlm`.
+
+    Returns
+    -------
+    (H, W, F) float32
+        The centre's guides. Where they hold no noise they are what they were, to about 1e-3.
+
+    Notes
+    -----
+    Non-local means over space and time steered by the guides' own variance: the lesser of that between
+    frames and that of the spatial residual, for noise shows in both, while texture shows only in the
+    second, and texture resampled by warping mainly in the first.
+    """
+    guides, confidence = check_window(guides, confidence, "confidence")
+    between = variance_from_window(guides, confidence)
+    variance = np.minimum(between, variance_from_residual(guides[guides.shape[0] // 2]))
+    return joint_nlm(guides, variance, confidence=confidence, radius=radius, patch_radius=patch_radius, k=1.0)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _centre_deviation(window, confidence):  # type: ignore[no-untyped-def]
+    """Squared deviation of the centre from the side frames, and in [0, 1] whether two of those are trusted."""
+    T, H, W, C = window.shape
+    centre = T // 2
+    deviation, trust = np.zeros((H, W, C), np.float32), np.zeros((H, W), np.float32)
+    for y in prange(H):
+        for x in range(W):
+            total, squares = np.float32(0), np.float32(0)
+            for t in range(T):
+                if t != centre:
+                    total += confidence[t, y, x]
+                    squares += confidence[t, y, x] ** 2
+            if total <= 1 or not confidence[centre, y, x] > 0:
+                continue
+            trust[y, x] = min(total - np.float32(1), np.float32(1))
+            for c in range(C):
+                mean = np.float32(0)
+                for t in range(T):
+                    if t != centre and confidence[t, y, x] > 0:
+                        mean += confidence[t, y, x] * window[t, y, x, c]
+                difference = window[centre, y, x, c] - mean / total
+                deviation[y, x, c] = difference**2 / (1 + np.float32(_WARPED) * squares / (total * total))
+    return deviation, trust
