@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from hybrid.simulate.command import simulate_command
+
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
     from hybrid.frames import Shot
     from hybrid.pipeline import Estimator
@@ -32,6 +34,9 @@ LayerOption = Annotated[
     typer.Option(
         "--layer", metavar="ROLE=LAYER", help="take a layer for color, albedo, normal, depth, motion, variance"
     ),
+]
+PreviewOption = Annotated[
+    Path | None, typer.Option(help="a PNG to look at: the middle frame, noisy and denoised side by side")
 ]
 OnOption = Annotated[
     list[str] | None, typer.Option("--effects", metavar="NAME", help="run a stage, whatever the plan says")
@@ -82,6 +87,7 @@ def pseudoref(
     shot: ShotArgument,
     output: OutputOption,
     preset: Annotated[str, typer.Option(help="draft, balanced or final")] = "balanced",
+    preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
     effects: OnOption = None,
@@ -104,6 +110,7 @@ def pseudoref(
         timings,
         command="pseudoref",
         preset=preset,
+        preview=preview,
     )
 
 
@@ -117,6 +124,7 @@ def denoise(
         float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
     ] = None,
     aov: AovOption = None,
+    preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
     effects: OnOption = None,
@@ -134,7 +142,14 @@ def denoise(
     path = weights or neural.shipped_weights(preset)
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
     _run(
-        opened, output, denoiser, plan, timings, command="denoise", preset=preset if weights is None else str(path.name)
+        opened,
+        output,
+        denoiser,
+        plan,
+        timings,
+        command="denoise",
+        preset=preset if weights is None else path.name,
+        preview=preview,
     )
 
 
@@ -142,18 +157,38 @@ def denoise(
 def compare(
     shot: ShotArgument,
     reference: Annotated[str, typer.Option(help="the same frames at many samples: a pattern or a folder")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="REPORT", help="folder for a page with chart and pictures")
+    ] = None,
     methods: Annotated[str | None, typer.Option(help="names, separated by commas; all without")] = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
 ) -> None:
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
+    import tempfile
+    from functools import partial
+
     from rich.console import Console
 
-    from hybrid.compare import METHODS, compare_shot, result_table
+    from hybrid.compare import METHODS, compare_shot, load_frame, result_table
+    from hybrid.report import ReportImages, write_report
 
     chosen = METHODS if methods is None else {name: _choose(METHODS, name, "methods") for name in methods.split(",")}
-    results = compare_shot(_open(shot, frames, layer), _open(reference, frames, None), chosen)
-    Console().print(result_table(results))
+    noisy, clean = _open(shot, frames, layer), _open(reference, frames, None)
+    with tempfile.TemporaryDirectory() as folder:
+        results = compare_shot(noisy, clean, chosen, folder=Path(folder))
+        Console().print(result_table(results))
+        if output is not None:
+            images = [
+                ReportImages(result.name, partial(load_frame, Path(folder), result.name))
+                for result in results
+                if result.absent_reason is None
+            ]
+            judged = [number for number in noisy.numbers if number in clean.numbers]
+            page = write_report(
+                output, Path(shot).name, results, images, partial(load_frame, Path(folder), "reference"), judged
+            )
+            typer.echo(f"wrote {page}")
 
 
 @app.command()
@@ -177,6 +212,18 @@ def prepare(
     clips = neural.write_clips(opened, wanted, output, name, pseudo_reference=pseudo_reference)
     written = len(list(track(clips, "prepare", total=len(opened))))
     typer.echo(f"wrote {written} clips to {output}")
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
+def train(context: typer.Context) -> None:
+    """Train a network on clips; `ravg train --help` lists the options."""
+    _neural()
+    from hybrid.neural import train_main
+
+    raise typer.Exit(train_main(context.args))
+
+
+app.command("simulate")(simulate_command)
 
 
 def _neural():  # type: ignore[no-untyped-def]
@@ -225,14 +272,22 @@ def _choose(table: dict[str, Thing], name: str, option: str) -> Thing:
 
 
 def _run(
-    shot: Shot, output: str, estimator: Estimator, plan: Plan, timings: Timings, *, command: str, preset: str
+    shot: Shot,
+    output: str,
+    estimator: Estimator,
+    plan: Plan,
+    timings: Timings,
+    *,
+    command: str,
+    preset: str,
+    preview: Path | None,
 ) -> None:
     """Denoise the shot with a progress bar, say what was met on the way, and leave the timings beside the output."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Table
 
-    from hybrid.pipeline import denoise_shot
+    from hybrid.pipeline import denoise_shot, write_preview
 
     console = Console(stderr=True)
     console.print("stages: " + ", ".join(d.effect for d in plan.decisions if d.on), highlight=False)
@@ -260,6 +315,9 @@ def _run(
     for row in timings.rows(pixels):
         table.add_row(*row)
     console.print(table)
+    if preview is not None:
+        write_preview(shot, output, preview)
+        console.print(f"wrote {preview}", highlight=False)
     report = finished.path.parent / "ravg.json"
     timings.write(
         report,

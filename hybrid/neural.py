@@ -22,6 +22,7 @@ from network.checkpoint import load_model
 from network.clips import Clip
 from network.inputs import window_exposure
 from network.models import denoise_tile, for_inference
+from network.train import main as train_main
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
@@ -31,6 +32,8 @@ ESTIMATE = BALANCED
 # Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
 # on a trained net is below half a float's precision.
 HALO = 32
+__all__ = ["Denoiser", "shipped_weights", "train_main", "write_clips"]
+
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 

@@ -6,13 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.frames import Shot, output_path
+from hybrid.files import replace_file
+from hybrid.frames import Shot, open_shot, output_path
 from hybrid.plan import Plan
 from hybrid.pseudo_reference import AlignedWindow, Aligner
 from hybrid.timing import Timings
+from hybrid.transfer import measure_exposure
+from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
@@ -104,3 +108,29 @@ def denoise_shot(
             images = {"color": denoised.color, **denoised.aovs}
             clamped = shot.write(path, number, images, denoised.extra, attributes)
         yield Finished(number, path, aligned.repaired, aligned.outliers, clamped)
+
+
+def write_preview(shot: Shot, output: str | Path, path: Path) -> None:
+    """Write a PNG of the middle frame, noisy on the left and denoised on the right.
+
+    Parameters
+    ----------
+    shot : Shot
+        The input.
+    output : str or Path
+        Where `denoise_shot` has written.
+    path : Path
+        Of the PNG. Both halves are exposed alike, to a mean of 0.18 of the noisy frame, and sRGB encoded.
+    """
+    number = shot.numbers[len(shot.numbers) // 2]
+    noisy, _ = replace_nonfinite(shot.read(number).color)
+    finished = open_shot(output_path(output, shot, number))
+    denoised = finished.read(finished.numbers[0]).color
+    exposure = measure_exposure(noisy) / 0.18
+    pair = np.concatenate([noisy, denoised], axis=1) / np.float32(exposure)
+    pair = np.clip(pair, 0, 1)
+    encoded = np.where(pair <= 0.0031308, 12.92 * pair, 1.055 * pair ** (1 / 2.4) - 0.055)
+    _, data = cv2.imencode(".png", np.round(encoded[..., ::-1] * 255).astype(np.uint8))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as temporary:
+        temporary.write_bytes(data.tobytes())

@@ -266,8 +266,9 @@ def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -
         inside &= vectors[1]
     window = np.stack([other, here.estimate, other])
     weight = color_gate(window, here.irradiance, exposure)[0]
-    # The gate is e^-1 where the means of 9×9 pixels differ by the noise of the estimate.
-    return float(np.mean(weight[inside] < np.exp(-1))) if inside.any() else 0.0
+    # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
+    # noise brings one in a thousand.
+    return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
 
 
 def _outlier_share(frame: PreparedFrame) -> float:

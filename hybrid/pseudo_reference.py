@@ -13,7 +13,7 @@ import numpy as np
 from flow.confidence import estimate_confidence, mix_centre
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
-from nlm.variance import prefilter_guide, variance_from_window
+from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 from numpy.typing import NDArray
 
 from flow.motion import Motion, compose_flow, invert_flow, normalize_motion
@@ -104,8 +104,8 @@ class AlignedWindow:
         What irradiance is multiplied by to give radiance: the centre's prefiltered albedo plus the floor, or 1.
     guide : (H, W, G) array or None
         The centre's albedo and normal, prefiltered.
-    variance : (T, H, W, 3) array
-        Of `color`.
+    variance : (H, W, 3) array
+        Of the centre's `color`, smoothed.
     exposure : float
         Brightness of the window's irradiance; scales with it.
     aovs : dict of str to (T, H, W, C) array
@@ -382,10 +382,8 @@ class Aligner:
         modulation = np.ones_like(color[0])
         if clean_albedo is not None and "demodulate" in self.effects:
             modulation = remodulate(modulation, clean_albedo)
-        if centre.variance is not None:
-            variance = np.ascontiguousarray(stack[..., slices["variance"]])
-        else:
-            variance = variance_from_window(color, confidence)[None]
+        given = centre.variance
+        variance = variance_from_window(color, confidence) if given is None else smooth_variance(given)
         return AlignedWindow(
             number=centre.number,
             color=np.ascontiguousarray(color),
@@ -443,7 +441,6 @@ def _layers(frame: PreparedFrame) -> dict[str, Array]:
         "estimate": frame.estimate,
         "albedo": frame.albedo,
         "normal": frame.normal,
-        "variance": frame.variance,
         **{f"aov {name}": layer for name, layer in frame.aovs.items()},
         "valid": frame.valid[..., None].astype(np.float32),
     }
@@ -528,7 +525,7 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
             irradiance = joint_nlm(
                 aligned.color,
                 aligned.variance,
-                None if aligned.guide is None else aligned.guide[None],
+                aligned.guide,
                 confidence=aligned.confidence,
                 radius=preset.nlm_radius,
                 patch_radius=preset.nlm_patch_radius,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +53,24 @@ class Scene:
         layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * grain
         return layers
 
-    def write(self, folder: Path, *, clean: bool = False) -> Path:
-        """Write the frames as shot.####.exr."""
+    def write(
+        self,
+        folder: Path,
+        *,
+        clean: bool = False,
+        scale: float = 1,
+        without: Collection[str] = (),
+        edit: Callable[[int, dict[str, np.ndarray]], None] | None = None,
+    ) -> Path:
+        """Write the frames as shot.####.exr: color times `scale`, some layers left out, or edited frame by frame."""
         folder.mkdir(parents=True, exist_ok=True)
         for index in range(self.frames):
             layers = self.clean(index) if clean else self.noisy(index)
-            write_layers(folder / f"shot.{self.first + index:04d}.exr", layers, half=False)
+            layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * np.float32(scale)
+            if edit is not None:
+                edit(index, layers)
+            kept = {name: layer for name, layer in layers.items() if name.partition(".")[2] not in without}
+            write_layers(folder / f"shot.{self.first + index:04d}.exr", kept, half=False)
         return folder
 
 

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+from conftest import Scene
+
+torch = pytest.importorskip("torch")
+
+from hybrid.frames import open_shot  # noqa: E402
+from hybrid.neural import Denoiser, has_bfloat16, shipped_weights, write_clips  # noqa: E402
+from hybrid.pseudo_reference import Aligner  # noqa: E402
+from network.checkpoint import save_model  # noqa: E402
+from network.clips import Clip  # noqa: E402
+from network.models import fast  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+EFFECTS = {"demodulate", "outliers", "warp"}
+SCENE = Scene(height=70, width=90, frames=5)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A network that was never trained: whatever it makes of its input, it must make it everywhere alike."""
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    model = fast(seed=3)
+    with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
+        model.head.window.weight.mul_(20)
+    save_model(model, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return SCENE.write(tmp_path_factory.mktemp("shot"))
+
+
+def align(folder, **options):
+    return Aligner(open_shot(folder, **options), EFFECTS).align(SCENE.first + 2)
+
+
+def test_tiles_give_what_the_whole_image_gives(folder, weights):
+    window = align(folder)
+    whole = Denoiser(weights, tile=256, precision="float32")(window).color
+    tiled = Denoiser(weights, tile=32, precision="float32")(window).color
+    # The receptive field of the U-Net is wider than the halo; what lies beyond has next to no influence.
+    np.testing.assert_allclose(tiled, whole, rtol=1e-3, atol=1e-4)
+    assert np.abs(whole - window.color[2] * window.modulation).max() > 0.1  # it does something
+
+
+def test_bfloat16_is_close_to_float32(folder, weights):
+    window = align(folder)
+    exact = Denoiser(weights, precision="float32")(window).color
+    short = Denoiser(weights, precision="bfloat16")(window).color
+    # Features have 8 bits; the kernels that come of them are applied in float32.
+    assert np.sqrt(np.mean((short - exact) ** 2)) < 0.02 * exact.mean()
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_result_scales_with_the_radiance(tmp_path, folder, weights, scale):
+    denoiser = Denoiser(weights, precision="float32")
+    plain = denoiser(align(folder)).color
+    scaled = denoiser(align(SCENE.write(tmp_path, scale=scale))).color
+    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-4 * scale)
+
+
+def test_a_flat_picture_stays_as_it_is(tmp_path, weights):
+    def flatten(index, layers):
+        layers["ViewLayer.Combined"][:] = 0.7
+        layers["ViewLayer.Denoising Albedo"][:] = 0.5
+
+    image = Denoiser(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
+    np.testing.assert_allclose(image, 0.7, rtol=1e-5)
+
+
+def test_without_guides_it_runs(tmp_path, weights):
+    scene = SCENE.write(tmp_path, without={"Denoising Albedo", "Denoising Normal", "Depth"})
+    assert np.isfinite(Denoiser(weights)(align(scene)).color).all()
+
+
+def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
+    def split(index, layers):
+        layers["direct"] = 0.25 * layers["ViewLayer.Combined"]
+        layers["mask"] = np.ones((SCENE.height, SCENE.width), np.float32)
+
+    denoiser = Denoiser(weights, precision="float32")
+    window = align(SCENE.write(tmp_path, edit=split), aovs=("direct", "mask"))
+    aovs = denoiser(window).aovs
+    assert aovs["direct"].shape == (SCENE.height, SCENE.width, 3)
+    # Constant 1 divided by a changing albedo is not constant; but the kernels sum to 1, so nothing is lost.
+    assert np.isfinite(aovs["mask"]).all()
+    assert aovs["mask"].mean() == pytest.approx(1, rel=0.05)
+
+
+def test_a_higher_threshold_stays_closer_to_the_input(folder, weights):
+    window = align(folder)
+    noisy = window.color[2] * window.modulation
+    distances = [
+        np.abs(Denoiser(weights, precision="float32", threshold=t)(window).color - noisy).mean() for t in (0, 0.5, 0.99)
+    ]
+    assert distances[0] > distances[2]
+
+
+def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
+    noisy = open_shot(SCENE.write(tmp_path / "noisy"))
+    clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
+    paths = list(write_clips(noisy, clean, tmp_path, "wall.a"))
+    assert len(paths) == SCENE.frames
+    clip = Clip.load(paths[2])
+    assert clip.shot == "wall"
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    np.testing.assert_allclose(clip.target, truth, rtol=1e-3)  # half has 11 bits
+    # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
+    radiance = clip.color[2].astype(np.float32) * clip.modulation
+    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"], rtol=5e-3)
+
+
+def test_bad_options_are_refused(weights):
+    for options, word in (
+        ({"precision": "int8"}, "precision"),
+        ({"tile": 3}, "tile"),
+        ({"threshold": 1.0}, "threshold"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            Denoiser(weights, **options)
+    with pytest.raises(ValueError, match="expected one of"):
+        shipped_weights("slowest")
+
+
+def test_bfloat16_is_detected_without_failing():
+    assert has_bfloat16() in (True, False)

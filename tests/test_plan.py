@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+from conftest import Scene
+
+from hybrid.frames import open_shot
+from hybrid.plan import EFFECTS, plan_shot
+
+
+def decisions(folder):
+    plan = plan_shot(open_shot(folder))
+    return {decision.effect: decision for decision in plan.decisions}
+
+
+def test_every_effect_is_decided_once_with_a_reason(shot_folder):
+    plan = plan_shot(open_shot(shot_folder))
+    assert [d.effect for d in plan.decisions] == list(EFFECTS)
+    assert all(d.reason for d in plan.decisions)
+
+
+def test_exact_vectors_are_used_as_they_are(shot_folder):
+    found = decisions(shot_folder)
+    assert found["warp"].on
+    assert found["warp"].figure == pytest.approx(np.hypot(2, 1), abs=1e-3)
+    assert not found["refine"].on
+    assert not found["dense-flow"].on
+    assert not found["gate"].on
+
+
+def test_nothing_is_warped_where_nothing_moves(tmp_path):
+    found = decisions(Scene(step=(0, 0)).write(tmp_path))
+    assert not found["warp"].on
+    assert not found["refine"].on
+
+
+def test_without_vectors_motion_is_looked_for_only_where_something_moves(tmp_path):
+    moving = decisions(Scene(noise=0.05).write(tmp_path / "moving", without={"Vector"}))
+    still = decisions(Scene(noise=0.05, step=(0, 0)).write(tmp_path / "still", without={"Vector"}))
+    assert moving["dense-flow"].on
+    assert moving["warp"].on
+    assert not still["dense-flow"].on
+    assert not still["warp"].on
+
+
+def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gate(tmp_path):
+    def reflect(index, layers):
+        y, x = np.mgrid[: Scene.height, : Scene.width]
+        # A bright disc that stands still while the vectors say that everything moves: a reflection.
+        layers["ViewLayer.Combined"][(y - 20) ** 2 + (x - 10 - 14 * index) ** 2 < 64] *= 5
+
+    found = decisions(Scene().write(tmp_path, edit=reflect))
+    assert found["refine"].on
+    assert found["gate"].on
+
+
+def test_fireflies_call_for_rejection(tmp_path):
+    def burn(index, layers):
+        layers["ViewLayer.Combined"][7 + index, 9] = 1e5
+
+    assert not decisions(Scene(noise=0.1).write(tmp_path / "calm"))["outliers"].on
+    assert decisions(Scene(noise=0.1).write(tmp_path / "burnt", edit=burn))["outliers"].on
+
+
+def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
+    def blur(index, layers):
+        noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
+        layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
+
+    assert not decisions(Scene().write(tmp_path / "sharp"))["prefilter"].on
+    assert decisions(Scene().write(tmp_path / "noisy", edit=blur))["prefilter"].on
+
+
+def test_without_albedo_there_is_no_demodulation(tmp_path):
+    found = decisions(Scene().write(tmp_path, without={"Denoising Albedo"}))
+    assert not found["demodulate"].on
+    assert found["demodulate"].figure is None
+
+
+def test_one_frame_has_a_plan(tmp_path):
+    found = decisions(Scene(frames=1).write(tmp_path))
+    assert not found["warp"].on
+
+
+def test_the_user_may_force_what_was_measured(shot_folder):
+    plan = plan_shot(open_shot(shot_folder)).force(on=["refine"], off=["warp"])
+    assert "refine" in plan.effects
+    assert "warp" not in plan.effects
+    forced = [d for d in plan.decisions if d.forced]
+    assert {d.effect for d in forced} == {"refine", "warp"}
+    assert all(d.reason.startswith("forced") for d in forced)
+
+
+@pytest.mark.parametrize(("on", "off"), [(["wrap"], []), ([], ["wrap"]), (["warp"], ["warp"])])
+def test_forcing_nonsense_is_refused(shot_folder, on, off):
+    with pytest.raises(ValueError, match=r"wrap|both"):
+        plan_shot(open_shot(shot_folder)).force(on=on, off=off)
