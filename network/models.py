@@ -27,6 +27,7 @@ class KernelConfig:
     size: int = 5  # K of the noisy frames' K×K taps
     estimate_frames: int = 0  # T_e: 0 no estimate (the paper's model), 1 of the centre, or T
     estimate_size: int = 1  # K of an estimate's K×K taps
+    estimate_share: float = 0.5  # part of the output that the estimate has before training
     threshold: float = 0.5  # t·K: 0.5 is the paper's t = 1 / (2K)
 
     def __post_init__(self) -> None:
@@ -36,6 +37,8 @@ class KernelConfig:
                 raise ValueError(f"{name}: expected an odd number >= 1, got {value}")
         if self.estimate_frames not in (0, 1, self.frames):
             raise ValueError(f"estimate_frames: expected 0, 1 or {self.frames}, got {self.estimate_frames}")
+        if not 0 < self.estimate_share < 1:
+            raise ValueError(f"estimate_share: expected 0 < share < 1, got {self.estimate_share}")
         _check_threshold(self.threshold)
 
     @property
@@ -106,13 +109,13 @@ class KernelHead(nn.Module):
 
     Notes
     -----
-    In units of 1/K (K the taps at hand), the raw weight of tap i is ``w_i = tK + K b_i ((1 − tK) c_i + h_i)``: b is
-    the uniform kernel within a source times that source's share (half for an estimate, the rest for the window),
-    c the confidence of the frame over its mean over the frames, h what the convolution predicts. As
-    ``η_t`` takes t away and renormalises, h = 0 gives exactly the kernel ``b_i c_i``: a mean of the window
-    weighted by confidence, blended half and half with the estimate. The training starts there, with small h; h
-    is added, not multiplied, so that it can reach any kernel, also on frames without confidence. Without an
-    estimate and at full confidence this is the uniform kernel, w = 1/K.
+    In units of 1/K (K the taps at hand), the raw weight of tap i is ``w_i = tK + (1 − tK) K b_i c_i + s_i h_i``: b is
+    the kernel at the start (uniform over the window, all but a fifth at the centre of an estimate, each times its
+    source's share), c the confidence of the frame over its mean over the frames, h what the convolution predicts, s
+    the scale of that: 1 on the window, K b on the estimate. As ``η_t`` takes t away and renormalises, h = 0 gives
+    exactly the kernel ``b_i c_i``: a mean of the window weighted by confidence, blended with the estimate. The training
+    starts there, with small h; h is added, not multiplied, so that it can reach any kernel, also on frames without
+    confidence. Without an estimate and at full confidence this is the uniform kernel, w = 1/K.
     """
 
     def __init__(self, channels: int, config: KernelConfig) -> None:
@@ -120,6 +123,10 @@ class KernelHead(nn.Module):
         self.config = config
         self.window = nn.Conv2d(channels, config.size**2, 3, padding=1)
         self.estimate = nn.Conv2d(channels, config.estimate_size**2, 3, padding=1) if config.estimate_frames else None
+        taps = config.estimate_size**2
+        start = torch.full((1, 1, taps, 1, 1), 0.2 if taps > 1 else 1.0)
+        start[:, :, taps // 2] = 0.8 * taps + 0.2 if taps > 1 else 1.0
+        self.register_buffer("start", start, persistent=False)
         with torch.no_grad():
             for convolution in (self.window, self.estimate):
                 if convolution is not None:
@@ -148,20 +155,20 @@ class KernelHead(nn.Module):
         config = self.config
         here = present.float().view(-1, 1, 1, 1) if config.estimate_frames else features.new_zeros(1, 1, 1, 1).float()
         taps = config.window_taps + here * config.estimate_taps
-        share = 0.5 * here
+        share = config.estimate_share * here
         bias = config.threshold
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         confidence = confidence.float() + 1e-3
         confidence = confidence / confidence.mean(1, keepdim=True)
         scale = (taps * (1 - share) / config.window_taps).unsqueeze(1)
         raw = _frames_first(self.window(features), config.frames)
-        weights = torch.addcmul(bias + (1 - bias) * scale * confidence, raw, scale).flatten(1, 2)
+        weights = (bias + (1 - bias) * scale * confidence + raw).flatten(1, 2)
         if self.estimate is not None:
             scale = (taps * share / config.estimate_taps).unsqueeze(1)
             middle = features.chunk(config.frames)[config.frames // 2]
             raw = self.estimate(middle if config.estimate_frames == 1 else features)
             raw = _frames_first(raw, config.estimate_frames)
-            start = bias * here.unsqueeze(1) + (1 - bias) * scale
+            start = bias * here.unsqueeze(1) + (1 - bias) * scale * self.start
             weights = torch.cat([weights, torch.addcmul(start, raw, scale).flatten(1, 2)], 1)
         cut = config.threshold if threshold is None else _check_threshold(threshold)
         return predict_kernel(weights, cut / taps, centre=config.centre)
@@ -303,7 +310,8 @@ def fast(frames: int = 5, estimate_frames: int = 1, seed: int = 0) -> RAUNet:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return RAUNet(RAUNetConfig(KernelConfig(frames=frames, estimate_frames=estimate_frames)))
+        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.85)
+        return RAUNet(RAUNetConfig(kernel))
 
 
 def paper(frames: int = 5, conv_size: int = 3, seed: int = 0) -> RAResNet:
