@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +23,8 @@ from typing import Any, TextIO
 
 import numpy as np
 import OpenEXR
+
+from hybrid.files import replace_file
 
 # 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
 # that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
@@ -791,25 +793,12 @@ def _convert(values: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, int]:
 
 
 def _write(path: Path, parts: list[OpenEXR.Part]) -> None:
-    """Write to a temporary name beside `path` and rename, so that `path` is never a part of a file."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
-    try:
-        # Opened here first: the library's own error has no error number, and not always a reason.
-        with temporary.open("wb"):
-            pass
+    """Write parts so that `path` is never a part of a file."""
+    with replace_file(path) as temporary:
         with _library_messages() as messages:
             try:
                 OpenEXR.File(parts).write(str(temporary))
             except Exception as error:
                 messages.append(str(error).replace(str(temporary), str(path)).replace("\n", " "))
-        if messages:
+        if messages:  # filled on leaving the block above
             raise OSError(f"{path}: cannot write: {messages[0]}")
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError) and error.filename is not None:
-            raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
-        raise

@@ -32,14 +32,13 @@ def replace_file(path: Path) -> Iterator[Path]:
     try:
         with temporary.open("wb"):
             pass
-    except OSError as error:
-        raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
-    try:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename == str(temporary):
+            raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
         raise
