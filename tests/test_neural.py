@@ -24,7 +24,7 @@ def weights(tmp_path_factory):
     model = fast(seed=3)
     with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
         model.head.window.weight.mul_(20)
-    save_model(model, path)
+    save_model(path, model)
     return path
 
 
