@@ -104,15 +104,21 @@ def _linearize(
                 bound[g, y, x] = _THETA * np.float32(attachment) * trust if inside else np.float32(0)
 
 
+@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
 def _with_gradients(planes: np.ndarray) -> np.ndarray:
-    """Interleave (H, W, G) with its central differences in x and y, 0 across the edge."""
-    out = np.empty((*planes.shape, 3), np.float32)
-    padded = np.pad(planes, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    out[..., 0] = planes
-    np.subtract(padded[1:-1, 2:], padded[1:-1, :-2], out=out[..., 1])
-    np.subtract(padded[2:, 1:-1], padded[:-2, 1:-1], out=out[..., 2])
-    out[..., 1:] *= 0.5
-    return out.reshape(*planes.shape[:2], -1)
+    """Interleave (H, W, G) with its central differences in x and y, halved across the edge."""
+    height, width, channels = planes.shape
+    half = np.float32(0.5)
+    out = np.empty((height, width, 3 * channels), np.float32)
+    for y in prange(height):
+        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            for g in range(channels):
+                out[y, x, 3 * g] = planes[y, x, g]
+                out[y, x, 3 * g + 1] = half * (planes[y, right, g] - planes[y, left, g])
+                out[y, x, 3 * g + 2] = half * (planes[below, x, g] - planes[above, x, g])
+    return out
 
 
 def _solve_level(
@@ -272,7 +278,8 @@ def refine_flow(
     λ Σ_g w_g |I₁(x + b + d) − I₀(x)| + |∇d₁| + |∇d₂| by alternating a thresholding and a dual step; with several
     guides their thresholding steps are taken one after the other. So what the guides do not show (flat walls, the
     direction along an edge) keeps the motion that the renderer gave it, which plain TV-L1, smoothing f, would
-    flatten: on exact vectors of a rotating object 0.46 px of error against 1.5. w_g = |∇I|² / (|∇I|² + σ_g²).
+    flatten: from exact vectors, 0.47 px of error against 1.5 on a rendered shot with a turning object.
+    w_g = |∇I|² / (|∇I|² + σ_g²).
     Detail of `start` finer than b is lost: choose with `select_flow` afterwards.
 
     References
@@ -370,9 +377,9 @@ def select_flow(
 
     The incumbent is the first candidate, and keeps every pixel where nothing beats it. Only if another one, over
     boxes of four times the size, beats it on two fifths of the frame, and three times as often as it is beaten,
-    are the given vectors wrong as such (noisy, say), and that one is the incumbent. Over such boxes TV-L1 beat
-    exact vectors on 0 to 12 % of the pixels of three rendered shots (reflections, what is hidden, noise that it
-    fitted), vectors perturbed by 1.2 px on 53 to 89 %.
+    are the given vectors wrong as such (noisy, say), and that one is the incumbent. With an albedo among the
+    guides, the refined flow beat exact vectors on 0 to 3 % of the pixels of three rendered shots, vectors
+    perturbed by 1.2 px on 47 to 88 %. (On noisy luminance alone it was 8 to 70 %: there it may not be enough.)
     """
     if not candidates:
         raise ValueError("candidates is empty, expected at least one flow")
