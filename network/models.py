@@ -118,6 +118,8 @@ class KernelHead(nn.Module):
     confidence. Without an estimate and at full confidence this is the uniform kernel, w = 1/K.
     """
 
+    start: Tensor
+
     def __init__(self, channels: int, config: KernelConfig) -> None:
         super().__init__()
         self.config = config

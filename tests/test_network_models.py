@@ -196,6 +196,16 @@ def test_the_kernels_start_at_the_confidence_and_half_the_estimate(estimate_fram
         torch.testing.assert_close(kernels[sample, 27:].sum(0), torch.full((4, 4), here), rtol=0, atol=1e-6)
 
 
+def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
+    """A fifth of the estimate's share is spread evenly over its 3×3 taps, the rest is the pixel's."""
+    config = KernelConfig(frames=3, size=3, estimate_frames=1, estimate_size=3, estimate_share=0.9)
+    kernels = silent_head(config)(torch.zeros(3, 4, 4, 4), torch.ones(1, 3, 1, 4, 4), torch.ones(1))
+    expected = torch.full((9,), 0.9 * 0.2 / 9)
+    expected[4] += 0.9 * 0.8
+    torch.testing.assert_close(kernels[0, 27:, 1, 1], expected)
+    torch.testing.assert_close(kernels[0, :27, 1, 1], torch.full((27,), 0.1 / 27))
+
+
 def test_a_correction_reaches_any_kernel() -> None:
     """Also all weight on one tap of a frame without confidence."""
     config = KernelConfig(frames=3, size=3, estimate_frames=1)
@@ -346,6 +356,7 @@ def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -
         (lambda: KernelConfig(size=0), "size: expected an odd number"),
         (lambda: KernelConfig(estimate_size=2), "estimate_size: expected an odd number"),
         (lambda: KernelConfig(estimate_frames=3), "estimate_frames: expected 0, 1 or 5, got 3"),
+        (lambda: KernelConfig(estimate_share=1.0), "estimate_share: expected 0 < share < 1, got 1.0"),
         (lambda: RAUNetConfig(widths=()), "widths: expected at least one"),
         (lambda: RAUNetConfig(ra_scales=(3,)), "ra_scales: expected scales 0 to 2"),
         (lambda: RAResNetConfig(ra_after=(3, 25)), "ra_after: expected ascending blocks 1 to 24"),

@@ -1,0 +1,168 @@
+"""Measure what the parts of `network` cost; JSON on standard output.
+
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/bench_network.py --threads 1
+
+CPU seconds of the process after a warm-up: median, least and greatest of the repeats. Parts are measured in training
+at the size of its crops and in inference at the size of its tiles; "naive" is the form that is written first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from network.blocks import RobustAverage, outermost_first, ravg
+from network.kernels import apply_kernels, predict_kernel, threshold_kernel
+from network.models import denoise_tile, fast, for_inference, paper
+from network.train import TrainConfig, batch_loss
+
+# CPU seconds per megapixel of the prototypes this replaces: forward, forward and backward.
+PROTOTYPE = {"apply_kernels": 0.11, "apply_kernels, training": 0.60}
+
+
+def parse_arguments(argv: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--tile", type=int, default=256)
+    parser.add_argument("--paper", action="store_true", help="also the paper's network, which takes a minute")
+    return parser.parse_args(argv)
+
+
+def measure(function: Callable[[], object], repeats: int) -> dict[str, float]:
+    function()
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        seconds.append(time.process_time() - start)
+    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
+
+
+def naive_ravg(frames: list[Tensor]) -> Tensor:
+    return torch.stack(frames).sort(0).values[1:-1].mean(0)
+
+
+def naive_block(block: RobustAverage, x: Tensor) -> Tensor:
+    """Concatenate, convolve and sort at every step."""
+    frames = list(x.chunk(5))
+    kernel = torch.cat([block.on_frame.weight, block.on_average.weight], 1)
+    for i in outermost_first(5):
+        average = naive_ravg(frames[:i] + frames[i + 1 :])
+        both = torch.cat([frames[i], average], 1)
+        hidden = torch.relu(functional.conv2d(both, kernel, block.on_frame.bias, padding=1))
+        weight = torch.sigmoid(block.weight(hidden))
+        frames[i] = (1 - weight) * frames[i] + weight * average
+    return torch.cat(frames)
+
+
+def unfolded(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+    n, t, c, h, w = frames.shape
+    patches = functional.unfold(frames.flatten(0, 1), 5, padding=2).view(n, t, c, 25, h, w)
+    kernels = kernels.view(n, t, 1, 25, h, w)
+    return (patches * kernels).sum(3), kernels.sum(3)
+
+
+def training(function: Callable[[Tensor], Tensor | tuple[Tensor, ...]], x: Tensor) -> Callable[[], None]:
+    def step() -> None:
+        y = function(x.detach().requires_grad_())
+        (y if isinstance(y, Tensor) else y[0]).sum().backward()
+
+    return step
+
+
+def inference(function: Callable[[Tensor], object], x: Tensor) -> Callable[[], None]:
+    def step() -> None:
+        with torch.no_grad():
+            function(x)
+
+    return step
+
+
+def parts(tile: int) -> Iterator[tuple[str, Callable[[], object], int]]:
+    """Name, what to run, and pixels."""
+    for size, mode, name in ((tile, inference, ""), (128, training, ", training")):
+        x = torch.randn(5, 32, size // 2, size // 2).bfloat16().contiguous(memory_format=torch.channels_last)
+        block = RobustAverage(32).bfloat16().to(memory_format=torch.channels_last)
+        yield f"ravg of four{name}", mode(lambda x: ravg(list(x.chunk(5))[:4]), x), size**2
+        yield f"ravg of four, naive{name}", mode(lambda x: naive_ravg(list(x.chunk(5))[:4]), x), size**2
+        yield f"RA block{name}", mode(lambda x, block=block: block(x, 5), x), size**2
+        yield f"RA block, naive{name}", mode(lambda x, block=block: naive_block(block, x), x), size**2
+        weights, frames = torch.rand(1, 125, size, size), torch.rand(1, 5, 3, size, size)
+        yield f"predict_kernel{name}", mode(lambda x: predict_kernel(x, centre=62), weights), size**2
+        yield f"threshold_kernel{name}", mode(lambda x: threshold_kernel(x, centre=62), weights), size**2
+        yield f"apply_kernels{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights), size**2
+        yield f"apply_kernels, unfolded{name}", mode(lambda x, f=frames: unfolded(x, f), weights), size**2
+
+
+def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], object], int]]:
+    for name, build in {"fast": fast, **({"paper": paper} if with_paper else {})}.items():
+        for bfloat16 in (False, True):
+            model = for_inference(build(), bfloat16)
+            color = torch.rand(1, 5, 3, tile, tile)
+            confidence, estimate = torch.rand(1, 5, 1, tile, tile), torch.rand(1, 1, 3, tile, tile)
+            yield (
+                f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
+                lambda m=model, x=color, c=confidence, e=estimate: denoise_tile(m, x, x, x, c, estimate=e),
+                tile**2,
+            )
+        for count in (1, 2):
+            model, config = build().to(memory_format=torch.channels_last), TrainConfig(steps=1)
+            color, image = torch.rand(count, 5, 3, 128, 128), torch.rand(count, 3, 128, 128)
+            batch = {
+                **dict.fromkeys(("color", "albedo", "normal"), color),
+                **dict.fromkeys(("modulation", "target"), image),
+                "confidence": color[:, :, :1],
+                "estimate": image[:, None],
+                "present": torch.ones(count),
+                "exposure": torch.ones(count),
+            }
+            yield (
+                f"{name}, training, batch of {count}",
+                lambda m=model, b=batch, c=config: batch_loss(m, b, c).backward(),
+                count * 128**2,
+            )
+
+
+def main(argv: list[str]) -> int:
+    options = parse_arguments(argv)
+    torch.set_num_threads(options.threads)
+    results = {}
+    for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.paper)):
+        seconds = measure(function, options.repeats)
+        results[name] = {**seconds, "per_megapixel": seconds["median"] / pixels * 1e6}
+        if name in PROTOTYPE:
+            results[name]["over_prototype"] = results[name]["per_megapixel"] / PROTOTYPE[name]
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+    header = {
+        "unit": "CPU seconds",
+        "tile": options.tile,
+        "crop": 128,
+        "threads": options.threads,
+        "repeats": options.repeats,
+        "machine": platform.processor() or platform.machine(),
+        "cpu": torch.backends.cpu.get_cpu_capability(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "commit": commit,
+    }
+    json.dump({**header, "results": results}, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
