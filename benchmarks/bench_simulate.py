@@ -30,8 +30,9 @@ GROUPS = {
     "light tree": ("cycles.use_light_tree",),
     "sky": ("world.cycles.sampling_method",),
     "depth of field": ("camera.dof.use_dof",),
-    "passes": ("layer.",),
 }
+KINDS = ("diffuse", "glossy", "transmission", "volume", "transparent_max", "max")
+WARPED = ("albedo_unwarped", "albedo_warped", "albedo_warped_blurred", "albedo_noise")
 
 
 def warp(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,11 +53,10 @@ def tone(image: np.ndarray, mean: float) -> np.ndarray:
 def two_seed_ratio(a: list[np.ndarray], b: list[np.ndarray]) -> float:
     """Return the mean squared difference of two kinds of picture over the sum of their variances."""
     mean = float(np.mean(a))
-    (a1, a2), (b1, b2) = ([tone(picture, mean) for picture in pair] for pair in (a, b))
-    variances = ((a1 - a2) ** 2).mean() / 2 + ((b1 - b2) ** 2).mean() / 2
-    # All four pairs, so that no one picture's luck decides.
-    apart = np.mean([((x - y) ** 2).mean() for x in (a1, a2) for y in (b1, b2)])
-    return float(apart / variances)
+    a, b = ([tone(picture, mean) for picture in some] for some in (a, b))
+    variances = sum(np.mean(np.var(some, axis=0, ddof=1)) for some in (a, b))
+    # All pairs, so that no one picture's luck decides.
+    return float(np.mean([((x - y) ** 2).mean() for x in a for y in b]) / variances)
 
 
 def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -
     import bpy
 
     from hybrid.simulate import cycles
-    from hybrid.simulate.effects import EVERYTHING, SceneFacts, effects_of, settings_of
+    from hybrid.simulate.effects import EVERYTHING, PASSES, SceneFacts, effects_of, settings_of
     from hybrid.simulate.shot import ShotSettings
 
     scene_name, _, seed = name.partition(":")
@@ -77,6 +77,7 @@ def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -
     exposure = {key: lean[key] for key in ("cycles.film_exposure",) if key in lean}
     full = {
         **EVERYTHING,
+        **dict.fromkeys(PASSES, False),
         "render.use_motion_blur": False,
         "camera.dof.use_dof": scene.camera.data.dof.use_dof,
         **exposure,
@@ -97,11 +98,14 @@ def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -
         return np.stack([channels[f"Combined.{c}"] for c in "RGB"], axis=-1)
 
     picture(full, 9)  # the first picture also builds the scene
-    fulls = [picture(full, seed) for seed in (1, 2)]
-    picture(lean, 9)
-    leans = [picture(lean, seed) for seed in (1, 2, 3, 4)]
-    lows = [picture(lean, seed, max(int(spp / np.e), 1)) for seed in (5, 6)]
-    full_cpu, lean_cpu = (float(np.mean([seconds for _, seconds in some])) for some in (fulls, leans))
+    # Turn about, so that what else the machine does weighs on both alike.
+    fulls, leans = [], []
+    for number in (1, 2, 3, 4):
+        fulls.append(picture(full, number))
+        leans.append(picture(lean, number))
+    full_cpu, lean_cpu = (float(np.median([seconds for _, seconds in some])) for some in (fulls, leans))
+    leans += [picture(lean, number) for number in (5, 6, 7, 8)]
+    lows = [picture(lean, number, max(int(spp / np.e), 1)) for number in (9, 10, 11, 12)]
 
     effects = {}
     for group, keys in GROUPS.items():
@@ -114,33 +118,28 @@ def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -
             change = {k: v for k, v in lean.items() if k.startswith(keys) and k in full and v != full[k]}
         if change:
             trial = {**full, **change}
-            effects[group] = 1 - float(np.mean([picture(trial, seed)[1] for seed in (1, 2)])) / full_cpu
+            turns = [(picture(full, number)[1], picture(trial, number)[1]) for number in (1, 2, 3)]
+            effects[group] = 1 - float(np.median([after / before for before, after in turns]))
 
-    # Vectors: this frame's albedo against the next one's, as it is and warped.
-    def warped(sharp: dict, following: dict) -> tuple[float, float]:
-        here, there = (np.stack([f[f"Denoising Albedo.{c}"] for c in "RGB"], -1) for f in (sharp, following))
+    def albedo(channels: dict) -> np.ndarray:
+        return np.stack([channels[f"Denoising Albedo.{c}"] for c in "RGB"], axis=-1)
+
+    def apart(vectors: dict, here: dict, there: dict) -> tuple[float, float]:
+        """Return the mean difference of two frames' albedo, as they are and along the vectors."""
         y, x = np.mgrid[: size[1], : size[0]].astype(float)
-        moved, inside = warp(there, x - sharp["Vector.Z"], y + sharp["Vector.W"])
-        still = np.median(np.abs(here - there).mean(-1)[inside])
-        return (
-            float(np.abs(here - there).mean(-1)[inside].mean()),
-            float(np.abs(here - moved).mean(-1)[inside].mean()),
-            float(still),
-        )
+        moved, inside = warp(albedo(there), x - vectors["Vector.Z"], y + vectors["Vector.W"])
+        before, after = (np.abs(albedo(here) - other).mean(axis=-1)[inside] for other in (albedo(there), moved))
+        return float(before.mean()), float(after.mean())
 
     this, following = leans[0][0], picture(lean, 7, spp, 5)[0]
-    unwarped, after, _ = warped(this, following)
-    noise = float(
-        np.abs(
-            np.stack([leans[0][0][f"Denoising Albedo.{c}"] - leans[1][0][f"Denoising Albedo.{c}"] for c in "RGB"])
-        ).mean()
-    )
+    unwarped, after = apart(this, this, following)
+    noise = float(np.abs(albedo(this) - albedo(leans[1][0])).mean())
     blurred = ShotSettings(scene_name, shot.seed, (4, 5), size, {"n": spp}, film=film, motion_blur=True)
-    cycles.apply(scene, {**lean, "render.use_motion_blur": True})
+    cycles.apply(scene, {**lean, "render.use_motion_blur": True, "render.use_persistent_data": False})
     scene.frame_set(4)
     cycles.render_picture(scene, blurred, folder / "b.exr", spp, 8)
     smeared = {k.partition(".")[2]: v.astype(np.float64) for k, v in cycles.read_channels(folder / "b.exr")[1].items()}
-    _, after_blur, _ = warped(smeared, following)
+    _, after_blur = apart(smeared, smeared, following)
     motion = np.hypot(this["Vector.Z"], this["Vector.W"])
     return {
         "scene": Path(scene_name).stem + (f":{seed}" if seed else ""),
@@ -151,11 +150,9 @@ def measure(name: str, size: tuple[int, int], film: tuple[int, int], spp: int) -
         "lean_cpu_s": lean_cpu,
         "saved": 1 - lean_cpu / full_cpu,
         "saved_by": effects,
-        "mean_change": float(color(leans[0][0]).mean() + color(leans[1][0]).mean())
-        / float(color(fulls[0][0]).mean() + color(fulls[1][0]).mean())
-        - 1,
-        "two_seeds": two_seed_ratio([color(p) for p, _ in fulls], [color(p) for p, _ in leans[2:]]),
-        "two_levels": two_seed_ratio([color(p) for p, _ in leans[:2]], [color(p) for p, _ in lows]),
+        "mean_change": float(np.mean([color(p) for p, _ in leans[:4]]) / np.mean([color(p) for p, _ in fulls]) - 1),
+        "two_seeds": two_seed_ratio([color(p) for p, _ in fulls], [color(p) for p, _ in leans[4:]]),
+        "two_levels": two_seed_ratio([color(p) for p, _ in leans[:4]], [color(p) for p, _ in lows]),
         "motion_px": float(np.median(motion)),
         "albedo_unwarped": unwarped,
         "albedo_warped": after,
