@@ -187,6 +187,8 @@ def main(argv: list[str]) -> int:
         name, spp = level.split("=")
         render_level(scene, out, name, int(spp), frames, options.seed * 10 + number)
     if options.reference:
+        # Blender 5.0 renders wrong pictures if passes change while it keeps the scene between renders.
+        scene.render.use_persistent_data = False
         scene.view_layers[0].cycles.denoising_store_passes = False
         scene.view_layers[0].use_pass_z = scene.view_layers[0].use_pass_vector = False
         render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)

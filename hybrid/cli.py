@@ -301,8 +301,7 @@ def _run(
         task = progress.add_task(command, total=len(shot))
         for finished in denoise_shot(shot, output, estimator, plan, attributes=attributes, timings=timings):
             progress.advance(task)
-            frame = shot.read(finished.number).color
-            pixels += frame.shape[0] * frame.shape[1]
+            pixels += finished.pixels
             if finished.repaired:
                 console.print(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
             if finished.clamped:

@@ -49,6 +49,7 @@ class Finished:
 
     number: int
     path: Path
+    pixels: int
     repaired: int
     outliers: int
     clamped: int
@@ -107,7 +108,7 @@ def denoise_shot(
         with timings.stage("write"):
             images = {"color": denoised.color, **denoised.aovs}
             clamped = shot.write(path, number, images, denoised.extra, attributes)
-        yield Finished(number, path, aligned.repaired, aligned.outliers, clamped)
+        yield Finished(number, path, aligned.confidence[0].size, aligned.repaired, aligned.outliers, clamped)
 
 
 def write_preview(shot: Shot, output: str | Path, path: Path) -> None:

@@ -10,7 +10,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from nlm.gate import color_gate
 from numpy.typing import NDArray
 
 from flow.warp import warp
@@ -18,6 +17,7 @@ from hybrid.frames import Shot
 from hybrid.pseudo_reference import Aligner, PreparedFrame, prepare, rendered_flow
 from hybrid.transfer import compress, measure_exposure
 from nlm.average import reject_outliers
+from nlm.gate import color_gate
 
 Array = NDArray[np.float32]
 
@@ -48,6 +48,8 @@ GUIDE_NOISE_ABOVE = 0.003
 NOISE_FREE = 1e-4
 TILE = 32
 SAMPLES = 3
+# What frames are prepared with to be measured: without texture, and with a first estimate.
+MEASURED = frozenset({"demodulate", "gate"})
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def plan_shot(shot: Shot) -> Plan:
     """
     pairs = _sample_pairs(shot)
     if not pairs:
-        only = prepare(shot.read(shot.numbers[0]), {"demodulate"})
+        only = prepare(shot.read(shot.numbers[0]), MEASURED)
         pairs, single = [_Pair(only, only)], True
     else:
         single = False
@@ -191,7 +193,7 @@ def _sample_pairs(shot: Shot) -> list[_Pair]:
     numbers = list(shot.numbers)
     count = min(SAMPLES, len(numbers))
     picked = sorted({numbers[(2 * i + 1) * len(numbers) // (2 * count)] for i in range(count)})
-    aligner = Aligner(shot, {"demodulate"}, radius=1)
+    aligner = Aligner(shot, MEASURED, radius=1)
     pairs = []
     for number in picked:
         previous, _, following = aligner.load(number, 1)
@@ -257,18 +259,23 @@ def _speed(pair: _Pair) -> float:
 
 def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -> float:
     """Share of the picture whose estimate differs between two frames by more than its noise, along `vectors`."""
-    here, there = pair.here, pair.there
-    exposure = measure_exposure(here.estimate)
-    if vectors is None:
-        other, inside = there.estimate, np.ones(here.valid.shape, bool)
-    else:
-        other, inside = warp(there.estimate, vectors[0])
+    here, other = _estimate_of(pair.here), _estimate_of(pair.there)
+    exposure = measure_exposure(here)
+    inside = np.ones(here.shape[:2], bool)
+    if vectors is not None:
+        other, inside = warp(other, vectors[0])
         inside &= vectors[1]
-    window = np.stack([other, here.estimate, other])
-    weight = color_gate(window, here.irradiance, exposure)[0]
+    window = np.stack([other, here, other])
+    weight = color_gate(window, pair.here.irradiance, exposure)[0]
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
     # noise brings one in a thousand.
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
+
+
+def _estimate_of(frame: PreparedFrame) -> Array:
+    if frame.estimate is None:
+        raise ValueError(f"frame {frame.number} was prepared without the estimate that the plan compares")
+    return frame.estimate
 
 
 def _outlier_share(frame: PreparedFrame) -> float:
@@ -286,8 +293,9 @@ def _guide_noise(pair: _Pair) -> float:
 
 
 def _noise_free_share(frame: PreparedFrame) -> float:
-    exposure = measure_exposure(frame.estimate)
-    removed = np.abs(compress(frame.irradiance, exposure) - compress(frame.estimate, exposure)).max(axis=-1)
+    estimate = _estimate_of(frame)
+    exposure = measure_exposure(estimate)
+    removed = np.abs(compress(frame.irradiance, exposure) - compress(estimate, exposure)).max(axis=-1)
     tiles = [
         removed[y : y + TILE, x : x + TILE].max() < NOISE_FREE
         for y in range(0, removed.shape[0], TILE)

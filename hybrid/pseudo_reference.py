@@ -10,39 +10,40 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from flow.confidence import estimate_confidence, mix_centre
-from nlm.gate import color_gate
-from nlm.guided import guided_filter
-from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 from numpy.typing import NDArray
 
-from flow.motion import Motion, compose_flow, invert_flow, normalize_motion
+from flow.confidence import estimate_confidence, mix_centre
+from flow.guide import prefilter_guide as prefilter_flow_guide
+from flow.motion import Motion, compose_flow, forward_backward_error, invert_flow, normalize_motion
 from flow.tvl1 import dense_flow, refine_flow, select_flow
 from flow.warp import warp
 from hybrid.frames import Frame, Shot
 from hybrid.timing import Timings
 from hybrid.transfer import compress, demodulate, measure_exposure, remodulate
 from nlm.average import reject_outliers, replace_nonfinite, robust_average
+from nlm.gate import color_gate
+from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
+from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Rec. 709 luminance; the weights only have to be the same everywhere.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+# Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
+HIDDEN = 3.0
 
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, made safe to filter: finite, divided by its albedo, with a first spatial estimate.
+    """One frame, made safe to filter: finite, divided by its albedo, perhaps with a first spatial estimate.
 
     Attributes
     ----------
     number : int
         The frame's number.
     irradiance : (H, W, 3) array
-        Color divided by albedo (`hybrid.transfer.demodulate`); the color itself without an albedo.
-    estimate : (H, W, 3) array
+        Color divided by albedo (`hybrid.transfer.demodulate`), or the color itself if not `demodulated`.
+    estimate : (H, W, 3) array or None
         A denoised picture of this frame alone, as irradiance: the one that came with the frame, or a guided filter's.
     albedo, normal : (H, W, 3) array or None
         Guides, finite.
@@ -58,11 +59,13 @@ class PreparedFrame:
         Of the irradiance, where the renderer gave one of the color.
     aovs : dict of str to (H, W, C) array
         Further layers to be warped along, demodulated like the color.
+    demodulated : bool
+        Whether the albedo has been divided out.
     """
 
     number: int
     irradiance: Array
-    estimate: Array
+    estimate: Array | None
     albedo: Array | None
     normal: Array | None
     valid: Mask
@@ -71,6 +74,7 @@ class PreparedFrame:
     depth: Array | None
     variance: Array | None
     aovs: dict[str, Array]
+    demodulated: bool
 
     @property
     def guide(self) -> Array | None:
@@ -78,10 +82,12 @@ class PreparedFrame:
         guides = [layer for layer in (self.albedo, self.normal) if layer is not None]
         return np.concatenate(guides, axis=-1) if guides else None
 
-    def flow_guide(self, exposure: float) -> Array:
-        """Tone-mapped luminance (H, W) of the estimate, in [0, 1)."""
-        radiance = self.estimate if self.albedo is None else remodulate(self.estimate, self.albedo)
-        return compress(radiance @ _LUMINANCE, exposure)
+    @property
+    def radiance(self) -> Array:
+        """The noisy radiance (H, W, 3)."""
+        if self.albedo is None or not self.demodulated:
+            return self.irradiance
+        return remodulate(self.irradiance, self.albedo)
 
 
 @dataclass(frozen=True)
@@ -94,8 +100,6 @@ class AlignedWindow:
         The centre frame's number.
     color : (T, H, W, 3) array
         Irradiance. A missing frame holds the centre's, with confidence 0.
-    estimates : (T, H, W, 3) array
-        Each frame's own estimate, as irradiance.
     albedo, normal : (T, H, W, 3) array or None
         Guides.
     confidence : (T, H, W) array
@@ -106,8 +110,6 @@ class AlignedWindow:
         The centre's albedo and normal, prefiltered.
     variance : (H, W, 3) array
         Of the centre's `color`, smoothed.
-    exposure : float
-        Brightness of the window's irradiance; scales with it.
     aovs : dict of str to (T, H, W, C) array
         Further layers, warped and demodulated like the color.
     flows : (T, H, W, 2) array
@@ -120,14 +122,12 @@ class AlignedWindow:
 
     number: int
     color: Array
-    estimates: Array
     albedo: Array | None
     normal: Array | None
     confidence: Array
     modulation: Array
     guide: Array | None
     variance: Array
-    exposure: float
     aovs: dict[str, Array]
     flows: Array
     repaired: int
@@ -145,14 +145,14 @@ class AlignedWindow:
 
 
 def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
-    """Make one frame safe to filter, divide it by its albedo, and estimate it by itself.
+    """Make one frame safe to filter, divide it by its albedo, and estimate it by itself where that is of use.
 
     Parameters
     ----------
     frame : Frame
         As read.
     effects : collection of str
-        The plan's; "demodulate" and "outliers" matter here.
+        The plan's; "demodulate" and "gate" matter here.
     """
     color, bad = replace_nonfinite(frame.color)
     repaired = bad
@@ -163,26 +163,25 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
             layer, bad_here = replace_nonfinite(layer)
             repaired = repaired | bad_here
         layers[name] = layer
-    albedo, normal, given, variance = layers.values()
+    albedo, normal, estimate, variance = layers.values()
     albedo = None if albedo is None else np.maximum(albedo, 0)
     motion = None
     if frame.motion is not None and frame.motion_convention is not None:
         motion = normalize_motion(frame.motion, frame.motion_convention)
-    divisor = albedo if "demodulate" in effects else None
-    irradiance = color if divisor is None else demodulate(color, divisor)
-    if variance is not None and divisor is not None:
-        variance = demodulate(demodulate(np.maximum(variance, 0), divisor), divisor)
-    if given is None:
-        estimate = _estimate_alone(irradiance, albedo, normal)
-    else:
-        estimate = given if divisor is None else demodulate(given, divisor)
-    aovs = {}
-    for name, layer in frame.aovs.items():
-        layer, _ = replace_nonfinite(layer)
-        aovs[name] = layer if divisor is None else demodulate(layer, divisor)
+    aovs = {name: replace_nonfinite(layer)[0] for name, layer in frame.aovs.items()}
+    demodulated = albedo is not None and "demodulate" in effects
+    if albedo is not None and demodulated:
+        color = demodulate(color, albedo)
+        estimate = None if estimate is None else demodulate(estimate, albedo)
+        variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
+        aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
+    if "gate" not in effects:
+        estimate = None
+    elif estimate is None:
+        estimate = _estimate_alone(color, albedo, normal)
     return PreparedFrame(
         number=frame.number,
-        irradiance=irradiance,
+        irradiance=color,
         estimate=estimate,
         albedo=albedo,
         normal=normal,
@@ -190,8 +189,9 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
         repaired=int(np.count_nonzero(repaired)),
         motion=motion,
         depth=frame.depth,
-        variance=variance,
+        variance=None if variance is None else np.maximum(variance, 0),
         aovs=aovs,
+        demodulated=demodulated,
     )
 
 
@@ -236,7 +236,7 @@ class Aligner:
         self.radius = radius
         self.interpolation = interpolation
         self.timings = timings or Timings()
-        self._frames: dict[int, tuple[Frame, PreparedFrame]] = {}
+        self._frames: dict[int, PreparedFrame] = {}
         self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
 
     def align(self, number: int) -> AlignedWindow:
@@ -258,23 +258,20 @@ class Aligner:
         """Read and prepare the frames around `number`; return the numbers of the window, ascending."""
         step = self.shot.step
         numbers = list(range(number - radius * step, number + radius * step + 1, step))
-        with self.timings.stage("read"):
-            window = self.shot.window(number, radius)
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
-        self._frames = {n: kept for n, kept in self._frames.items() if n in numbers}
-        with self.timings.stage("prepare"):
-            for n, frame in zip(numbers, window.frames, strict=True):
-                # A frame brought onto another data window is another object, and is prepared again.
-                if frame is not None and (n not in self._frames or self._frames[n][0] is not frame):
-                    self._frames[n] = frame, prepare(frame, self.effects)
-                    self._flows = {ab: flow for ab, flow in self._flows.items() if n not in ab}
+        self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
+        for n in numbers:
+            if n not in self._frames and self.shot.has(n):
+                with self.timings.stage("read"):
+                    frame = self.shot.read(n)
+                with self.timings.stage("prepare"):
+                    self._frames[n] = prepare(frame, self.effects)
         return numbers
 
     def frame(self, number: int) -> PreparedFrame | None:
         """Frame `number` of the window loaded last, or None where the shot has no such frame."""
-        kept = self._frames.get(number)
-        return None if kept is None else kept[1]
+        return self._frames.get(number)
 
     def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
         """Flow from frame `start` to frame `end`, chained over the frames between; None where one is missing."""
@@ -306,96 +303,116 @@ class Aligner:
         if "warp" not in self.effects:
             return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
         vectors = rendered_flow(here, there)
-        exposure = measure_exposure(remodulated(here))
-        guides = here.flow_guide(exposure), there.flow_guide(exposure)
-        noise = 0.5 * _guide_noise(here, exposure)
+        if vectors is not None and "refine" not in self.effects:
+            return vectors
+        exposure = measure_exposure(here.radiance)
+        guide, noise = prefilter_flow_guide(here.radiance, here.albedo, exposure=exposure)
+        other, other_noise = prefilter_flow_guide(there.radiance, there.albedo, exposure=exposure)
+        noise = np.maximum(noise, other_noise)
         if vectors is None:
-            return dense_flow(*guides, noise=noise), np.ones(shape, bool)
+            return dense_flow(guide, other, noise=noise), np.ones(shape, bool)
         flow, valid = vectors
-        if "refine" in self.effects:
-            refined = refine_flow(*guides, flow, noise=noise)
-            flow, _ = select_flow([flow, refined], *guides, noise=noise)
+        back = rendered_flow(there, here)
+        # Hidden in the other frame: whatever matches there is another surface.
+        visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
+        refined = refine_flow(guide, other, flow, noise=noise)
+        flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
         return flow, valid
 
     def _assemble(self, number: int, numbers: list[int]) -> AlignedWindow:
-        centre = self._frames[number][1]
-        height, width = centre.irradiance.shape[:2]
-        layers = _stack(centre)
-        stack = np.empty((len(numbers), *layers.shape), np.float32)
-        confidence = np.zeros((len(numbers), height, width), np.float32)
-        flows = np.zeros((len(numbers), height, width, 2), np.float32)
+        centre = self._frames[number]
+        shape = len(numbers), *centre.irradiance.shape[:2]
+        layers = _layers(centre)
+        window = {name: np.empty((*shape, layer.shape[-1]), np.float32) for name, layer in layers.items()}
+        confidence = np.zeros(shape, np.float32)
+        flows = np.zeros((*shape, 2), np.float32)
         for index, neighbour in enumerate(numbers):
-            if neighbour == number:
-                stack[index], confidence[index] = layers, centre.valid
-                continue
-            there = self.frame(neighbour)
-            link, back = self.flow(number, neighbour), self.flow(neighbour, number)
+            there, link, back = self.frame(neighbour), None, None
+            if neighbour != number:
+                link, back = self.flow(number, neighbour), self.flow(neighbour, number)
             if there is None or link is None or back is None:
-                stack[index] = layers
+                # The centre itself, or a frame that is missing.
+                for name, layer in layers.items():
+                    window[name][index] = layer
+                confidence[index] = centre.valid if neighbour == number else 0
                 continue
             with self.timings.stage("warp"):
-                stack[index], confidence[index], flows[index] = self._warp(centre, there, link, back[0])
+                warped, inside = self._warp(there, layers, link[0])
+                for name, layer in warped.items():
+                    window[name][index] = layer
+                confidence[index] = self._trust(centre, warped, link, inside, back[0])
+                flows[index] = link[0]
         with self.timings.stage("confidence"):
-            return self._finish(centre, stack, confidence, flows)
+            return self._finish(centre, window, confidence, flows)
 
-    def _warp(
-        self, centre: PreparedFrame, there: PreparedFrame, link: tuple[Array, Mask], back: Array
-    ) -> tuple[Array, Array, Array]:
-        """Warp one neighbour's layers to the centre, and say how far they can be trusted."""
-        flow, valid = link
-        if "warp" in self.effects:
-            warped, inside = warp(_stack(there), flow, interpolation=self.interpolation)
-        else:
-            warped, inside = _stack(there), np.ones(flow.shape[:2], bool)
-        slices = _slices(centre)
-        # The last channel is the share of finite colour in the mix: less than all of it is no measurement.
-        valid = valid & (warped[..., -1] > 0.999)
-        trust = estimate_confidence(
-            flow,
+    def _warp(self, there: PreparedFrame, wanted: Collection[str], flow: Array) -> tuple[dict[str, Array], Mask]:
+        """Warp a neighbour's layers to the centre, all in one call."""
+        layers = _layers(there)
+        if missing := set(wanted) ^ set(layers):
+            raise ValueError(
+                f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
+            )
+        if "warp" not in self.effects:
+            return layers, np.ones(flow.shape[:2], bool)
+        stack, inside = warp(np.concatenate(list(layers.values()), axis=-1), flow, interpolation=self.interpolation)
+        warped, start = {}, 0
+        for name, layer in layers.items():
+            warped[name] = stack[..., start : start + layer.shape[-1]]
+            start += layer.shape[-1]
+        return warped, inside
+
+    def _trust(
+        self,
+        centre: PreparedFrame,
+        warped: dict[str, Array],
+        link: tuple[Array, Mask],
+        inside: Mask,
+        back: Array,
+    ) -> Array:
+        """Confidence in a warped neighbour, from geometry."""
+        # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
+        valid = link[1] & (warped["valid"][..., 0] > 0.999)
+        return estimate_confidence(
+            link[0],
             inside=inside,
             reverse=back if "warp" in self.effects else None,
             albedo=centre.albedo,
-            warped_albedo=None if centre.albedo is None else warped[..., slices["albedo"]],
+            warped_albedo=warped.get("albedo"),
             normal=centre.normal,
-            warped_normal=None if centre.normal is None else warped[..., slices["normal"]],
+            warped_normal=warped.get("normal"),
             valid=valid,
         )
-        return warped, trust, flow
 
-    def _finish(self, centre: PreparedFrame, stack: Array, confidence: Array, flows: Array) -> AlignedWindow:
-        slices = _slices(centre)
-        color, estimates = stack[..., slices["color"]], stack[..., slices["estimate"]]
-        albedo = None if centre.albedo is None else stack[..., slices["albedo"]]
-        normal = None if centre.normal is None else stack[..., slices["normal"]]
-        exposure = measure_exposure(estimates[len(stack) // 2])
+    def _finish(
+        self, centre: PreparedFrame, window: dict[str, Array], confidence: Array, flows: Array
+    ) -> AlignedWindow:
+        color, albedo, normal = window["color"], window.get("albedo"), window.get("normal")
+        middle = len(color) // 2
         outliers = 0
         if "outliers" in self.effects:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected))
         if "gate" in self.effects:
-            confidence = confidence * color_gate(estimates, color[len(stack) // 2], exposure)
-        clean_albedo, guide = centre.albedo, centre.guide
-        if guide is not None and "prefilter" in self.effects:
-            layers = [layer for layer in (albedo, normal) if layer is not None]
-            guide = prefilter_guide(np.concatenate(layers, axis=-1), confidence)
-            clean_albedo = None if albedo is None else guide[..., :3]
+            estimates = window.pop("estimate")
+            confidence = confidence * color_gate(estimates, color[middle], measure_exposure(estimates[middle]))
+        guides = [
+            (own, layer) for own, layer in ((centre.albedo, albedo), (centre.normal, normal)) if layer is not None
+        ]
+        clean = [prefilter_guide(layer, confidence) if "prefilter" in self.effects else own for own, layer in guides]
         modulation = np.ones_like(color[0])
-        if clean_albedo is not None and "demodulate" in self.effects:
-            modulation = remodulate(modulation, clean_albedo)
+        if albedo is not None and centre.demodulated:
+            modulation = remodulate(modulation, clean[0])
         given = centre.variance
-        variance = variance_from_window(color, confidence) if given is None else smooth_variance(given)
         return AlignedWindow(
             number=centre.number,
-            color=np.ascontiguousarray(color),
-            estimates=np.ascontiguousarray(estimates),
+            color=color,
             albedo=albedo,
             normal=normal,
             confidence=confidence,
             modulation=modulation,
-            guide=guide,
-            variance=variance,
-            exposure=exposure,
-            aovs={name: stack[..., slices[f"aov {name}"]] for name in centre.aovs},
+            guide=np.concatenate(clean, axis=-1) if clean else None,
+            variance=variance_from_window(color, confidence) if given is None else smooth_variance(given),
+            aovs={name: window[f"aov {name}"] for name in centre.aovs},
             flows=flows,
             repaired=centre.repaired,
             outliers=outliers,
@@ -422,20 +439,8 @@ def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mas
     return None
 
 
-def remodulated(frame: PreparedFrame) -> Array:
-    """The radiance (H, W, 3) of a prepared frame's estimate."""
-    return frame.estimate if frame.albedo is None else remodulate(frame.estimate, frame.albedo)
-
-
-def _guide_noise(frame: PreparedFrame, exposure: float) -> float:
-    """Standard deviation of the noise in the frame's flow guide: what the estimate removed, a typical value."""
-    noisy = frame.irradiance if frame.albedo is None else remodulate(frame.irradiance, frame.albedo)
-    removed = compress(noisy @ _LUMINANCE, exposure) - frame.flow_guide(exposure)
-    return float(1.4826 * np.median(np.abs(removed)))
-
-
 def _layers(frame: PreparedFrame) -> dict[str, Array]:
-    """All layers of a frame that are warped, in their order in the stack."""
+    """All layers of a frame that are warped."""
     named = {
         "color": frame.irradiance,
         "estimate": frame.estimate,
@@ -445,19 +450,6 @@ def _layers(frame: PreparedFrame) -> dict[str, Array]:
         "valid": frame.valid[..., None].astype(np.float32),
     }
     return {name: layer for name, layer in named.items() if layer is not None}
-
-
-def _stack(frame: PreparedFrame) -> Array:
-    return np.concatenate(list(_layers(frame).values()), axis=-1)
-
-
-def _slices(frame: PreparedFrame) -> dict[str, slice]:
-    """Which channels of the stack each layer takes."""
-    slices, start = {}, 0
-    for name, layer in _layers(frame).items():
-        slices[name] = slice(start, start + layer.shape[-1])
-        start += layer.shape[-1]
-    return slices
 
 
 @dataclass(frozen=True)

@@ -110,25 +110,25 @@ class KernelHead(nn.Module):
     Notes
     -----
     In units of 1/K (K the taps at hand), the raw weight of tap i is ``w_i = tK + (1 − tK) K b_i c_i + s_i h_i``: b is
-    the kernel at the start (uniform over the window, all but a fifth at the centre of an estimate, each times its
-    source's share), c the confidence of the frame over its mean over the frames, h what the convolution predicts, s
-    the scale of that: 1 on the window, K b on the estimate. As ``η_t`` takes t away and renormalises, h = 0 gives
-    exactly the kernel ``b_i c_i``: a mean of the window weighted by confidence, blended with the estimate. The training
-    starts there, with small h; h is added, not multiplied, so that it can reach any kernel, also on frames without
-    confidence. Without an estimate and at full confidence this is the uniform kernel, w = 1/K.
+    the kernel at the start (four fifths on the pixel itself and the rest on all its taps, in each frame of the window;
+    nearly all on the pixel itself in an estimate; each times its source's share), c the confidence of the frame over
+    its mean over the frames, h what the convolution predicts, s the scale of that: 1 on the window, K times b's mean
+    on the estimate. As ``η_t`` takes t away and renormalises, h = 0 gives exactly the kernel ``b_i c_i``: the mean over
+    time weighted by confidence, hardly blurred, blended with the estimate. Blur is what costs at the start: a 3×3 mean
+    of the estimate alone loses 3 dB on a clean shot. The training starts there, with small h; h is added, not
+    multiplied, so that it can reach any kernel, also on frames without confidence.
     """
 
-    start: Tensor
+    window_start: Tensor
+    estimate_start: Tensor
 
     def __init__(self, channels: int, config: KernelConfig) -> None:
         super().__init__()
         self.config = config
         self.window = nn.Conv2d(channels, config.size**2, 3, padding=1)
         self.estimate = nn.Conv2d(channels, config.estimate_size**2, 3, padding=1) if config.estimate_frames else None
-        taps = config.estimate_size**2
-        start = torch.full((1, 1, taps, 1, 1), 0.2 if taps > 1 else 1.0)
-        start[:, :, taps // 2] = 0.8 * taps + 0.2 if taps > 1 else 1.0
-        self.register_buffer("start", start, persistent=False)
+        self.register_buffer("window_start", _peak(config.size, 0.2), persistent=False)
+        self.register_buffer("estimate_start", _peak(config.estimate_size, 0.05), persistent=False)
         with torch.no_grad():
             for convolution in (self.window, self.estimate):
                 if convolution is not None:
@@ -164,13 +164,13 @@ class KernelHead(nn.Module):
         confidence = confidence / confidence.mean(1, keepdim=True)
         scale = (taps * (1 - share) / config.window_taps).unsqueeze(1)
         raw = _frames_first(self.window(features), config.frames)
-        weights = (bias + (1 - bias) * scale * confidence + raw).flatten(1, 2)
+        weights = (bias + (1 - bias) * scale * confidence * self.window_start + raw).flatten(1, 2)
         if self.estimate is not None:
             scale = (taps * share / config.estimate_taps).unsqueeze(1)
             middle = features.chunk(config.frames)[config.frames // 2]
             raw = self.estimate(middle if config.estimate_frames == 1 else features)
             raw = _frames_first(raw, config.estimate_frames)
-            start = bias * here.unsqueeze(1) + (1 - bias) * scale * self.start
+            start = bias * here.unsqueeze(1) + (1 - bias) * scale * self.estimate_start
             weights = torch.cat([weights, torch.addcmul(start, raw, scale).flatten(1, 2)], 1)
         cut = config.threshold if threshold is None else _check_threshold(threshold)
         return predict_kernel(weights, cut / taps, centre=config.centre)
@@ -312,7 +312,7 @@ def fast(frames: int = 5, estimate_frames: int = 1, seed: int = 0) -> RAUNet:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.85)
+        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.9)
         return RAUNet(RAUNetConfig(kernel))
 
 
@@ -435,6 +435,14 @@ def _frames_first(x: Tensor, frames: int) -> Tensor:
     """``(T·N, K·K, H, W)`` to float32 ``(N, T, K·K, H, W)``, planes contiguous as the kernels' passes want them."""
     x = x.unflatten(0, (frames, -1)).transpose(0, 1)
     return x.to(torch.float32, memory_format=torch.contiguous_format)
+
+
+def _peak(size: int, spread: float) -> Tensor:
+    """A K×K kernel, (1, 1, K·K, 1, 1), of mean 1: `spread` of it uniform, the rest at the centre."""
+    taps = size * size
+    kernel = torch.full((1, 1, taps, 1, 1), spread)
+    kernel[:, :, taps // 2] += taps * (1 - spread)
+    return kernel
 
 
 def _check_threshold(relative: float) -> float:

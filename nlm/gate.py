@@ -57,7 +57,8 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
     centre, valid = _tone_map(estimates[centre_index], exposure)
     shown, known = _tone_map(noisy, exposure)
     error = np.where(valid & known, _mean_square(shown - centre), np.float32(0))
-    noise = np.sqrt(cv2.blur(error, _NOISE_SIZE))
+    # The running sums of a box filter round to a little below 0 where nothing differs.
+    noise = np.sqrt(np.maximum(cv2.blur(error, _NOISE_SIZE), 0))
     rate = 1 / np.square(np.float32(_SHARE) * noise + np.float32(_FLOOR))
     weight = np.empty(estimates.shape[:3], np.float32)
     for t, estimate in enumerate(estimates):

@@ -108,9 +108,7 @@ def test_normals_of_any_length_and_of_no_surface() -> None:
 
 def test_depth_is_relative() -> None:
     def agreement(a: float, b: float) -> float:
-        result = estimate_confidence(
-            STILL, inside=INSIDE, depth=constant(a)[..., 0], warped_depth=constant(b)[..., 0]
-        )
+        result = estimate_confidence(STILL, inside=INSIDE, depth=constant(a)[..., 0], warped_depth=constant(b)[..., 0])
         return float(result[3, 3])
 
     assert agreement(10, 10.5) == 1

@@ -63,9 +63,7 @@ def test_bilinear_agrees_with_opencv() -> None:
     rng = np.random.default_rng(3)
     image, flow = rng.random((30, 40, 3), np.float32), random_flow(rng, 30, 40, 5)
     y, x = np.mgrid[:30, :40].astype(np.float32)
-    expected = cv2.remap(
-        image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    expected = cv2.remap(image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # OpenCV before 5 quantises positions to 1/32 px: half a step in x and y on slopes of up to 1.
     np.testing.assert_allclose(warp(image, flow)[0], expected, atol=1 / 32)
 

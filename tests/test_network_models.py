@@ -175,10 +175,18 @@ def silent_head(config: KernelConfig) -> KernelHead:
     return head
 
 
-def test_without_an_estimate_and_at_full_confidence_the_kernels_start_uniform() -> None:
+def start(size: int, spread: float) -> torch.Tensor:
+    """`spread` of a kernel of K×K taps that sums to 1 is uniform, the rest on the pixel itself."""
+    kernel = torch.full((size * size,), spread / size**2)
+    kernel[size * size // 2] += 1 - spread
+    return kernel
+
+
+def test_without_an_estimate_and_at_full_confidence_the_kernels_start_at_the_mean_over_time() -> None:
     config = KernelConfig()
     kernels = silent_head(config)(torch.zeros(5, 4, 6, 6), torch.ones(1, 5, 1, 6, 6), torch.zeros(1))
-    torch.testing.assert_close(kernels, torch.full((1, 125, 6, 6), 1 / 125))
+    expected = (start(5, 0.2) / 5).repeat(5).view(1, 125, 1, 1).expand(1, 125, 6, 6)
+    torch.testing.assert_close(kernels, expected)
 
 
 @pytest.mark.parametrize("estimate_frames", [0, 1, 3])
@@ -197,13 +205,10 @@ def test_the_kernels_start_at_the_confidence_and_half_the_estimate(estimate_fram
 
 
 def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
-    """A fifth of the estimate's share is spread evenly over its 3×3 taps, the rest is the pixel's."""
     config = KernelConfig(frames=3, size=3, estimate_frames=1, estimate_size=3, estimate_share=0.9)
     kernels = silent_head(config)(torch.zeros(3, 4, 4, 4), torch.ones(1, 3, 1, 4, 4), torch.ones(1))
-    expected = torch.full((9,), 0.9 * 0.2 / 9)
-    expected[4] += 0.9 * 0.8
-    torch.testing.assert_close(kernels[0, 27:, 1, 1], expected)
-    torch.testing.assert_close(kernels[0, :27, 1, 1], torch.full((27,), 0.1 / 27))
+    torch.testing.assert_close(kernels[0, 27:, 1, 1], 0.9 * start(3, 0.05))
+    torch.testing.assert_close(kernels[0, :27, 1, 1], 0.1 / 3 * start(3, 0.2).repeat(3))
 
 
 def test_a_correction_reaches_any_kernel() -> None:
@@ -211,10 +216,10 @@ def test_a_correction_reaches_any_kernel() -> None:
     config = KernelConfig(frames=3, size=3, estimate_frames=1)
     head = silent_head(config)
     with torch.no_grad():
-        head.window.bias.fill_(-2)
+        head.window.bias.fill_(-50)
         head.window.bias[7] = 50
-        head.estimate.bias.fill_(-2)
-        head.window.weight[7, 0, 1, 1] = -100  # and only where the feature is not 1: in frame 2
+        head.estimate.bias.fill_(-50)
+        head.window.weight[7, 0, 1, 1] = -200  # and only where the feature is not 1: in frame 2
     features = torch.ones(3, 4, 5, 5)
     features[2] = 0
     confidence = torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(1, 3, 1, 5, 5)

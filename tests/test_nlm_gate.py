@@ -37,8 +37,9 @@ def test_shuts_on_moving_light_and_stays_open_on_noise(rng):
 
 def test_does_not_depend_on_the_exposure(rng):
     estimates, noisy = rng.random((3, 20, 20, 3), np.float32), rng.random((20, 20, 3), np.float32)
-    np.testing.assert_allclose(color_gate(estimates * 512, noisy * 512, 128.0), color_gate(estimates, noisy, 0.25),
-                               rtol=1e-6)
+    np.testing.assert_allclose(
+        color_gate(estimates * 512, noisy * 512, 128.0), color_gate(estimates, noisy, 0.25), rtol=1e-6
+    )
 
 
 def test_hard_values_do_not_spread(rng):
@@ -55,11 +56,14 @@ def test_hard_values_do_not_spread(rng):
     assert np.isfinite(color_gate(np.zeros_like(estimates), np.zeros_like(noisy), 1.0)).all()
 
 
-@pytest.mark.parametrize(("name", "arguments"), [
-    ("estimates", (np.zeros((2, 8, 8, 3)), np.zeros((8, 8, 3)), 1.0)),
-    ("noisy", (np.zeros((3, 8, 8, 3)), np.zeros((8, 9, 3)), 1.0)),
-    ("exposure", (np.zeros((3, 8, 8, 3)), np.zeros((8, 8, 3)), 0.0)),
-])
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("estimates", (np.zeros((2, 8, 8, 3)), np.zeros((8, 8, 3)), 1.0)),
+        ("noisy", (np.zeros((3, 8, 8, 3)), np.zeros((8, 9, 3)), 1.0)),
+        ("exposure", (np.zeros((3, 8, 8, 3)), np.zeros((8, 8, 3)), 0.0)),
+    ],
+)
 def test_arguments_are_checked(name, arguments):
     with pytest.raises(ValueError, match=f"^{name}:"):
         color_gate(*arguments)

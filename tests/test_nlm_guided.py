@@ -37,8 +37,13 @@ def test_matches_the_equations(rng, channels):
     guide = rng.random((14, 17, channels)) * np.arange(1, channels + 1)
     weight = rng.uniform(0.1, 1, (14, 17))
     for w in (None, weight):
-        result = guided_filter(image.astype(np.float32), guide.astype(np.float32), radius=2, eps=0.05,
-                               weight=None if w is None else w.astype(np.float32))
+        result = guided_filter(
+            image.astype(np.float32),
+            guide.astype(np.float32),
+            radius=2,
+            eps=0.05,
+            weight=None if w is None else w.astype(np.float32),
+        )
         # coefficients are stored in float32 and cancel; the range's clamp is not reached at this eps
         np.testing.assert_allclose(result, naive(image, guide, 2, 0.05, w), atol=2e-5)
 
@@ -103,13 +108,16 @@ def test_what_is_not_finite_or_not_trusted_is_left_out(rng):
     assert np.isfinite(nothing).all()
 
 
-@pytest.mark.parametrize(("name", "change"), [
-    ("guide", {"guide": np.zeros((8, 9, 3), np.float32)}),
-    ("radius", {"radius": 0}),
-    ("eps", {"eps": 0.0}),
-    ("subsample", {"subsample": 3}),
-    ("weight", {"weight": np.ones((8, 9), np.float32)}),
-])
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("guide", {"guide": np.zeros((8, 9, 3), np.float32)}),
+        ("radius", {"radius": 0}),
+        ("eps", {"eps": 0.0}),
+        ("subsample", {"subsample": 3}),
+        ("weight", {"weight": np.ones((8, 9), np.float32)}),
+    ],
+)
 def test_arguments_are_checked(name, change):
     good = {"image": np.zeros((8, 8, 3), np.float32), "guide": np.zeros((8, 8, 3), np.float32), "radius": 2}
     with pytest.raises(ValueError, match=f"^{name}:"):

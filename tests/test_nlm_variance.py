@@ -69,8 +69,9 @@ def test_scale_constants_and_order():
     rng = np.random.default_rng(9)
     window = rng.normal(1, 0.4, (3, 16, 16, 3)).astype(np.float32)
     confidence = np.ones((3, 16, 16), np.float32)
-    np.testing.assert_allclose(variance_from_window(window * 8, confidence),
-                               variance_from_window(window, confidence) * 64, rtol=1e-6)
+    np.testing.assert_allclose(
+        variance_from_window(window * 8, confidence), variance_from_window(window, confidence) * 64, rtol=1e-6
+    )
     np.testing.assert_array_equal(variance_from_window(np.ones_like(window), confidence), 0)
     flat = np.full((16, 16, 7), 0.3, np.float32)
     np.testing.assert_allclose(smooth_variance(flat), 0.3, rtol=1e-6)
