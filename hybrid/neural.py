@@ -16,7 +16,7 @@ import network
 from hybrid.frames import Shot
 from hybrid.pipeline import Denoised
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import BALANCED, FINAL, AlignedWindow, Aligner, estimate
+from hybrid.pseudo_reference import ALPHA, BALANCED, FINAL, AlignedWindow, Aligner, estimate
 from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.clips import Clip
@@ -118,33 +118,51 @@ class Denoiser:
     def _run(self, aligned: AlignedWindow, given: Array | None) -> Denoised:
         color = aligned.mixed(aligned.color)
         height, width = color.shape[1:3]
-        layers: dict[str, Array | None] = {
-            "color": color,
-            "albedo": None if aligned.albedo is None else aligned.mixed(aligned.albedo),
-            "normal": None if aligned.normal is None else aligned.mixed(aligned.normal),
-            "confidence": aligned.confidence[..., None],
-            "estimate": None if given is None else (given / aligned.modulation)[None],
-        }
+        layers = {"color": color, "confidence": aligned.confidence[..., None]}
+        if aligned.albedo is not None:
+            layers["albedo"] = aligned.mixed(aligned.albedo)
+        if aligned.normal is not None:
+            layers["normal"] = aligned.mixed(aligned.normal)
+        if given is not None:
+            layers["estimate"] = (given / aligned.modulation)[None]
         if aligned.aovs:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
         exposure = window_exposure(_tensor(color))
         irradiance = np.empty(color.shape[1:], np.float32)
-        channels = 0 if layers.get("aovs") is None else sum(layer.shape[-1] for layer in aligned.aovs.values())
+        channels = sum(layer.shape[-1] for layer in aligned.aovs.values())
         filtered = np.empty((height, width, channels), np.float32)
         for inner, outer, offset in _tiles(height, width, self.tile, self.model.multiple):
-            cut = {
-                name: None if a is None else _tensor(_pad(a[:, *outer], self.model.multiple))
-                for name, a in layers.items()
-            }
-            out, _, aovs = denoise_tile(self.model, exposure=exposure, threshold=self.threshold, **cut)
+            # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
+            if "skip" in aligned.effects and not aligned.variance[outer].any():
+                irradiance[inner] = color[aligned.centre][inner]
+                if filtered.size:
+                    filtered[inner] = layers["aovs"][aligned.centre][inner]
+                continue
+            cut = {name: _tensor(_pad(layer[:, *outer], self.model.multiple)) for name, layer in layers.items()}
+            out, _, aovs = denoise_tile(
+                self.model,
+                cut["color"],
+                cut.get("albedo"),
+                cut.get("normal"),
+                cut["confidence"],
+                exposure,
+                cut.get("estimate"),
+                threshold=self.threshold,
+                aovs=cut.get("aovs"),
+            )
             irradiance[inner] = _image(out)[offset]
             if aovs is not None:
                 filtered[inner] = _image(aovs)[offset]
         aovs_out, start = {}, 0
         for name, layer in aligned.aovs.items():
             stop = start + layer.shape[-1]
-            modulation = aligned.modulation if stop - start == 3 else aligned.modulation.mean(axis=-1, keepdims=True)
-            aovs_out[name] = filtered[..., start:stop] * modulation
+            light = filtered[..., start:stop]
+            if name == ALPHA:
+                aovs_out[name] = light
+            elif stop - start == 3:
+                aovs_out[name] = light * aligned.modulation
+            else:
+                aovs_out[name] = light * aligned.modulation.mean(axis=-1, keepdims=True)
             start = stop
         return Denoised(irradiance * aligned.modulation, aovs_out)
 

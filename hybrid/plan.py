@@ -29,8 +29,8 @@ EFFECTS = {
     "refine": "correct the renderer's vectors by TV-L1",
     "gate": "do not average over time where the light itself changes",
     "prefilter": "filter noisy albedo and normals before they guide anything",
-    "alpha": "filter the alpha channel too",
-    "skip": "leave tiles without noise as they are",
+    "alpha": "filter the alpha channel with the network's kernels",
+    "skip": "leave tiles without noise out of the network",
 }
 
 # Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.

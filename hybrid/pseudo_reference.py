@@ -29,6 +29,8 @@ from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+# Name of the alpha channel among the AOVs; unlike the others it is not light, and is not demodulated.
+ALPHA = "alpha"
 # Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
 HIDDEN = 3.0
 
@@ -118,6 +120,8 @@ class AlignedWindow:
         Pixels of the centre frame that were not finite.
     outliers : int
         Pixels of the window that were rejected as fireflies.
+    effects : frozenset of str
+        The stages that made it.
     """
 
     number: int
@@ -132,6 +136,7 @@ class AlignedWindow:
     flows: Array
     repaired: int
     outliers: int
+    effects: frozenset[str]
 
     @property
     def centre(self) -> int:
@@ -152,7 +157,7 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
     frame : Frame
         As read.
     effects : collection of str
-        The plan's; "demodulate" and "gate" matter here.
+        The plan's; "demodulate", "alpha" and "gate" matter here.
     """
     color, bad = replace_nonfinite(frame.color)
     repaired = bad
@@ -175,6 +180,8 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
         estimate = None if estimate is None else demodulate(estimate, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
         aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
+    if frame.alpha is not None and "alpha" in effects:
+        aovs[ALPHA] = replace_nonfinite(frame.alpha[..., None])[0]
     if "gate" not in effects:
         estimate = None
     elif estimate is None:
@@ -416,6 +423,7 @@ class Aligner:
             flows=flows,
             repaired=centre.repaired,
             outliers=outliers,
+            effects=self.effects,
         )
 
 

@@ -90,6 +90,30 @@ def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
     assert aovs["mask"].mean() == pytest.approx(1, rel=0.05)
 
 
+def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
+    def cut_out(index, layers):
+        alpha = np.random.default_rng(index).uniform(0.4, 0.6, (SCENE.height, SCENE.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
+
+    shot = open_shot(SCENE.write(tmp_path, edit=cut_out))
+    window = Aligner(shot, EFFECTS | {"alpha"}).align(SCENE.first + 2)
+    alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"]
+    assert alpha.shape == (SCENE.height, SCENE.width, 1)
+    assert 0.4 <= alpha.min() <= alpha.max() <= 0.6  # kernels are convex
+    assert alpha.std() < 0.5 * window.aovs["alpha"][2].std()
+
+
+def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
+    def blank(index, layers):
+        layers["ViewLayer.Combined"][:, 40:] = 0
+
+    shot = open_shot(SCENE.write(tmp_path, edit=blank))
+    denoiser = Denoiser(weights, tile=16, precision="float32")
+    images = [denoiser(Aligner(shot, EFFECTS | extra).align(SCENE.first + 2)).color for extra in (set(), {"skip"})]
+    np.testing.assert_allclose(images[1], images[0], atol=1e-6)
+    assert (images[1][:, 60:] == 0).all()
+
+
 def test_a_higher_threshold_stays_closer_to_the_input(folder, weights):
     window = align(folder)
     noisy = window.color[2] * window.modulation
