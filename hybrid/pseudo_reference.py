@@ -402,10 +402,9 @@ class Aligner:
         if "gate" in self.effects:
             estimates = window.pop("estimate")
             confidence = confidence * color_gate(estimates, color[middle], measure_exposure(estimates[middle]))
-        guides = [
-            (own, layer) for own, layer in ((centre.albedo, albedo), (centre.normal, normal)) if layer is not None
-        ]
-        clean = [prefilter_guide(layer, confidence) if "prefilter" in self.effects else own for own, layer in guides]
+        guides = [layer for layer in (albedo, normal) if layer is not None]
+        noisy = "prefilter" in self.effects
+        clean: list[Array] = [prefilter_guide(g, confidence) if noisy else g[middle] for g in guides]
         modulation = np.ones_like(color[0])
         if albedo is not None and centre.demodulated:
             modulation = remodulate(modulation, clean[0])

@@ -48,8 +48,8 @@ def _divisor(albedo: Array, channels: int) -> Array:
 
 def compress(radiance: Array, exposure: float) -> Array:
     """Map [0, inf) to [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure`` (Reinhard et al. 2002, eq. 3)."""
-    scaled: Array = np.maximum(radiance, np.float32(0)) / np.float32(exposure)
-    return scaled / (np.float32(1) + scaled)
+    scaled = np.asarray(np.maximum(radiance, 0) / np.float32(exposure), np.float32)
+    return scaled / (1 + scaled)
 
 
 def expand(compressed: Array, exposure: float) -> Array:
