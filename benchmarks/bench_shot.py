@@ -1,6 +1,6 @@
 """Seconds and peak memory of whole runs at film size, as JSON.
 
-    python benchmarks/bench_shot.py [--frames 4] [--commands "pseudoref --preset balanced" "denoise"]
+    python benchmarks/bench_shot.py [--frames 6] [--commands "pseudoref --preset balanced" "denoise"]
 
 The bundled shot is tiled 6×6 to 1920×1080 (its motion is then that of a film frame, with seams in it), and each command
 runs on it in a process of its own, as a user would run it. Peak memory is the operating system's count.
@@ -36,7 +36,7 @@ def tile_shot(folder: Path, frames: int) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--commands", nargs="+", default=["pseudoref --preset balanced", "denoise"])
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as name:
@@ -54,6 +54,7 @@ def main(argv: list[str] | None = None) -> int:
                 stage: {
                     "seconds": round(cost["seconds"] / options.frames, 3),
                     "cpu_seconds": round(cost["cpu_seconds"] / options.frames, 3),
+                    "peak_mib": round(cost["peak_bytes"] / 2**20),
                 }
                 for stage, cost in report["stages"].items()
             }

@@ -248,7 +248,7 @@ def _open(shot: str, frames: str | None, layer: Sequence[str] | None, aovs: Sequ
         if not separator:
             raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER")
         overrides[role] = name
-    opened = open_shot(shot, frames=frames, layers=overrides, aovs=tuple(aovs or ()))
+    opened = open_shot(shot, frames=frames, layers=overrides, aovs=tuple(aovs or ()), keep=1)
     for warning in opened.warnings:
         typer.echo(f"warning: {warning}", err=True)
     return opened

@@ -108,7 +108,9 @@ def denoise_shot(
         with timings.stage("write"):
             images = {"color": denoised.color, **denoised.aovs}
             clamped = shot.write(path, number, images, denoised.extra, attributes)
-        yield Finished(number, path, aligned.confidence[0].size, aligned.repaired, aligned.outliers, clamped)
+        finished = Finished(number, path, denoised.color[..., 0].size, aligned.repaired, aligned.outliers, clamped)
+        del aligned, denoised  # or they would still be there while the next window is made
+        yield finished
 
 
 def write_preview(shot: Shot, output: str | Path, path: Path) -> None:

@@ -114,8 +114,6 @@ class AlignedWindow:
         Of the centre's `color`, smoothed.
     aovs : dict of str to (T, H, W, C) array
         Further layers, warped and demodulated like the color.
-    flows : (T, H, W, 2) array
-        Where the centre's pixels lie in each frame, pixels.
     repaired : int
         Pixels of the centre frame that were not finite.
     outliers : int
@@ -133,7 +131,6 @@ class AlignedWindow:
     guide: Array | None
     variance: Array
     aovs: dict[str, Array]
-    flows: Array
     repaired: int
     outliers: int
     effects: frozenset[str]
@@ -330,27 +327,25 @@ class Aligner:
         centre = self._frames[number]
         shape = len(numbers), *centre.irradiance.shape[:2]
         layers = _layers(centre)
-        window = {name: np.empty((*shape, layer.shape[-1]), np.float32) for name, layer in layers.items()}
+        window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
         confidence = np.zeros(shape, np.float32)
-        flows = np.zeros((*shape, 2), np.float32)
         for index, neighbour in enumerate(numbers):
             there, link, back = self.frame(neighbour), None, None
             if neighbour != number:
                 link, back = self.flow(number, neighbour), self.flow(neighbour, number)
             if there is None or link is None or back is None:
                 # The centre itself, or a frame that is missing.
-                for name, layer in layers.items():
-                    window[name][index] = layer
+                for name, kept in window.items():
+                    kept[index] = layers[name]
                 confidence[index] = centre.valid if neighbour == number else 0
                 continue
             with self.timings.stage("warp"):
                 warped, inside = self._warp(there, layers, link[0])
-                for name, layer in warped.items():
-                    window[name][index] = layer
+                for name, kept in window.items():
+                    kept[index] = warped[name]
                 confidence[index] = self._trust(centre, warped, link, inside, back[0])
-                flows[index] = link[0]
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, confidence, flows)
+            return self._finish(centre, window, confidence)
 
     def _warp(self, there: PreparedFrame, wanted: Collection[str], flow: Array) -> tuple[dict[str, Array], Mask]:
         """Warp a neighbour's layers to the centre, all in one call."""
@@ -390,10 +385,8 @@ class Aligner:
             valid=valid,
         )
 
-    def _finish(
-        self, centre: PreparedFrame, window: dict[str, Array], confidence: Array, flows: Array
-    ) -> AlignedWindow:
-        color, albedo, normal = window["color"], window.get("albedo"), window.get("normal")
+    def _finish(self, centre: PreparedFrame, window: dict[str, Array], confidence: Array) -> AlignedWindow:
+        color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
         middle = len(color) // 2
         outliers = 0
         if "outliers" in self.effects:
@@ -402,6 +395,7 @@ class Aligner:
         if "gate" in self.effects:
             estimates = window.pop("estimate")
             confidence = confidence * color_gate(estimates, color[middle], measure_exposure(estimates[middle]))
+            del estimates  # the largest arrays of a film frame are given back as soon as they can be
         guides = [layer for layer in (albedo, normal) if layer is not None]
         noisy = "prefilter" in self.effects
         clean: list[Array] = [prefilter_guide(g, confidence) if noisy else g[middle] for g in guides]
@@ -419,7 +413,6 @@ class Aligner:
             guide=np.concatenate(clean, axis=-1) if clean else None,
             variance=variance_from_window(color, confidence) if given is None else smooth_variance(given),
             aovs={name: window[f"aov {name}"] for name in centre.aovs},
-            flows=flows,
             repaired=centre.repaired,
             outliers=outliers,
             effects=self.effects,

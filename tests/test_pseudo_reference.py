@@ -125,17 +125,19 @@ def test_a_firefly_leaves_neither_a_bright_spot_nor_a_dark_hole(tmp_path):
 
 def test_a_still_shot_is_not_warped(tmp_path):
     scene = Scene(frames=3, step=(0, 0))
-    window = align(scene.write(tmp_path), {"demodulate"}, number=scene.first + 1)
+    aligner = Aligner(open_shot(scene.write(tmp_path)), {"demodulate"})
+    window = aligner.align(scene.first + 1)
     noisy = scene.noisy(0)["ViewLayer.Combined"]
     np.testing.assert_allclose(window.color[1] * window.modulation, noisy, rtol=1e-5)
-    assert (window.flows == 0).all()
+    assert (aligner.flow(scene.first + 1, scene.first)[0] == 0).all()
 
 
 def test_without_vectors_the_motion_is_found(tmp_path):
     scene = Scene(height=64, width=96, noise=0.05)
     folder = scene.write(tmp_path, without={"Vector"})
-    window = align(folder, MOVING | {"dense-flow"}, number=scene.first + 1)
-    inner = window.flows[3][16:-16, 16:-16]  # to the next frame
+    aligner = Aligner(open_shot(folder), MOVING | {"dense-flow"})
+    aligner.align(scene.first + 1)
+    inner = aligner.flow(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
     # The wall's 4 px squares have straight edges; most of the picture must be found to half a pixel.
     error = np.hypot(inner[..., 0] - scene.step[0], inner[..., 1] - scene.step[1])
     assert np.median(error) < 0.5

@@ -29,7 +29,8 @@ def test_demodulation_of_black_is_bounded_by_the_floor(radiance):
 
 def test_one_channel_is_divided_by_the_mean_albedo(radiance):
     albedo = np.full_like(radiance, 0.45)
-    np.testing.assert_allclose(demodulate(radiance[..., :1], albedo), radiance[..., :1] / np.float32(0.45 + ALBEDO_FLOOR), rtol=1e-6)
+    divisor = np.float32(0.45 + ALBEDO_FLOOR)
+    np.testing.assert_allclose(demodulate(radiance[..., :1], albedo), radiance[..., :1] / divisor, rtol=1e-6)
 
 
 def test_compression_is_undone_by_expansion(radiance):
