@@ -156,7 +156,12 @@ def denoise(
 @app.command()
 def compare(
     shot: ShotArgument,
-    reference: Annotated[str, typer.Option(help="the same frames at many samples: a pattern or a folder")],
+    reference: Annotated[
+        list[str],
+        typer.Option(
+            help="the same frames at many samples; twice: two independent halves, whose noise cancels"
+        ),
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="REPORT", help="folder for a page with chart and pictures")
     ] = None,
@@ -174,9 +179,13 @@ def compare(
     from hybrid.report import ReportImages, write_report
 
     chosen = METHODS if methods is None else {name: _choose(METHODS, name, "methods") for name in methods.split(",")}
-    noisy, clean = _open(shot, frames, layer), _open(reference, frames, None)
+    if len(reference) > 2:
+        raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
+    noisy, clean = _open(shot, frames, layer), [_open(spec, frames, None) for spec in reference]
     with tempfile.TemporaryDirectory() as folder:
-        results = compare_shot(noisy, clean, chosen, folder=Path(folder))
+        results = compare_shot(
+            noisy, clean[0] if len(clean) == 1 else (clean[0], clean[1]), chosen, folder=Path(folder)
+        )
         Console().print(result_table(results))
         if output is not None:
             images = [
@@ -184,7 +193,7 @@ def compare(
                 for result in results
                 if result.absent_reason is None
             ]
-            judged = [number for number in noisy.numbers if number in clean.numbers]
+            judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
             page = write_report(
                 output, Path(shot).name, results, images, partial(load_frame, Path(folder), "reference"), judged
             )

@@ -16,7 +16,7 @@ import network
 from hybrid.frames import Shot
 from hybrid.pipeline import Denoised
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import ALPHA, BALANCED, FINAL, AlignedWindow, Aligner, estimate
+from hybrid.pseudo_reference import ALPHA, FINAL, AlignedWindow, Aligner, estimate
 from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.clips import Clip
@@ -28,7 +28,7 @@ from nlm.average import replace_nonfinite
 Array = NDArray[np.float32]
 
 # The classical estimate that the shipped weights were trained beside, and are given as a further tap.
-ESTIMATE = BALANCED
+ESTIMATE = FINAL
 # Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
 # on a trained net is below half a float's precision.
 HALO = 32

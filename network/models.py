@@ -312,7 +312,7 @@ def fast(frames: int = 5, estimate_frames: int = 1, seed: int = 0) -> RAUNet:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.9)
+        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.95)
         return RAUNet(RAUNetConfig(kernel))
 
 
