@@ -318,8 +318,8 @@ def _read_state(path: Path, identity: str) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line of ``python -m network.train``; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m network.train", description="Train a network on clips.")
+    """The command ``ravg train``; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="ravg train", description="Train a network on clips.")
     parser.add_argument("clips", help="folder of .npz clips")
     parser.add_argument("-o", "--out", required=True, help="safetensors file to write")
     parser.add_argument("--preset", choices=("fast", "paper"), default="fast")
