@@ -85,7 +85,8 @@ def run(height: int, width: int, repeat: int) -> dict[str, dict[str, float]]:
 
     wide = [np.clip(image * (65535 / 8), 0, 65535).astype(np.uint16) for image in window]
     narrow = [np.clip(image * (255 / 8), 0, 255).astype(np.uint8) for image in window]
-    cv2.setNumThreads(1)
+    add("cv2.ximgproc.guidedFilter, 3 channels",
+        lambda: cv2.ximgproc.guidedFilter(np.ascontiguousarray(features[..., :3]), frame, 8, 0.01))
     add("cv2.fastNlMeansDenoisingMulti u8 7/21", lambda: cv2.fastNlMeansDenoisingMulti(narrow, 2, FRAMES, [8.0]))
     add("cv2.fastNlMeansDenoisingMulti u16 7/21", lambda: cv2.fastNlMeansDenoisingMulti(wide, 2, FRAMES, [2000.0],
                                                                                         normType=cv2.NORM_L1))

@@ -138,7 +138,7 @@ def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
     return cv2.blur(cut, (2 * radius + 1, 2 * radius + 1)).reshape(variance.shape)
 
 
-def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 2, patch_radius: int = 1) -> Floats:
+def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patch_radius: int = 1) -> Floats:
     """Take the noise out of the centre frame's guides: albedo and normals under depth of field or behind glass.
 
     Parameters
@@ -159,7 +159,7 @@ def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 2, patc
     -----
     Non-local means over space and time steered by the guides' own variance: the lesser of that between
     frames and that of the spatial residual, for noise shows in both, while texture shows only in the
-    second, and texture resampled by warping mainly in the first.
+    second, and texture resampled by warping mainly in the first. A radius above 1 gains nothing on Cycles shots.
     """
     guides, confidence = check_window(guides, confidence, "confidence")
     between = variance_from_window(guides, confidence)
