@@ -90,8 +90,8 @@ def test_noisy_guides_lose_their_noise_and_keep_their_edges(rng):
     clean[:, 24:] = 0.6
     guides = clean + rng.normal(0, 0.05, (5, 48, 48, 3)).astype(np.float32)
     result = prefilter_guide(guides, np.ones((5, 48, 48), np.float32))
-    # 45 samples at best, so a seventh of the deviation; weights below 1 and an estimated variance cost the rest
-    assert (result - clean)[:, 4:20].std() < 0.25 * 0.05
+    # 45 samples at best, so a seventh of the deviation; a fifth allows for weights below 1
+    assert (result - clean)[:, 4:20].std() < 0.2 * 0.05
     edge = result[:, 24].mean() - result[:, 23].mean()
     assert edge == pytest.approx(0.6, abs=0.02)
 
