@@ -112,7 +112,9 @@ def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) 
 
     An outlier becomes the weighted mean of those neighbours that are none: no dark hole, for the mean keeps
     the neighbours' energy, and no halo, for nothing else is touched. What a firefly carries is lost: in
-    expectation, it belongs to the picture. On renders without visible fireflies the mean falls by less than 0.1 %.
+    expectation, it belongs to the picture. On Cycles renders without visible fireflies the window's mean fell
+    by less than 0.1 %; with them by 0.3 to 1.2 %; and by 2 % (the centre by 6 %) where two samples in three
+    are 0: there much of what is lost is ordinary noise.
     """
     if not threshold > 0:
         raise ValueError(f"threshold: expected a positive number, got {threshold!r}")
