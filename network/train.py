@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from network import losses
-from network.checkpoint import describe, save_model
+from network.checkpoint import describe, load_model, save_model
 from network.clips import Clip, Sampler, SamplerConfig, load_clips, split_by_shot, whole_frame
 from network.inputs import network_inputs
 from network.kernels import filter_window, mean_of
@@ -323,6 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("clips", help="folder of .npz clips")
     parser.add_argument("-o", "--out", required=True, help="safetensors file to write")
     parser.add_argument("--preset", choices=("fast", "paper"), default="fast")
+    parser.add_argument("--init", help="weights to start from, of any preset; without: random ones of --preset")
     parser.add_argument("--minutes", type=float, help="stop after so many minutes")
     parser.add_argument("--steps", type=int, help="stop after so many steps")
     parser.add_argument("--validation", nargs="*", default=[], metavar="SHOT", help="shots kept out of training")
@@ -355,7 +356,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     presets: dict[str, Callable[..., Model]] = {"fast": fast, "paper": paper}
     try:
         training, validation = split_by_shot(load_clips(options.clips), options.validation)
-        model = presets[options.preset](frames=training[0].color.shape[0], seed=options.seed)
+        if options.init:
+            model = load_model(options.init).float().train().requires_grad_(True)
+        else:
+            model = presets[options.preset](frames=training[0].color.shape[0], seed=options.seed)
         train(
             training,
             validation,
