@@ -304,13 +304,14 @@ def _run(
         if not decision.on:
             console.print(f"  not run: {decision.effect} ({decision.reason})", highlight=False)
     attributes = {"ravg/command": command, "ravg/preset": preset, "ravg/effects": " ".join(sorted(plan.effects))}
-    pixels, finished = 0, None
+    pixels, outliers, finished = 0, 0, None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(command, total=len(shot))
         for finished in denoise_shot(shot, output, estimator, plan, attributes=attributes, timings=timings):
             progress.advance(task)
             pixels += finished.pixels
+            outliers += finished.outliers
             if finished.repaired:
                 console.print(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
             if finished.clamped:
@@ -333,6 +334,7 @@ def _run(
         preset=preset,
         frames=len(shot),
         pixels=pixels,
+        outliers=outliers,
         plan=[vars(decision) for decision in plan.decisions],
     )
     console.print(f"wrote {len(shot)} frames to {finished.path.parent} and their timings to {report}", highlight=False)

@@ -58,6 +58,7 @@ def test_pseudoref_writes_denoised_frames_that_keep_everything_else(tmp_path, ca
         assert psnr(pictures[1], truth) > psnr(pictures[0], truth) + 3
     report = json.loads((out / "ravg.json").read_text())
     assert report["frames"] == 3
+    assert report["outliers"] >= 0
     assert {"read", "prepare", "warp", "write"} <= report["stages"].keys()
     assert all(decision["reason"] for decision in report["plan"])
 
