@@ -34,6 +34,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--center", default="0.5,0.5", help="of the crop, as fractions, x right, y down")
     parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
     parser.add_argument("--reference", type=int, default=0, help="samples of the reference; 0: none")
+    parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="of the reference; default: all")
     parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
     parser.add_argument("--compact", action="store_true", help="all channels as half, without the denoising depth")
     parser.add_argument("--seed", type=int, default=1)
@@ -191,6 +192,9 @@ def main(argv: list[str]) -> int:
         scene.render.use_persistent_data = False
         scene.view_layers[0].cycles.denoising_store_passes = False
         scene.view_layers[0].use_pass_z = scene.view_layers[0].use_pass_vector = False
+        if options.reference_frames:
+            first, last = map(int, options.reference_frames.split("-"))
+            frames = range(first, last + 1)
         render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)
     if options.compact:
         for path in sorted(out.glob("*.exr")):
