@@ -89,6 +89,43 @@ def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, 
     return _activate(weights, threshold, centre, relative=True)
 
 
+def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: int) -> Tensor:
+    """Softmax of raw weights, thresholded and normalised again where a threshold is given.
+
+    Parameters
+    ----------
+    weights : Tensor
+        ``(N, K, H, W)`` raw weights; only their differences count.
+    threshold : float or Tensor
+        t on the scale of the softmax, below 1/K. 0, the default, is the plain softmax, which gives every tap some
+        weight.
+    centre : int
+        As for `threshold_kernel`.
+
+    Returns
+    -------
+    Tensor
+        ``(N, K, H, W)`` float32 (float64 stays), not negative, sums to 1 over the taps.
+
+    Raises
+    ------
+    ValueError
+        As for `threshold_kernel`.
+
+    Notes
+    -----
+    ``η_t(σ(w))`` with ``σ(w_i) = exp(w_i) / Σ_j exp(w_j)``. The greatest weight of a softmax is at least 1/K, so with
+    t < 1/K it never falls back to the identity.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 4, equation 2 and the last paragraph on thresholds.
+    """
+    if weights.dtype != torch.float64:
+        weights = weights.float()
+    return threshold_kernel(weights.softmax(1), threshold, centre=centre)
+
+
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     """Apply the kernels of one source to its frames, frame by frame.
 

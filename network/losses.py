@@ -1,18 +1,21 @@
 """Image losses, and their conversion from space to time.
 
-An image loss takes prediction and target, ``(N, C, H, W)`` radiance, and the scale of the radiance, ``(N,)``, and
-returns one value per sample, ``(N,)``. All are scale invariant: ``loss(a·x, a·y, a·s) = loss(x, y, s)``.
+An image loss takes prediction and target, ``(N, C, H, W)`` radiance, the scale of the radiance, ``(N,)``, and optional
+weights of the errors, and returns one value per sample, ``(N,)``. All are scale invariant:
+``loss(a·x, a·y, a·s) = loss(x, y, s)``. The perceptual one is in `network.perceptual`.
 
 What they do to the mean when the targets are noisy (Lehtinen et al. 2018): a squared error is least at the mean
 of the targets, so `relmse`, whose weights depend on the prediction alone and carry no gradient, is unbiased.
 `l1` is least at the median, and Monte Carlo noise is skewed, with its median below its mean: it darkens.
 `smape` is an L1 error with a weight that depends on the target too and darkens as well, where the noise is
 strong. `relmse` with a limit on outliers stays between the two: it only darkens by what is beyond the limit.
+``benchmarks/loss_bias.py`` measures this on renders.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from itertools import combinations
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -20,19 +23,26 @@ from torch.nn import functional
 
 from network.kernels import mean_of
 
-ImageLoss = Callable[[Tensor, Tensor, Tensor], Tensor]
+#: Frames of a window, and the weight of the loss of the image they give together.
+Term = tuple[tuple[int, ...], float]
 
 #: Weight of the fallback in the image of a subset of frames. The kernels sum to 1 over all frames; a subset to
 #: which they give less than this is mostly its own unfiltered pixels, and dividing by its share stays harmless.
 SUBSET_EPSILON = 1e-3
 
 
-def l1(prediction: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+class ImageLoss(Protocol):
+    """An image loss: ``(N, C, H, W)`` prediction and target, ``(N,)`` scale, weights of the errors, to ``(N,)``."""
+
+    def __call__(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor: ...
+
+
+def l1(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
     """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median)."""
-    return (prediction - target).abs().mean((1, 2, 3)) / scale
+    return _mean((prediction - target).abs(), weight) / scale
 
 
-def smape(prediction: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+def smape(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
     """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2.
 
     Notes
@@ -45,10 +55,17 @@ def smape(prediction: Tensor, target: Tensor, scale: Tensor) -> Tensor:
     doi:10.1145/3197517.3201388.
     """
     floor = 1e-2 * scale.view(-1, 1, 1, 1)
-    return ((prediction - target).abs() / (prediction.abs() + target.abs() + floor)).mean((1, 2, 3))
+    return _mean((prediction - target).abs() / (prediction.abs() + target.abs() + floor), weight)
 
 
-def relmse(prediction: Tensor, target: Tensor, scale: Tensor, epsilon: float = 0.1, limit: float = 4.0) -> Tensor:
+def relmse(
+    prediction: Tensor,
+    target: Tensor,
+    scale: Tensor,
+    weight: Tensor | None = None,
+    epsilon: float = 0.1,
+    limit: float = 4.0,
+) -> Tensor:
     """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``.
 
     Parameters
@@ -57,6 +74,8 @@ def relmse(prediction: Tensor, target: Tensor, scale: Tensor, epsilon: float = 0
         ``(N, C, H, W)``.
     scale : Tensor
         ``(N,)``.
+    weight : Tensor, optional
+        ``(N, C, H, W)`` factors of the errors.
     epsilon : float
         Floor of the denominator in squared scales: pixels darker than ``sqrt(ε) s`` count by absolute error.
     limit : float
@@ -82,7 +101,7 @@ def relmse(prediction: Tensor, target: Tensor, scale: Tensor, epsilon: float = 0
     size = relative.abs()
     # Quadratic inside the limit, tangent outside. The minimum keeps an infinite limit from making inf − inf.
     inside = size.clamp(max=limit)
-    return (inside * (2 * size - inside)).mean((1, 2, 3))
+    return _mean(inside * (2 * size - inside), weight)
 
 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
@@ -94,6 +113,54 @@ def frame_pairs(frames: int) -> list[tuple[int, int]]:
     return [(i, i + half + 1) for i in range(half)]
 
 
+def spatial_terms(frames: int) -> list[Term]:
+    """One term, the whole window: how Vogels et al. 2018 train, and what a spatial loss says to a temporal network."""
+    return [(tuple(range(frames)), 1.0)]
+
+
+def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
+    """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with a weight of its own.
+
+    The paper uses the whole window's term only to train a model further, and downweighted, because on its own it
+    leads away from using time.
+    """
+    return [
+        ((frames // 2,), 1.0),
+        *((pair, 1.0) for pair in frame_pairs(frames)),
+        *((subset, whole) for subset, _ in spatial_terms(frames) if whole and frames > 1),
+    ]
+
+
+def power_terms(frames: int) -> list[Term]:
+    """The paper's equation in full: every subset of the window but the empty one; 7 for three frames, 31 for five."""
+    sizes = range(1, frames + 1)
+    return [(subset, 1.0) for size in sizes for subset in combinations(range(frames), size)]
+
+
+def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -> Tensor:
+    """Weights that punish errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1.
+
+    Parameters
+    ----------
+    prediction, target, noisy : Tensor
+        d, r and c, ``(N, C, H, W)`` radiance; c is the noisy centre.
+    slope : float
+        λ ≥ 1. With more of it the network would rather leave noise than lose detail. Meant for clean targets: where
+        the target's noise is independent of the input's, it decides on which side the prediction is.
+
+    Returns
+    -------
+    Tensor
+        ``(N, C, H, W)``.
+
+    References
+    ----------
+    Vogels et al. 2018, section 5.4, doi:10.1145/3197517.3201388.
+    """
+    beyond = (prediction.detach() - target) * (target - noisy) > 0
+    return torch.where(beyond, slope, 1.0)
+
+
 def temporal_loss(
     loss: ImageLoss,
     numerators: Tensor,
@@ -102,14 +169,15 @@ def temporal_loss(
     target: Tensor,
     modulation: Tensor,
     scale: Tensor,
-    whole: float = 0.0,
+    terms: list[Term],
+    slope: float = 1.0,
 ) -> Tensor:
     """Spatial loss converted to a temporal one: the target is predicted from parts of the window.
 
     Parameters
     ----------
-    loss : callable
-        Image loss of this module.
+    loss : ImageLoss
+        Image loss.
     numerators, denominators : Tensor
         ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` from `network.kernels.filter_window`.
     color : Tensor
@@ -120,9 +188,10 @@ def temporal_loss(
         ``(N, C, H, W)``: radiance is irradiance times modulation.
     scale : Tensor
         ``(N,)`` exposure of the irradiance.
-    whole : float
-        Weight of the term of the whole window; the others have weight 1. The paper uses it only to train a model
-        further, and downweighted, because on its own it leads away from using time.
+    terms : list of Term
+        From `temporal_terms`, `power_terms` or `spatial_terms`.
+    slope : float
+        λ of `asymmetry`; 1 for none.
 
     Returns
     -------
@@ -131,26 +200,23 @@ def temporal_loss(
 
     Notes
     -----
-    Terms: the centre; each of `frame_pairs`; the whole window. A subset's image is the mean of its taps: the
-    kernels of the other frames are zeroed and the rest renormalised. An estimate of the centre belongs to the
-    centre's term and the whole's.
+    A subset's image is the mean of its taps: the kernels of the other frames are zeroed and the rest renormalised. An
+    estimate of a frame belongs to every term with that frame.
 
     References
     ----------
-    Kalojanov and Thurston 2023, section 5.
+    Kalojanov and Thurston 2023, section 5, equation 5.
     """
-    frames = numerators.shape[1]
+    centre = numerators.shape[1] // 2
     # Scale of the radiance; a black modulation (no albedo anywhere) would make it 0.
     radiance = scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
     total = torch.zeros_like(scale)
-    terms = [((frames // 2,), 1.0), *((pair, 1.0) for pair in frame_pairs(frames))]
-    if whole:
-        terms.append((tuple(range(frames)), whole))
     for subset, weight in terms:
         index = list(subset)
-        fallback = color[:, frames // 2] if frames // 2 in subset else color[:, index].mean(1)
-        image = mean_of(numerators[:, index], denominators[:, index], fallback, SUBSET_EPSILON)
-        total = total + weight * loss(image * modulation, target, radiance)
+        fallback = color[:, centre] if centre in subset else color[:, index].mean(1)
+        image = mean_of(numerators[:, index], denominators[:, index], fallback, SUBSET_EPSILON) * modulation
+        sides = None if slope == 1 else asymmetry(image, target, color[:, centre] * modulation, slope)
+        total = total + weight * loss(image, target, radiance, sides)
     return total / sum(weight for _, weight in terms)
 
 
@@ -162,3 +228,8 @@ def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
     error = functional.relu(prediction) / (1 + functional.relu(prediction))
     error = error - functional.relu(target) / (1 + functional.relu(target))
     return -10 * torch.log10(error.square().mean((1, 2, 3)).clamp_min(1e-12))
+
+
+def _mean(errors: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean per sample of errors, weighted where there are weights."""
+    return (errors if weight is None else errors * weight).mean((1, 2, 3))

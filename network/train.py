@@ -31,6 +31,7 @@ from network.kernels import filter_window, mean_of
 from network.models import Model, fast, paper
 
 LOSSES: dict[str, losses.ImageLoss] = {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse}
+TERMS = ("temporal", "power", "spatial")
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,9 @@ class TrainConfig:
     clip_norm: float = 1.0  # largest norm of the gradient; one firefly is one sample
     ema: float = 0.999  # of the weights that are validated and kept
     loss: str = "relmse"
+    terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
     whole: float = 1.0  # weight of the whole window's term beside the temporal ones
+    slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
     bfloat16: bool = True  # for the convolutions; kernels and losses are float32
     seed: int = 0
     checkpoint_minutes: float = 5.0
@@ -64,6 +67,16 @@ class TrainConfig:
             raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
         if self.loss not in LOSSES:
             raise ValueError(f"loss: expected one of {sorted(LOSSES)}, got {self.loss!r}")
+        if self.terms not in TERMS:
+            raise ValueError(f"terms: expected one of {', '.join(TERMS)}, got {self.terms!r}")
+        if self.whole < 0 or self.slope < 1:
+            raise ValueError(f"whole, slope: expected whole >= 0 and slope >= 1, got {self.whole} and {self.slope}")
+
+    def loss_terms(self, frames: int) -> list[losses.Term]:
+        """Terms of the loss for a window of so many frames."""
+        if self.terms == "temporal":
+            return losses.temporal_terms(frames, self.whole)
+        return losses.power_terms(frames) if self.terms == "power" else losses.spatial_terms(frames)
 
 
 def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> tuple[Tensor, Tensor]:
@@ -99,8 +112,9 @@ def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> T
     loss = LOSSES[config.loss]
     numerators, denominators = predict(model, batch, config.bfloat16)
     color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
+    terms = config.loss_terms(color.shape[1])
     value = losses.temporal_loss(
-        loss, numerators, denominators, color, batch["target"], modulation, batch["exposure"], config.whole
+        loss, numerators, denominators, color, batch["target"], modulation, batch["exposure"], terms, config.slope
     )
     with torch.no_grad():
         scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)

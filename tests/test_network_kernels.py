@@ -5,12 +5,20 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.kernels import apply_kernels, filter_window, mean_of, predict_kernel, threshold_kernel
+from network.kernels import (
+    apply_kernels,
+    filter_window,
+    mean_of,
+    predict_kernel,
+    softmax_kernel,
+    threshold_kernel,
+)
 
 pytestmark = pytest.mark.neural
 
@@ -59,6 +67,22 @@ def test_predicted_kernel_is_normalised_thresholded_and_normalised(t: float) -> 
     torch.testing.assert_close(predict_kernel(weights, t, centre=4), expected)
 
 
+@pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
+def test_softmax_kernel_is_the_papers_equation(t: float) -> None:
+    weights = uniform(1, 9, 3, 4, seed=1) * 6 - 2
+    kernel = softmax_kernel(weights, t, centre=4)
+    for y, x in itertools.product(range(3), range(4)):
+        powers = [math.exp(w) for w in weights[0, :, y, x].tolist()]
+        sigma = [power / sum(powers) for power in powers]
+        torch.testing.assert_close(kernel[0, :, y, x], torch.tensor(eta(sigma, t, 4), dtype=torch.float64))
+    assert bool((kernel == 0).any()) == (t > 0)  # the plain softmax leaves no tap without weight
+
+
+def test_a_softmax_keeps_its_greatest_weight_under_every_threshold_that_is_allowed() -> None:
+    kernel = softmax_kernel(torch.zeros(1, 9, 1, 1, dtype=torch.float64), 0.111, centre=4)
+    torch.testing.assert_close(kernel, torch.full_like(kernel, 1 / 9))
+
+
 def test_the_default_threshold_is_half_of_one_over_k() -> None:
     weights = uniform(1, 8, 2, 2)
     for activation in (threshold_kernel, predict_kernel):
@@ -72,7 +96,7 @@ def test_equal_weights_survive_every_threshold_that_is_allowed() -> None:
 
 @pytest.mark.parametrize("t", [1 / 9, 0.2, -0.01, float("nan")])
 def test_a_threshold_of_one_over_k_or_more_is_an_error(t: float) -> None:
-    for activation in (threshold_kernel, predict_kernel):
+    for activation in (threshold_kernel, predict_kernel, softmax_kernel):
         with pytest.raises(ValueError, match=r"threshold: expected 0 <= t < 1/K"):
             activation(torch.ones(1, 9, 1, 1), t, centre=4)
 
@@ -112,7 +136,7 @@ def test_kernels_are_float32_even_of_bfloat16_weights() -> None:
     torch.testing.assert_close(kernel.sum(1), torch.ones(1, 4, 4))
 
 
-@pytest.mark.parametrize("activation", [threshold_kernel, predict_kernel])
+@pytest.mark.parametrize("activation", [threshold_kernel, predict_kernel, softmax_kernel])
 def test_activation_gradient(activation) -> None:  # type: ignore[no-untyped-def]
     weights = (uniform(2, 9, 3, 2, seed=5) * 0.5 - 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda w: activation(w, 0.06, centre=4), weights)

@@ -11,7 +11,19 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from network.kernels import apply_kernels, mean_of, predict_kernel
-from network.losses import SUBSET_EPSILON, frame_pairs, l1, relmse, smape, temporal_loss, tone_mapped_psnr
+from network.losses import (
+    SUBSET_EPSILON,
+    asymmetry,
+    frame_pairs,
+    l1,
+    power_terms,
+    relmse,
+    smape,
+    spatial_terms,
+    temporal_loss,
+    temporal_terms,
+    tone_mapped_psnr,
+)
 
 pytestmark = pytest.mark.neural
 
@@ -113,17 +125,55 @@ def test_pairs_are_one_frame_before_and_one_after() -> None:
     assert frame_pairs(1) == []
 
 
-@pytest.mark.parametrize("frames", [1, 3, 5])
-@pytest.mark.parametrize("whole", [0.0, 0.25])
-def test_temporal_loss_is_the_loss_of_renormalised_subsets(frames: int, whole: float) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_multiply_the_errors(loss) -> None:  # type: ignore[no-untyped-def]
+    prediction, target, weight = uniform(1, 3, 4, 5), uniform(1, 3, 4, 5, seed=1), uniform(1, 3, 4, 5, seed=2)
+    one = torch.ones(1, dtype=torch.float64)
+    parts = [loss(prediction, target, one, (weight == w).double()) * w for w in weight.flatten()]
+    torch.testing.assert_close(loss(prediction, target, one, weight), sum(parts))
+    torch.testing.assert_close(loss(prediction, target, one, 0 * weight + 1), loss(prediction, target, one))
+
+
+def test_asymmetry_against_loops() -> None:
+    d, r, c = uniform(1, 3, 4, 5), uniform(1, 3, 4, 5, seed=1), uniform(1, 3, 4, 5, seed=2)
+    weights = asymmetry(d, r, c, 2.5)
+    for index in torch.cartesian_prod(*(torch.arange(n) for n in d.shape)).tolist():
+        i = tuple(index)
+        assert weights[i] == (2.5 if (d[i] - r[i]) * (r[i] - c[i]) > 0 else 1.0)
+    # On the target or between it and the input nothing is punished; beyond it is.
+    assert asymmetry(r, r, c, 2.5).unique().tolist() == [1]
+    assert asymmetry((r + c) / 2, r, c, 2.5).unique().tolist() == [1]
+    assert asymmetry(2 * r - c, r, c, 2.5).unique().tolist() == [2.5]
+
+
+def test_terms_are_the_papers() -> None:
+    assert temporal_terms(5) == [((2,), 1.0), ((0, 3), 1.0), ((1, 4), 1.0)]
+    assert temporal_terms(5, 0.25)[-1] == ((0, 1, 2, 3, 4), 0.25)
+    assert temporal_terms(1, 0.25) == [((0,), 1.0)]  # the centre is the whole
+    assert spatial_terms(3) == [((0, 1, 2), 1.0)]
+    assert [subset for subset, _ in power_terms(3)] == [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)]
+    assert len(power_terms(5)) == 2**5 - 1
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        temporal_terms(1),
+        temporal_terms(3),
+        temporal_terms(5),
+        temporal_terms(5, 0.25),
+        power_terms(3),
+        spatial_terms(5),
+    ],
+)
+def test_temporal_loss_is_the_loss_of_renormalised_subsets(terms) -> None:  # type: ignore[no-untyped-def]
     """Zero the excluded frames' weights, renormalise the kernel, apply it: section 5 of the paper."""
+    frames = 1 + max(frame for subset, _ in terms for frame in subset)
     kernels = predict_kernel(uniform(2, frames * 9, 6, 5), 0.0, centre=frames * 9 // 2)
     color, target = uniform(2, frames, 3, 6, 5, seed=1), uniform(2, 3, 6, 5, seed=2)
     modulation, scale = uniform(2, 3, 6, 5, seed=3), torch.tensor([0.5, 2.0], dtype=torch.float64)
     numerators, denominators = apply_kernels(kernels, color)
 
-    terms = [((frames // 2,), 1.0)] + [(pair, 1.0) for pair in frame_pairs(frames)]
-    terms += [(tuple(range(frames)), whole)] if whole else []
     expected = 0
     for subset, weight in terms:
         kept = torch.zeros(frames, 1, dtype=torch.float64)
@@ -133,7 +183,7 @@ def test_temporal_loss_is_the_loss_of_renormalised_subsets(frames: int, whole: f
         image = mean_of(*apply_kernels(part, color), color[:, frames // 2], 0) * modulation
         expected = expected + weight * l1(image, target, scale * modulation.mean((1, 2, 3)))
     expected = expected / sum(weight for _, weight in terms)
-    got = temporal_loss(l1, numerators, denominators, color, target, modulation, scale, whole)
+    got = temporal_loss(l1, numerators, denominators, color, target, modulation, scale, terms)
     # A subset has a share of about 1/5 or more; its fallback weighs 1e-3 beside that.
     torch.testing.assert_close(got, expected, rtol=2e-2, atol=0)
     assert SUBSET_EPSILON == 1e-3
@@ -145,7 +195,7 @@ def test_frames_without_weight_are_judged_by_their_own_pixels() -> None:
     numerators, denominators = torch.zeros(1, 5, 3, 4, 4).double(), torch.zeros(1, 5, 1, 4, 4).double()
     numerators[:, 2], denominators[:, 2] = color[:, 2], 1
     one = torch.ones(1, dtype=torch.float64)
-    got = temporal_loss(l1, numerators, denominators, color, target, torch.ones_like(target), one)
+    got = temporal_loss(l1, numerators, denominators, color, target, torch.ones_like(target), one, temporal_terms(5))
     images = [color[:, 2], color[:, [0, 3]].mean(1), color[:, [1, 4]].mean(1)]
     torch.testing.assert_close(got, sum(l1(image, target, one) for image in images) / 3)
 
@@ -154,12 +204,24 @@ def test_temporal_loss_does_not_depend_on_the_scale() -> None:
     color, target, modulation = uniform(1, 3, 3, 4, 4), uniform(1, 3, 4, 4, seed=1), uniform(1, 3, 4, 4, seed=2)
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     scale = torch.ones(1, dtype=torch.float64)
-    once = temporal_loss(relmse, *sums, color, target, modulation, scale, 1.0)
+    terms = temporal_terms(3, 1.0)
+    once = temporal_loss(relmse, *sums, color, target, modulation, scale, terms, 3.0)
     numerators, denominators = sums
     scaled = temporal_loss(
-        relmse, numerators * 512, denominators, color * 512, target * 512, modulation, scale * 512, 1.0
+        relmse, numerators * 512, denominators, color * 512, target * 512, modulation, scale * 512, terms, 3.0
     )
     torch.testing.assert_close(scaled, once)
+
+
+def test_the_slope_weighs_each_terms_errors() -> None:
+    color, target = uniform(1, 3, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
+    sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
+    one = torch.ones(1, dtype=torch.float64)
+    got = temporal_loss(smape, *sums, color, target, torch.ones_like(target), one, spatial_terms(3), 2.0)
+    image = mean_of(*sums, color[:, 1], SUBSET_EPSILON)
+    expected = smape(image, target, one, asymmetry(image, target, color[:, 1], 2.0))
+    torch.testing.assert_close(got, expected)
+    assert got > smape(image, target, one)
 
 
 def test_psnr_on_the_tone_curve() -> None:

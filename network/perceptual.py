@@ -1,0 +1,136 @@
+"""The paper's perceptual loss: distances in the latent space of VGG19, times SMAPE."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from network.losses import smape
+
+#: Convolutions of VGG19 by block (configuration E of the paper below), each followed by a ReLU, each block but the
+#: last used by a maximum over 2×2. Up to the last convolution; what follows is for classification.
+BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512, 512, 512, 512), (512, 512, 512, 512))
+#: Where torch hub keeps the weights that torchvision publishes, trained on ImageNet.
+HUB_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
+#: Mean and standard deviation of the ImageNet pictures those weights have seen, in [0, 1].
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class VGG19(nn.Module):
+    """Trunk of VGG19: pictures to the features of two layers. Parameters are named as torchvision names them.
+
+    References
+    ----------
+    Simonyan and Zisserman 2015, "Very Deep Convolutional Networks for Large-Scale Image Recognition", arXiv:1409.1556.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        before, after_block = 3, []
+        for block in BLOCKS:
+            if layers:
+                layers.append(nn.MaxPool2d(2))
+            for width in block:
+                layers += [nn.Conv2d(before, width, 3, padding=1), nn.ReLU()]
+                before = width
+            after_block.append(len(layers))
+        self.features = nn.Sequential(*layers)
+        self.after_third = after_block[2]
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """``(N, 3, H, W)`` in [0, 1], 16 pixels or more, to layer 4 of block 3 and of block 5, both after the ReLU."""
+        x = self.features[: self.after_third]((picture - self.mean) / self.std)
+        return x, self.features[self.after_third :](x)
+
+
+def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
+    """Read the weights of VGG19 in torchvision's format.
+
+    Parameters
+    ----------
+    source : path or "hub"
+        A state dict (.pth, read without unpickling anything but tensors, or .safetensors); "hub" downloads
+        torchvision's, 550 MB, once, and keeps it where torch hub keeps such files.
+
+    Returns
+    -------
+    VGG19
+        Without gradients.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no state dict, or not one of VGG19.
+    """
+    where = f"vgg {os.fspath(source)!r}"
+    try:
+        if source == "hub":
+            state = torch.hub.load_state_dict_from_url(HUB_URL, map_location="cpu", weights_only=True)
+        elif not Path(source).is_file():
+            raise FileNotFoundError(f"{where}: no such file")
+        elif Path(source).suffix == ".safetensors":
+            state = load_file(source)
+        else:
+            state = torch.load(source, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise
+    except SafetensorError as error:
+        raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
+    except Exception as error:  # torch has no one class for what may be wrong with a file
+        raise ValueError(f"{where}: no state dict, or cut short ({error})") from error
+    model = VGG19()
+    for name, value in model.state_dict().items():
+        found = state.get(name) if isinstance(state, dict) else None
+        if not isinstance(found, Tensor) or found.shape != value.shape:
+            got = tuple(found.shape) if isinstance(found, Tensor) else None
+            raise ValueError(
+                f"{where}: {name}: expected shape {tuple(value.shape)} as in torchvision's VGG19, got {got}"
+            )
+    model.load_state_dict({name: state[name].float() for name in model.state_dict()})
+    return model.eval().requires_grad_(False)
+
+
+class Perceptual(nn.Module):
+    """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; an `network.losses.ImageLoss`.
+
+    Parameters
+    ----------
+    vgg : VGG19
+        From `load_vgg19`.
+
+    Notes
+    -----
+    VGG19 knows pictures in [0, 1]; radiance is shown to it on ``y = x / (1 + x)`` of the radiance over its scale, not
+    negative. The sum and the product keep the magnitudes of the terms apart, as in the paper. Weights act on SMAPE, the
+    one factor that is made of pixels.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 5, equation 6; Johnson et al. 2016, arXiv:1603.08155.
+    """
+
+    def __init__(self, vgg: VGG19) -> None:
+        super().__init__()
+        self.vgg = vgg
+
+    def forward(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
+        """See `network.losses.ImageLoss`."""
+        images = torch.cat([prediction, target]).relu() / torch.cat([scale, scale]).view(-1, 1, 1, 1)
+        distance = torch.zeros_like(scale)
+        for features in self.vgg(images / (1 + images)):
+            of_prediction, of_target = features.chunk(2)
+            distance = distance + (of_prediction - of_target).abs().mean((1, 2, 3))
+        return distance * smape(prediction, target, scale, weight)
