@@ -2,11 +2,11 @@
 
     python benchmarks/loss_bias.py "examples/shot/noisy.####.exr" --reference "examples/shot/reference.####.exr"
 
-A network sees what is common to many renders of a place, not the noise of the one that is its target. So: in every block
-of 16×16 pixels the reference, times a gain of that block, against the noisy frame as target; the gain that a loss likes best
-leaves the mean alone, darkens or brightens. Printed is the mean of the blocks so scaled over the mean of the reference: 1 is
-unbiased. Losses whose denominators carry no gradient are followed to where their gradient vanishes. The mean of the noisy
-frame over that of the reference stands beside: so far chance has moved it.
+A network sees what is common to many renders of a place, not the noise of the one that is its target. So: in every
+block of 16×16 pixels the reference, times a gain of that block, against the noisy frame as target; the gain that a loss
+likes best leaves the mean alone, darkens or brightens. Printed is the mean of the blocks so scaled over the mean of the
+reference: 1 is unbiased. Losses whose denominators carry no gradient are followed to where their gradient vanishes. The
+mean of the noisy frame over that of the reference stands beside: so far chance has moved it.
 """
 
 from __future__ import annotations
@@ -27,12 +27,11 @@ from network.inputs import window_exposure
 from network.losses import ImageLoss, l1, relmse, smape
 from network.perceptual import Perceptual, load_vgg19
 
-
 BLOCK = 16
 
 
 def favourite_mean(loss: ImageLoss, reference: Tensor, target: Tensor, scale: Tensor) -> float:
-    """Mean of the reference with each block at the gain, 1/4 to 4, where the slope of the loss changes sign, over its mean."""
+    """Mean of the reference over its mean, each block times the gain (1/4 to 4) where the slope changes sign."""
     rows, columns = (length // BLOCK for length in reference.shape[2:])
     reference, target = (image[..., : rows * BLOCK, : columns * BLOCK] for image in (reference, target))
     low = torch.full((1, 1, rows, columns), math.log(0.25))
