@@ -176,6 +176,46 @@ class RobustAverage(nn.Module):
         return torch.cat(state)
 
 
+class TemporalModule(nn.Module):
+    """Temporal module of Vogels et al. 2018: convolutions on the features of all frames together.
+
+    Parameters
+    ----------
+    channels : int
+        Width of the features of a frame.
+    frames : int
+        T.
+    blocks : int
+        Residual blocks on what is common to the frames.
+    kernel_size : int
+        Odd size of the convolutions.
+
+    Notes
+    -----
+    The features of all frames, concatenated, become features of the window; those pass the residual blocks, and a 1×1
+    convolution gives each frame its own again, from which its kernel is predicted. What Robust Average blocks do at
+    many depths with one set of parameters, this does once, at the end, with weights for each position in the window.
+
+    References
+    ----------
+    Vogels et al. 2018, "Denoising with Kernel Prediction and Asymmetric Loss Functions", section 5.2,
+    doi:10.1145/3197517.3201388.
+    """
+
+    def __init__(self, channels: int, frames: int, blocks: int = 2, kernel_size: int = 3) -> None:
+        super().__init__()
+        self.join = nn.Conv2d(frames * channels, channels, kernel_size, padding=kernel_size // 2)
+        self.blocks = nn.ModuleList(ResidualBlock(channels, kernel_size) for _ in range(blocks))
+        self.split = nn.Conv2d(channels, frames * channels, 1)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """``(T·N, C, H, W)``, time first, to the same shape."""
+        window = self.join(torch.cat(torch.relu(x).chunk(frames), 1))
+        for block in self.blocks:
+            window = block(window)
+        return torch.cat(self.split(torch.relu(window)).chunk(frames, 1))
+
+
 def outermost_first(frames: int) -> list[int]:
     """Order in which a Robust Average block visits a window: 0, 4, 1, 3, 2 for five frames."""
     return sorted(range(frames), key=lambda i: (-abs(i - frames // 2), i))

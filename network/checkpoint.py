@@ -14,7 +14,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from network.models import KernelConfig, Model, RAResNet, RAResNetConfig, RAUNet, RAUNetConfig
+from network.models import (
+    TKPCN,
+    KernelConfig,
+    Model,
+    RAResNet,
+    RAResNetConfig,
+    RAUNet,
+    RAUNetConfig,
+    TKPCNConfig,
+)
 
 FORMAT = "ravg-network"
 #: Raised when a change makes older weights give other kernels. Files say which one they were written for.
@@ -42,9 +51,11 @@ def build(description: Mapping[str, Any]) -> Model:
             return RAUNet(RAUNetConfig(**values))
         if name == "RAResNet":
             return RAResNet(RAResNetConfig(**values))
+        if name == "TKPCN":
+            return TKPCN(TKPCNConfig(**values))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"model description: {error!r}") from error
-    raise ValueError(f"model description: expected model RAUNet or RAResNet, got {name!r}")
+    raise ValueError(f"model description: expected model RAUNet, RAResNet or TKPCN, got {name!r}")
 
 
 def save_model(

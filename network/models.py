@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage
+from network.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.inputs import CHANNELS, ESTIMATE_CHANNELS, network_inputs, window_exposure
 from network.kernels import filter_window, mean_of, predict_kernel
 
@@ -93,6 +93,25 @@ class RAResNetConfig:
             raise ValueError(f"ra_after: expected ascending blocks 1 to {self.blocks}, got {self.ra_after}")
         if not 0 <= self.skips <= len(self.ra_after):
             raise ValueError(f"skips: expected 0 to {len(self.ra_after)}, got {self.skips}")
+        if self.conv_size < 1 or self.conv_size % 2 == 0:
+            raise ValueError(f"conv_size: expected an odd number >= 1, got {self.conv_size}")
+
+
+@dataclass(frozen=True)
+class TKPCNConfig:
+    """Residual network without Robust Average blocks, with a temporal module at its end: the paper's baseline."""
+
+    kernel: KernelConfig = field(default_factory=KernelConfig)
+    width: int = 80
+    blocks: int = 24  # of the spatial part, shared over the frames
+    temporal_blocks: int = 2
+    conv_size: int = 3
+
+    def __post_init__(self) -> None:
+        if self.blocks < 0 or self.temporal_blocks < 0:
+            raise ValueError(
+                f"blocks, temporal_blocks: expected 0 or more, got {self.blocks} and {self.temporal_blocks}"
+            )
         if self.conv_size < 1 or self.conv_size % 2 == 0:
             raise ValueError(f"conv_size: expected an odd number >= 1, got {self.conv_size}")
 
@@ -295,7 +314,43 @@ class RAResNet(nn.Module):
         return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
 
 
-Model = RAUNet | RAResNet
+class TKPCN(nn.Module):
+    """The paper's baseline: a spatial network with shared weights, then one temporal module; no RA blocks.
+
+    Parameters
+    ----------
+    config : TKPCNConfig
+        Sizes.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 7; Vogels et al. 2018, section 5.2, doi:10.1145/3197517.3201388.
+    """
+
+    def __init__(self, config: TKPCNConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, size = config.width, config.conv_size
+        self.stem = nn.Conv2d(config.kernel.channels, width, size, padding=size // 2)
+        self.blocks = nn.ModuleList(ResidualBlock(width, size) for _ in range(config.blocks))
+        self.temporal = TemporalModule(width, config.kernel.frames, config.temporal_blocks, size)
+        self.head = KernelHead(width, config.kernel)
+
+    @property
+    def multiple(self) -> int:
+        """Height and width must be multiples of this."""
+        return 1
+
+    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
+        """Kernels of an aligned window; see `RAUNet.forward`."""
+        x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
+        for block in self.blocks:
+            x = block(x)
+        x = self.temporal(x, self.config.kernel.frames)
+        return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
+
+
+Model = RAUNet | RAResNet | TKPCN
 
 
 def fast(frames: int = 5, estimate_frames: int = 1, seed: int = 0) -> RAUNet:

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage, outermost_first, ravg
+from network.blocks import ResidualBlock, RobustAverage, TemporalModule, outermost_first, ravg
 
 pytestmark = pytest.mark.neural
 
@@ -171,3 +171,21 @@ def test_robust_average_block_keeps_samples_of_a_batch_apart() -> None:
 def test_robust_average_block_of_one_frame_is_the_identity() -> None:
     x = random(2, 4, 6, 5, dtype=torch.float32)
     assert RobustAverage(4)(x, 1) is x
+
+
+@pytest.mark.parametrize("frames", [1, 3, 5])
+def test_temporal_module_against_the_naive_one(frames: int) -> None:
+    """All frames' features side by side, two residual blocks, one linear map to each frame's features."""
+    torch.manual_seed(0)
+    module = TemporalModule(4, frames).double()
+    x = random(frames, 2, 4, 6, 5, seed=3)
+    for sample in range(2):
+        side_by_side = x[:, sample].relu().flatten(0, 1)[None]
+        window = functional.conv2d(side_by_side, module.join.weight, module.join.bias, padding=1)
+        for block in module.blocks:
+            window = block(window)
+        for frame in range(frames):
+            own = slice(4 * frame, 4 * frame + 4)
+            expected = functional.conv2d(window.relu(), module.split.weight[own], module.split.bias[own])
+            got = module(x.flatten(0, 1), frames).unflatten(0, (frames, 2))[frame, sample]
+            torch.testing.assert_close(got, expected[0])

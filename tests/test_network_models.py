@@ -13,12 +13,14 @@ torch = pytest.importorskip("torch")
 from network.inputs import network_inputs, window_exposure
 from network.kernels import filter_window, mean_of
 from network.models import (
+    TKPCN,
     KernelConfig,
     KernelHead,
     RAResNet,
     RAResNetConfig,
     RAUNet,
     RAUNetConfig,
+    TKPCNConfig,
     denoise_tile,
     fast,
     for_inference,
@@ -52,6 +54,11 @@ def small_unet(kernel: KernelConfig = SMALL, **sizes: tuple[int, ...]) -> RAUNet
 def small_resnet(kernel: KernelConfig = SMALL) -> RAResNet:
     torch.manual_seed(0)
     return RAResNet(RAResNetConfig(kernel, width=4, blocks=4, ra_after=(1, 2, 4), skips=2))
+
+
+def small_tkpcn(kernel: KernelConfig = SMALL) -> TKPCN:
+    torch.manual_seed(0)
+    return TKPCN(TKPCNConfig(kernel, width=4, blocks=2))
 
 
 @torch.no_grad()
@@ -252,7 +259,7 @@ def test_a_threshold_of_one_or_more_is_an_error(threshold: float) -> None:
 # Models
 
 
-@pytest.mark.parametrize("build", [small_unet, small_resnet])
+@pytest.mark.parametrize("build", [small_unet, small_resnet, small_tkpcn])
 @pytest.mark.parametrize("frames", [1, 3, 5, 7])
 def test_kernels_of_any_window_length_are_kernels(build, frames: int) -> None:  # type: ignore[no-untyped-def]
     model = build(replace(SMALL, frames=frames))
@@ -276,7 +283,7 @@ def test_an_estimate_of_every_frame() -> None:
     assert bool((share > 0).all())
 
 
-@pytest.mark.parametrize("build", [small_unet, small_resnet])
+@pytest.mark.parametrize("build", [small_unet, small_resnet, small_tkpcn])
 def test_samples_of_a_batch_do_not_touch_each_other(build) -> None:  # type: ignore[no-untyped-def]
     model, data = build(), window(n=2)
     second = {name: value[1:] for name, value in data.items()}
@@ -296,6 +303,20 @@ def test_only_robust_average_blocks_connect_the_frames(scales: tuple[int, ...]) 
     run(model, data)
     assert torch.equal(seen[0][0], seen[1][0]) == (not scales)
     assert not torch.equal(seen[0][2], seen[1][2])
+
+
+def test_the_baselines_frames_meet_in_its_temporal_module_only() -> None:
+    model = small_tkpcn()
+    before, after = [], []
+    model.blocks[-1].register_forward_hook(lambda module, inputs, output: before.append(output))
+    model.temporal.register_forward_hook(lambda module, inputs, output: after.append(output))
+    data = window()
+    run(model, data)
+    data["albedo"] = data["albedo"].clone()
+    data["albedo"][:, 2] = 0
+    run(model, data)
+    assert torch.equal(before[0][:2], before[1][:2])
+    assert not torch.equal(after[0][0], after[1][0])
 
 
 def test_the_paper_network_has_the_parameters_it_should() -> None:
@@ -367,6 +388,8 @@ def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -
         (lambda: RAResNetConfig(ra_after=(3, 25)), "ra_after: expected ascending blocks 1 to 24"),
         (lambda: RAResNetConfig(skips=7), "skips: expected 0 to 6, got 7"),
         (lambda: RAResNetConfig(conv_size=4), "conv_size: expected an odd number"),
+        (lambda: TKPCNConfig(blocks=-1), "blocks, temporal_blocks: expected 0 or more, got -1 and 2"),
+        (lambda: TKPCNConfig(conv_size=2), "conv_size: expected an odd number"),
     ],
 )
 def test_configurations_say_what_is_wrong(make, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -20,7 +20,16 @@ from safetensors.torch import save_file
 import network.train
 from network.checkpoint import build, describe, load_model, load_notes, save_model
 from network.clips import Clip, Sampler, SamplerConfig
-from network.models import KernelConfig, Model, RAResNet, RAResNetConfig, RAUNet, RAUNetConfig
+from network.models import (
+    TKPCN,
+    KernelConfig,
+    Model,
+    RAResNet,
+    RAResNetConfig,
+    RAUNet,
+    RAUNetConfig,
+    TKPCNConfig,
+)
 from network.train import TrainConfig, batch_loss, main, train, validate
 
 pytestmark = pytest.mark.neural
@@ -230,7 +239,8 @@ def test_weights_come_back(tmp_path: Path, dtype: torch.dtype) -> None:
 
 
 def test_every_model_is_built_from_its_description() -> None:
-    for model in (make_model(), RAResNet(RAResNetConfig(width=4, blocks=3, ra_after=(1, 3), skips=1))):
+    resnet = RAResNet(RAResNetConfig(width=4, blocks=3, ra_after=(1, 3), skips=1))
+    for model in (make_model(), resnet, TKPCN(TKPCNConfig(width=4, blocks=1))):
         again = build(json.loads(json.dumps(describe(model))))
         assert type(again) is type(model)
         assert again.config == model.config
