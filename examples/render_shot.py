@@ -35,6 +35,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
     parser.add_argument("--reference", type=int, default=0, help="samples of the reference; 0: none")
     parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="of the reference; default: all")
+    parser.add_argument("--second-reference", action="store_true", help="another one, reference_b, of other seeds")
     parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
     parser.add_argument("--compact", action="store_true", help="all channels as half, without the denoising depth")
     parser.add_argument("--seed", type=int, default=1)
@@ -196,6 +197,8 @@ def main(argv: list[str]) -> int:
             first, last = map(int, options.reference_frames.split("-"))
             frames = range(first, last + 1)
         render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)
+        if options.second_reference:
+            render_level(scene, out, "reference_b", options.reference, frames, options.seed * 10 + 8)
     if options.compact:
         for path in sorted(out.glob("*.exr")):
             compact(path)

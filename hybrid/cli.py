@@ -158,9 +158,7 @@ def compare(
     shot: ShotArgument,
     reference: Annotated[
         list[str],
-        typer.Option(
-            help="the same frames at many samples; twice: two independent halves, whose noise cancels"
-        ),
+        typer.Option(help="the same frames at many samples; twice: two independent halves, whose noise cancels"),
     ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="REPORT", help="folder for a page with chart and pictures")

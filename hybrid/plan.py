@@ -48,7 +48,7 @@ GUIDE_NOISE_ABOVE = 0.003
 NOISE_FREE = 1e-4
 TILE = 32
 SAMPLES = 3
-# What frames are prepared with to be measured: without texture, and with a first estimate.
+# What frames are prepared with to be measured: without texture, and with their light.
 MEASURED = frozenset({"demodulate", "gate"})
 
 
@@ -258,8 +258,8 @@ def _speed(pair: _Pair) -> float:
 
 
 def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -> float:
-    """Share of the picture whose estimate differs between two frames by more than its noise, along `vectors`."""
-    here, other = _estimate_of(pair.here), _estimate_of(pair.there)
+    """Share of the picture whose light differs between two frames by more than its noise, along `vectors`."""
+    here, other = _light_of(pair.here), _light_of(pair.there)
     exposure = measure_exposure(here)
     inside = np.ones(here.shape[:2], bool)
     if vectors is not None:
@@ -272,10 +272,10 @@ def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
 
 
-def _estimate_of(frame: PreparedFrame) -> Array:
-    if frame.estimate is None:
-        raise ValueError(f"frame {frame.number} was prepared without the estimate that the plan compares")
-    return frame.estimate
+def _light_of(frame: PreparedFrame) -> Array:
+    if frame.light is None:
+        raise ValueError(f"frame {frame.number} was prepared without the light that the plan compares")
+    return frame.light
 
 
 def _outlier_share(frame: PreparedFrame) -> float:
@@ -293,9 +293,9 @@ def _guide_noise(pair: _Pair) -> float:
 
 
 def _noise_free_share(frame: PreparedFrame) -> float:
-    estimate = _estimate_of(frame)
-    exposure = measure_exposure(estimate)
-    removed = np.abs(compress(frame.irradiance, exposure) - compress(estimate, exposure)).max(axis=-1)
+    light = _light_of(frame)
+    exposure = measure_exposure(light)
+    removed = np.abs(compress(frame.irradiance, exposure) - compress(light, exposure)).max(axis=-1)
     tiles = [
         removed[y : y + TILE, x : x + TILE].max() < NOISE_FREE
         for y in range(0, removed.shape[0], TILE)

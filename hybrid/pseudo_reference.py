@@ -6,7 +6,7 @@ both read the `AlignedWindow` that it returns, and nothing after it warps again.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from flow.warp import warp
 from hybrid.frames import Frame, Shot
 from hybrid.timing import Timings
 from hybrid.transfer import compress, demodulate, measure_exposure, remodulate
-from nlm.average import reject_outliers, replace_nonfinite, robust_average
+from nlm.average import average, reject_outliers, replace_nonfinite, robust_average
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
@@ -31,13 +31,15 @@ Mask = NDArray[np.bool_]
 
 # Name of the alpha channel among the AOVs; unlike the others it is not light, and is not demodulated.
 ALPHA = "alpha"
+# Where the confidence is below this, the centre's estimate takes the place of a neighbour's by and by.
+DISTRUSTED = 0.1
 # Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
 HIDDEN = 3.0
 
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, made safe to filter: finite, divided by its albedo, perhaps with a first spatial estimate.
+    """One frame, made safe to filter: finite, divided by its albedo, perhaps with a rough idea of its light.
 
     Attributes
     ----------
@@ -45,8 +47,8 @@ class PreparedFrame:
         The frame's number.
     irradiance : (H, W, 3) array
         Color divided by albedo (`hybrid.transfer.demodulate`), or the color itself if not `demodulated`.
-    estimate : (H, W, 3) array or None
-        A denoised picture of this frame alone, as irradiance: the one that came with the frame, or a guided filter's.
+    light : (H, W, 3) array or None
+        Irradiance without most of its noise, by a guided filter: what the gate compares where nothing better is given.
     albedo, normal : (H, W, 3) array or None
         Guides, finite.
     valid : (H, W) bool array
@@ -67,7 +69,7 @@ class PreparedFrame:
 
     number: int
     irradiance: Array
-    estimate: Array | None
+    light: Array | None
     albedo: Array | None
     normal: Array | None
     valid: Mask
@@ -112,6 +114,8 @@ class AlignedWindow:
         The centre's albedo and normal, prefiltered.
     variance : (H, W, 3) array
         Of the centre's `color`, smoothed.
+    estimate : (T, H, W, 3) array or None
+        The estimates that were asked for, aligned, as irradiance; where a frame cannot be trusted, the centre's.
     aovs : dict of str to (T, H, W, C) array
         Further layers, warped and demodulated like the color.
     repaired : int
@@ -130,6 +134,7 @@ class AlignedWindow:
     modulation: Array
     guide: Array | None
     variance: Array
+    estimate: Array | None
     aovs: dict[str, Array]
     repaired: int
     outliers: int
@@ -146,8 +151,44 @@ class AlignedWindow:
         return np.stack([mix_centre(warped, centre, c) for warped, c in zip(layer, self.confidence, strict=True)])
 
 
+@dataclass(frozen=True)
+class Preset:
+    """Settings of the classical estimate; each preset is a measured point of accuracy against time.
+
+    Attributes
+    ----------
+    name : str
+        What the user calls it.
+    nlm_radius : int
+        Search radius of the non-local means, pixels; 0: the robust average alone.
+    nlm_patch_radius : int
+        Radius of the patches it compares, pixels.
+    guided_radius : int
+        Radius of the guided filter that follows, pixels; 0: none.
+    guided_eps : float
+        Its regularisation, relative to the guides' scale.
+    """
+
+    name: str
+    nlm_radius: int
+    nlm_patch_radius: int
+    guided_radius: int
+    guided_eps: float
+
+
+DRAFT = Preset("draft", 0, 0, guided_radius=1, guided_eps=1e-3)
+BALANCED = Preset("balanced", 3, 2, guided_radius=1, guided_eps=1e-2)
+FINAL = Preset("final", 5, 2, guided_radius=1, guided_eps=1e-2)
+PRESETS = {preset.name: preset for preset in (DRAFT, BALANCED, FINAL)}
+
+
+# Where the estimates of single frames come from: a function from a frame to its denoised radiance (H, W, 3), or None
+# where it has none; a preset, for our own, made from each frame's window; or None.
+Estimate = Callable[[Frame], Array | None] | Preset | None
+
+
 def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
-    """Make one frame safe to filter, divide it by its albedo, and estimate it by itself where that is of use.
+    """Make one frame safe to filter, divide it by its albedo, and estimate its light where the gate will ask for it.
 
     Parameters
     ----------
@@ -159,13 +200,13 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
     color, bad = replace_nonfinite(frame.color)
     repaired = bad
     layers: dict[str, Array | None] = {}
-    for name in ("albedo", "normal", "estimate", "variance"):
+    for name in ("albedo", "normal", "variance"):
         layer = getattr(frame, name)
         if layer is not None:
             layer, bad_here = replace_nonfinite(layer)
             repaired = repaired | bad_here
         layers[name] = layer
-    albedo, normal, estimate, variance = layers.values()
+    albedo, normal, variance = layers.values()
     albedo = None if albedo is None else np.maximum(albedo, 0)
     motion = None
     if frame.motion is not None and frame.motion_convention is not None:
@@ -174,19 +215,14 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
     demodulated = albedo is not None and "demodulate" in effects
     if albedo is not None and demodulated:
         color = demodulate(color, albedo)
-        estimate = None if estimate is None else demodulate(estimate, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
         aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
     if frame.alpha is not None and "alpha" in effects:
         aovs[ALPHA] = replace_nonfinite(frame.alpha[..., None])[0]
-    if "gate" not in effects:
-        estimate = None
-    elif estimate is None:
-        estimate = _estimate_alone(color, albedo, normal)
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
-        estimate=estimate,
+        light=_rough_light(color, albedo, normal) if "gate" in effects else None,
         albedo=albedo,
         normal=normal,
         valid=~bad,
@@ -199,8 +235,8 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
     )
 
 
-def _estimate_alone(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
-    """Estimate one frame cheaply: what the gate and the flow compare must not be noise."""
+def _rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
+    """Light of one frame, cheaply: what the gate compares must not be noise."""
     clean, _ = reject_outliers(irradiance[None], np.ones((1, *irradiance.shape[:2]), np.float32))
     guides = [layer for layer in (albedo, normal) if layer is not None]
     if guides:
@@ -222,8 +258,11 @@ class Aligner:
         Frames on each side of the centre; the window has 2 · radius + 1.
     interpolation : str
         Of the warp, "bilinear" or "bicubic".
+    estimate : function or Preset, optional
+        Where the estimates of single frames come from (`hybrid.estimates`). A function is called once per frame. A
+        preset's estimate is made from each frame's own window, so a window of them draws on twice its radius.
     timings : Timings, optional
-        Where to count the stages "read", "prepare", "flow" and "warp".
+        Where to count the stages "read", "prepare", "estimate", "flow", "warp" and "confidence".
     """
 
     def __init__(
@@ -233,14 +272,17 @@ class Aligner:
         *,
         radius: int = 2,
         interpolation: str = "bilinear",
+        estimate: Estimate = None,
         timings: Timings | None = None,
     ) -> None:
         self.shot = shot
         self.effects = frozenset(effects)
+        self.estimate = estimate
         self.radius = radius
         self.interpolation = interpolation
         self.timings = timings or Timings()
         self._frames: dict[int, PreparedFrame] = {}
+        self._estimates: dict[int, Array | None] = {}
         self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
 
     def align(self, number: int) -> AlignedWindow:
@@ -256,22 +298,47 @@ class Aligner:
         AlignedWindow
             The first and the last frames of a shot have neighbours of confidence 0.
         """
-        return self._assemble(number, self.load(number, self.radius))
+        numbers = self._around(number, self.radius)
+        if isinstance(self.estimate, Preset):
+            self._estimate_window(numbers, self.estimate)
+        else:
+            self._load(numbers)
+        return self._assemble(number, numbers, given=self.estimate is not None)
 
     def load(self, number: int, radius: int) -> list[int]:
         """Read and prepare the frames around `number`; return the numbers of the window, ascending."""
+        numbers = self._around(number, radius)
+        self._load(numbers)
+        return numbers
+
+    def _around(self, number: int, radius: int) -> list[int]:
         step = self.shot.step
-        numbers = list(range(number - radius * step, number + radius * step + 1, step))
+        return list(range(number - radius * step, number + radius * step + 1, step))
+
+    def _load(self, numbers: Collection[int]) -> None:
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
         self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
+        self._estimates = {n: estimate for n, estimate in self._estimates.items() if n in numbers}
+        # Where estimates of single frames are given, the gate compares those.
+        effects = self.effects - {"gate"} if callable(self.estimate) else self.effects
         for n in numbers:
             if n not in self._frames and self.shot.has(n):
                 with self.timings.stage("read"):
                     frame = self.shot.read(n)
                 with self.timings.stage("prepare"):
-                    self._frames[n] = prepare(frame, self.effects)
-        return numbers
+                    self._frames[n] = prepare(frame, effects)
+                if callable(self.estimate):
+                    with self.timings.stage("estimate"):
+                        self._estimates[n] = _checked(self.estimate(frame), frame)
+
+    def _estimate_window(self, numbers: list[int], preset: Preset) -> None:
+        """Estimate each frame of a window from a window of its own, once while windows slide over it."""
+        ahead = [n for n in numbers if self.shot.has(n) and n not in self._estimates]
+        self._load(sorted({*numbers, *(m for n in ahead for m in self._around(n, self.radius))}))
+        for n in ahead:
+            aligned = self._assemble(n, self._around(n, self.radius), given=False)
+            self._estimates[n] = estimate(aligned, preset, timings=self.timings)
 
     def frame(self, number: int) -> PreparedFrame | None:
         """Frame `number` of the window loaded last, or None where the shot has no such frame."""
@@ -323,10 +390,17 @@ class Aligner:
         flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
         return flow, valid
 
-    def _assemble(self, number: int, numbers: list[int]) -> AlignedWindow:
+    def _assemble(self, number: int, numbers: list[int], *, given: bool) -> AlignedWindow:
         centre = self._frames[number]
         shape = len(numbers), *centre.irradiance.shape[:2]
         layers = _layers(centre)
+        estimates: Array | None = None
+        if given:
+            layers.pop("light", None)
+            alone = self._estimates[number]
+            if alone is None:
+                raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
+            estimates = np.repeat(alone[None], len(numbers), axis=0)
         window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
         confidence = np.zeros(shape, np.float32)
         for index, neighbour in enumerate(numbers):
@@ -344,12 +418,24 @@ class Aligner:
                 for name, kept in window.items():
                     kept[index] = warped[name]
                 confidence[index] = self._trust(centre, warped, link, inside, back[0])
+                if estimates is not None:
+                    neighbours = self._estimates[neighbour]
+                    if neighbours is None:
+                        confidence[index] = 0
+                    elif "warp" in self.effects:
+                        # Estimates have no noise that interpolation could average, only detail to lose: bicubic is
+                        # worth up to 0.5 dB here.
+                        estimates[index] = warp(neighbours, link[0], interpolation="bicubic")[0]
+                    else:
+                        estimates[index] = neighbours
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, confidence)
+            return self._finish(centre, window, estimates, confidence)
 
     def _warp(self, there: PreparedFrame, wanted: Collection[str], flow: Array) -> tuple[dict[str, Array], Mask]:
         """Warp a neighbour's layers to the centre, all in one call."""
         layers = _layers(there)
+        if "light" not in wanted:
+            layers.pop("light", None)
         if missing := set(wanted) ^ set(layers):
             raise ValueError(
                 f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
@@ -385,23 +471,31 @@ class Aligner:
             valid=valid,
         )
 
-    def _finish(self, centre: PreparedFrame, window: dict[str, Array], confidence: Array) -> AlignedWindow:
+    def _finish(
+        self, centre: PreparedFrame, window: dict[str, Array], estimates: Array | None, confidence: Array
+    ) -> AlignedWindow:
         color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
         middle = len(color) // 2
         outliers = 0
         if "outliers" in self.effects:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected))
-        if "gate" in self.effects:
-            estimates = window.pop("estimate")
-            confidence = confidence * color_gate(estimates, color[middle], measure_exposure(estimates[middle]))
-            del estimates  # the largest arrays of a film frame are given back as soon as they can be
         guides = [layer for layer in (albedo, normal) if layer is not None]
         noisy = "prefilter" in self.effects
         clean: list[Array] = [prefilter_guide(g, confidence) if noisy else g[middle] for g in guides]
         modulation = np.ones_like(color[0])
         if albedo is not None and centre.demodulated:
             modulation = remodulate(modulation, clean[0])
+        if estimates is not None:
+            # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
+            estimates = estimates / modulation
+        if "gate" in self.effects:
+            light = window.pop("light") if estimates is None else estimates
+            confidence = confidence * color_gate(light, color[middle], measure_exposure(light[middle]))
+            del light  # the largest arrays of a film frame are given back as soon as they can be
+        if estimates is not None:
+            for estimate, trust in zip(estimates, confidence, strict=True):
+                estimate[:] = mix_centre(estimate, estimates[middle], np.minimum(trust / DISTRUSTED, 1))
         given = centre.variance
         return AlignedWindow(
             number=centre.number,
@@ -412,6 +506,7 @@ class Aligner:
             modulation=modulation,
             guide=np.concatenate(clean, axis=-1) if clean else None,
             variance=variance_from_window(color, confidence) if given is None else smooth_variance(given),
+            estimate=estimates,
             aovs={name: window[f"aov {name}"] for name in centre.aovs},
             repaired=centre.repaired,
             outliers=outliers,
@@ -443,44 +538,13 @@ def _layers(frame: PreparedFrame) -> dict[str, Array]:
     """All layers of a frame that are warped."""
     named = {
         "color": frame.irradiance,
-        "estimate": frame.estimate,
+        "light": frame.light,
         "albedo": frame.albedo,
         "normal": frame.normal,
         **{f"aov {name}": layer for name, layer in frame.aovs.items()},
         "valid": frame.valid[..., None].astype(np.float32),
     }
     return {name: layer for name, layer in named.items() if layer is not None}
-
-
-@dataclass(frozen=True)
-class Preset:
-    """Settings of the classical estimate; each preset is a measured point of accuracy against time.
-
-    Attributes
-    ----------
-    name : str
-        What the user calls it.
-    nlm_radius : int
-        Search radius of the non-local means, pixels; 0: the robust average alone.
-    nlm_patch_radius : int
-        Radius of the patches it compares, pixels.
-    guided_radius : int
-        Radius of the guided filter that follows, pixels; 0: none.
-    guided_eps : float
-        Its regularisation, relative to the guides' scale.
-    """
-
-    name: str
-    nlm_radius: int
-    nlm_patch_radius: int
-    guided_radius: int
-    guided_eps: float
-
-
-DRAFT = Preset("draft", 0, 0, guided_radius=1, guided_eps=1e-3)
-BALANCED = Preset("balanced", 3, 2, guided_radius=1, guided_eps=1e-2)
-FINAL = Preset("final", 5, 2, guided_radius=1, guided_eps=1e-2)
-PRESETS = {preset.name: preset for preset in (DRAFT, BALANCED, FINAL)}
 
 
 def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timings | None = None) -> Array:
@@ -530,3 +594,45 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
             guide = np.concatenate(guides, axis=-1)
             irradiance = guided_filter(irradiance, guide, radius=preset.guided_radius, eps=preset.guided_eps)
     return irradiance * aligned.modulation
+
+
+def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> Array:
+    """Make the given estimates stable: average them over the frames that show the same light.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        With estimates.
+    timings : Timings, optional
+        Where to count the stage "average".
+
+    Returns
+    -------
+    (H, W, 3) array
+        Radiance, finite.
+
+    Raises
+    ------
+    ValueError
+        If the window has no estimates.
+
+    Notes
+    -----
+    ``Σ c_t e_t / Σ c_t``, c the confidence: geometry's times the color gate's (`nlm.gate`).
+    """
+    if aligned.estimate is None:
+        raise ValueError("aligned: expected a window with estimates, got none")
+    timings = timings or Timings()
+    with timings.stage("average"):
+        return average(aligned.estimate, aligned.confidence) * aligned.modulation
+
+
+def _checked(estimate: Array | None, frame: Frame) -> Array | None:
+    """An estimate that fits its frame and is finite."""
+    if estimate is None:
+        return None
+    if estimate.shape != frame.color.shape:
+        raise ValueError(
+            f"the estimate of frame {frame.number} has shape {estimate.shape}, expected {frame.color.shape}"
+        )
+    return np.maximum(replace_nonfinite(estimate)[0], 0)

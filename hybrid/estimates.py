@@ -1,0 +1,107 @@
+"""Per-frame estimates: pictures that are denoised already, each by itself, which time makes stable.
+
+An estimate comes from the file (Cycles keeps the ``Noisy Image`` beside what it has denoised), from any finished
+sequence, from OIDN where it is installed, or from our own pseudo-reference.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.frames import Frame, Shot, open_shot
+from hybrid.oidn import denoise_oidn
+from hybrid.pseudo_reference import FINAL, Estimate, Preset
+from nlm.average import replace_nonfinite
+
+Array = NDArray[np.float32]
+
+OIDN_MODES = {
+    "oidn": {"quality": "high"},
+    "oidn-fast": {"quality": "fast"},
+    "oidn-best": {"quality": "high", "prefilter": True},
+}
+
+
+@dataclass(frozen=True)
+class EstimateSource:
+    """Where the estimates of a shot come from.
+
+    Attributes
+    ----------
+    name : str
+        What was taken; written to the header of the output.
+    estimate : Estimate
+        What an `Aligner` takes: a function, a preset of our own, or None for none.
+    reason : str
+        Why this one.
+    """
+
+    name: str
+    estimate: Estimate
+    reason: str
+
+
+def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSource:
+    """Find the estimates that are asked for.
+
+    Parameters
+    ----------
+    spec : str
+        "auto": what is in the file, else OIDN where it is installed, else our own. "oidn" (quality high, guides as
+        given), "oidn-fast", "oidn-best" (guides prefiltered), "nlm" (our own, from each frame's window), "none",
+        or the pattern of a finished sequence of the same frames.
+    shot : Shot
+        The noisy shot.
+    own : Preset
+        Of our own estimate.
+
+    Raises
+    ------
+    ValueError
+        If OIDN is asked for by name and not installed, or a sequence lacks frames of the shot.
+    FileNotFoundError
+        If there is no such sequence.
+    """
+    if spec == "auto":
+        if shot.layers(shot.numbers[0]).estimate is not None:
+            return EstimateSource("file", _from_file, "the file holds a denoised picture")
+        if _has_oidn():
+            return EstimateSource("oidn", partial(_run_oidn, **OIDN_MODES["oidn"]), "OIDN is installed")
+        return EstimateSource("nlm", own, "no denoised picture in the file, and pyoidn is not installed")
+    if spec == "none":
+        return EstimateSource("none", None, "asked for")
+    if spec == "nlm":
+        return EstimateSource("nlm", own, "asked for")
+    if spec in OIDN_MODES:
+        if not _has_oidn():
+            raise ValueError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
+        return EstimateSource(spec, partial(_run_oidn, **OIDN_MODES[spec]), "asked for")
+    sequence = open_shot(spec)
+    missing = [number for number in shot.numbers if not sequence.has(number)]
+    if missing:
+        raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
+    return EstimateSource("sequence", partial(_read_sequence, sequence), "asked for")
+
+
+def _has_oidn() -> bool:
+    return importlib.util.find_spec("pyoidn") is not None
+
+
+def _from_file(frame: Frame) -> Array | None:
+    return frame.estimate
+
+
+def _run_oidn(frame: Frame, **mode: object) -> Array:
+    clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
+    albedo, normal = clean if clean[0] is not None else (None, None)
+    return denoise_oidn(replace_nonfinite(frame.color)[0], albedo, normal, **mode)  # type: ignore[arg-type]
+
+
+def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:
+    # Neighbours outside the frames that were asked for may be missing: they then count for nothing.
+    return sequence.read(frame.number).color if sequence.has(frame.number) else None
