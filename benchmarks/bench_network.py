@@ -113,7 +113,7 @@ def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], ob
         for bfloat16 in (False, True):
             model = for_inference(build(), bfloat16)
             color = torch.rand(1, 5, 3, tile, tile)
-            confidence, estimate = torch.rand(1, 5, 1, tile, tile), torch.rand(1, 1, 3, tile, tile)
+            confidence, estimate = torch.rand(1, 5, 1, tile, tile), torch.rand(1, 5, 3, tile, tile)
             yield (
                 f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
                 lambda m=model, x=color, c=confidence, e=estimate: denoise_tile(m, x, x, x, c, estimate=e),
@@ -123,10 +123,9 @@ def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], ob
             model, config = build().to(memory_format=torch.channels_last), TrainConfig(steps=1)
             color, image = torch.rand(count, 5, 3, 128, 128), torch.rand(count, 3, 128, 128)
             batch = {
-                **dict.fromkeys(("color", "albedo", "normal"), color),
+                **dict.fromkeys(("color", "albedo", "normal", "estimate"), color),
                 **dict.fromkeys(("modulation", "target"), image),
                 "confidence": color[:, :, :1],
-                "estimate": image[:, None],
                 "present": torch.ones(count),
                 "exposure": torch.ones(count),
             }

@@ -85,13 +85,19 @@ def run(height: int, width: int, repeat: int) -> dict[str, dict[str, float]]:
 
     wide = [np.clip(image * (65535 / 8), 0, 65535).astype(np.uint16) for image in window]
     narrow = [np.clip(image * (255 / 8), 0, 255).astype(np.uint8) for image in window]
-    add("cv2.ximgproc.guidedFilter, 3 channels",
-        lambda: cv2.ximgproc.guidedFilter(np.ascontiguousarray(features[..., :3]), frame, 8, 0.01))
+    add(
+        "cv2.ximgproc.guidedFilter, 3 channels",
+        lambda: cv2.ximgproc.guidedFilter(np.ascontiguousarray(features[..., :3]), frame, 8, 0.01),
+    )
     add("cv2.fastNlMeansDenoisingMulti u8 7/21", lambda: cv2.fastNlMeansDenoisingMulti(narrow, 2, FRAMES, [8.0]))
-    add("cv2.fastNlMeansDenoisingMulti u16 7/21", lambda: cv2.fastNlMeansDenoisingMulti(wide, 2, FRAMES, [2000.0],
-                                                                                        normType=cv2.NORM_L1))
-    add("skimage.denoise_nl_means fast 7/10", lambda: denoise_nl_means(window[2], patch_size=7, patch_distance=10,
-                                                                       h=0.3, channel_axis=-1, fast_mode=True))
+    add(
+        "cv2.fastNlMeansDenoisingMulti u16 7/21",
+        lambda: cv2.fastNlMeansDenoisingMulti(wide, 2, FRAMES, [2000.0], normType=cv2.NORM_L1),
+    )
+    add(
+        "skimage.denoise_nl_means fast 7/10",
+        lambda: denoise_nl_means(window[2], patch_size=7, patch_distance=10, h=0.3, channel_axis=-1, fast_mode=True),
+    )
     for name in [name for name in results if name.startswith(("robust", "joint_nlm r", "guided"))]:
         for peer in [peer for peer in results if peer.startswith(("cv2", "skimage"))]:
             results[name][f"share of {peer}"] = results[name]["median"] / results[peer]["median"]
@@ -108,9 +114,18 @@ def main(argv: list[str] | None = None) -> int:
     numba.set_num_threads(1)
     cv2.setNumThreads(1)
     report = {
-        "size": [width, height], "frames": FRAMES, "features": FEATURES, "seed": SEED, "repeat": arguments.repeat,
-        "threads": 1, "python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__,
-        "opencv": cv2.__version__, "scikit-image": skimage.__version__, "machine": platform.processor(),
+        "size": [width, height],
+        "frames": FRAMES,
+        "features": FEATURES,
+        "seed": SEED,
+        "repeat": arguments.repeat,
+        "threads": 1,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "opencv": cv2.__version__,
+        "scikit-image": skimage.__version__,
+        "machine": platform.processor(),
         "cpu_seconds": run(height, width, arguments.repeat),
     }
     text = json.dumps(report, indent=1)

@@ -16,9 +16,7 @@ def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray
     return error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5
 
 
-def _agree_albedo(
-    albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: np.ndarray | float
-) -> np.ndarray:
+def _agree_albedo(albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: np.ndarray | float) -> np.ndarray:
     """exp(-d² / σ²) of the difference, relative where the albedo is above 1 (emitters, sky)."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.atleast_3d(albedo - warped)

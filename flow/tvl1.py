@@ -34,12 +34,8 @@ def _step_primal(
                 u[y, x] -= residual * gx[g, y, x]
                 v[y, x] -= residual * gy[g, y, x]
         for x in range(width):
-            u[y, x] += _THETA * (
-                dual[0, y + 1, x + 1] - dual[0, y + 1, x] + dual[1, y + 1, x + 1] - dual[1, y, x + 1]
-            )
-            v[y, x] += _THETA * (
-                dual[2, y + 1, x + 1] - dual[2, y + 1, x] + dual[3, y + 1, x + 1] - dual[3, y, x + 1]
-            )
+            u[y, x] += _THETA * (dual[0, y + 1, x + 1] - dual[0, y + 1, x] + dual[1, y + 1, x + 1] - dual[1, y, x + 1])
+            v[y, x] += _THETA * (dual[2, y + 1, x + 1] - dual[2, y + 1, x] + dual[3, y + 1, x + 1] - dual[3, y, x + 1])
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
@@ -165,9 +161,7 @@ def _resize(planes: np.ndarray, width: int, height: int, interpolation: int) -> 
     return cv2.resize(planes, (width, height), interpolation=interpolation).reshape(height, width, -1)
 
 
-def _smooth_start(
-    start: np.ndarray, centre: np.ndarray, neighbour: np.ndarray, noise: np.ndarray
-) -> np.ndarray:
+def _smooth_start(start: np.ndarray, centre: np.ndarray, neighbour: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Smooth a flow within the guides' edges, over 17 pixels, or over 129 where that explains the guides better."""
     if min(start.shape[:2]) < 32:
         return start
@@ -299,9 +293,7 @@ def refine_flow(
     start = np.where(usable, start, 0).astype(np.float32)
 
     base = _smooth_start(start, centre, neighbour, deviation)
-    return _solve(
-        centre, neighbour, deviation, base, np.zeros_like(base), scales, warps, iterations, attachment
-    )
+    return _solve(centre, neighbour, deviation, base, np.zeros_like(base), scales, warps, iterations, attachment)
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
@@ -424,9 +416,7 @@ def select_flow(
     return flow, choice
 
 
-def dense_flow(
-    centre_guide: np.ndarray, neighbour_guide: np.ndarray, *, noise: float | np.ndarray = 0.0
-) -> np.ndarray:
+def dense_flow(centre_guide: np.ndarray, neighbour_guide: np.ndarray, *, noise: float | np.ndarray = 0.0) -> np.ndarray:
     """Estimate the flow from the pictures alone, for renderers that give no vectors.
 
     Parameters

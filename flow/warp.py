@@ -92,9 +92,7 @@ def _bicubic(image: np.ndarray, flow: np.ndarray, out: np.ndarray, inside: np.nd
 _KERNELS: dict[str, Callable] = {"bilinear": _bilinear, "bicubic": _bicubic}
 
 
-def warp(
-    image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear"
-) -> tuple[np.ndarray, np.ndarray]:
+def warp(image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear") -> tuple[np.ndarray, np.ndarray]:
     """Sample an image, or a stack of any number of AOV channels, where a flow points.
 
     Parameters

@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 import network
+from hybrid.estimates import choose_estimate
 from hybrid.frames import Shot
 from hybrid.pipeline import Denoised
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import ALPHA, FINAL, AlignedWindow, Aligner, estimate
+from hybrid.pseudo_reference import ALPHA, AlignedWindow, Aligner, gated_average
 from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.clips import Clip
@@ -27,8 +28,6 @@ from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
-# The classical estimate that the shipped weights were trained beside, and are given as a further tap.
-ESTIMATE = FINAL
 # Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
 # on a trained net is below half a float's precision.
 HALO = 32
@@ -109,13 +108,10 @@ class Denoiser:
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         """Denoise the centre of an aligned window."""
-        given = None
-        if self.model.config.kernel.estimate_frames:
-            given = estimate(aligned, ESTIMATE, timings=self.timings)
         with self.timings.stage("network"):
-            return self._run(aligned, given)
+            return self._run(aligned)
 
-    def _run(self, aligned: AlignedWindow, given: Array | None) -> Denoised:
+    def _run(self, aligned: AlignedWindow) -> Denoised:
         color = aligned.mixed(aligned.color)
         height, width = color.shape[1:3]
         layers = {"color": color, "confidence": aligned.confidence[..., None]}
@@ -123,8 +119,8 @@ class Denoiser:
             layers["albedo"] = aligned.mixed(aligned.albedo)
         if aligned.normal is not None:
             layers["normal"] = aligned.mixed(aligned.normal)
-        if given is not None:
-            layers["estimate"] = (given / aligned.modulation)[None]
+        if aligned.estimate is not None:
+            layers["estimate"] = aligned.estimate
         if aligned.aovs:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
         exposure = window_exposure(_tensor(color))
@@ -174,6 +170,7 @@ def write_clips(
     name: str,
     *,
     radius: int = 2,
+    estimate: str = "auto",
     pseudo_reference: bool = False,
 ) -> Iterator[Path]:
     """Write a training clip for each frame that two renders of one shot have in common.
@@ -190,8 +187,10 @@ def write_clips(
         Of the clips. What comes before its first dot is the shot's: sets are split by it.
     radius : int
         Frames on each side of the centre.
+    estimate : str
+        Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
     pseudo_reference : bool
-        Take the classical estimate of the target's window instead of its noisy frame.
+        Take the gated average of the target's estimates, of the same kind, instead of its noisy frame.
 
     Yields
     ------
@@ -201,7 +200,7 @@ def write_clips(
     Raises
     ------
     ValueError
-        If the two have no frame in common.
+        If the two have no frame in common, or there are no estimates.
 
     References
     ----------
@@ -210,13 +209,17 @@ def write_clips(
     numbers = [number for number in shot.numbers if target.has(number)]
     if not numbers:
         raise ValueError(f"target: expected frames {shot.numbers[0]}-{shot.numbers[-1]}, got none of them")
-    aligner = Aligner(shot, plan_shot(shot).effects, radius=radius)
-    target_aligner = Aligner(target, plan_shot(target).effects, radius=radius)
+    aligner, target_aligner = (
+        Aligner(s, plan_shot(s).effects, radius=radius, estimate=choose_estimate(estimate, s).estimate)
+        for s in (shot, target)
+    )
     for number in numbers:
         aligned = aligner.align(number)
+        if aligned.estimate is None:
+            raise ValueError(f"estimate is {estimate!r}, expected one that gives pictures: clips hold estimates")
         color = aligned.mixed(aligned.color)
         if pseudo_reference:
-            wanted = estimate(target_aligner.align(number), FINAL)
+            wanted = gated_average(target_aligner.align(number))
         else:
             wanted, _ = replace_nonfinite(target.read(number).color)
         clip = Clip(
@@ -225,7 +228,7 @@ def write_clips(
             normal=np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal),
             confidence=aligned.confidence,
             modulation=aligned.modulation,
-            estimate=estimate(aligned, ESTIMATE) / aligned.modulation,
+            estimate=aligned.estimate,
             target=wanted,
             target_kind="pseudo_reference" if pseudo_reference else "noisy",
             shot=name.partition(".")[0],

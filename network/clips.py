@@ -37,7 +37,7 @@ class Clip:
     modulation : ndarray
         ``(H, W, 3)``; radiance is irradiance times modulation.
     estimate : ndarray
-        ``(H, W, 3)`` denoised irradiance of the centre, made from this window and nothing else.
+        ``(T, H, W, 3)`` aligned estimates of the frames, irradiance, made from the same noisy frames and nothing else.
     target : ndarray
         ``(H, W, 3)`` radiance of the centre, of noise independent of color's.
     target_kind : str
@@ -75,7 +75,7 @@ class Clip:
             "normal": window,
             "confidence": window[:3],
             "modulation": image,
-            "estimate": image,
+            "estimate": window,
             "target": image,
         }
         for name, shape in expected.items():
@@ -166,7 +166,7 @@ class SamplerConfig:
     """How crops are drawn and varied. Probabilities are per sample."""
 
     crop: int = 128  # height and width; smaller clips are used whole, if square
-    drop_estimate: float = 0.25  # the model must also work without one
+    drop_estimate: float = 0.1  # the model must also work without one
     drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
@@ -238,8 +238,8 @@ class Sampler:
         -------
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal`` ``(N, T, 3, H, W)``, ``confidence`` ``(N, T, 1, H, W)``,
-            ``modulation``, ``target`` ``(N, 3, H, W)``, ``estimate`` ``(N, 1, 3, H, W)``, ``present`` ``(N,)`` (1
-            where the estimate may be used), ``exposure`` ``(N,)``.
+            ``estimate`` ``(N, T, 3, H, W)``, ``modulation``, ``target`` ``(N, 3, H, W)``, ``present`` ``(N,)`` (1 where
+            the estimate may be used), ``exposure`` ``(N,)``.
         """
         samples = [self._sample() for _ in range(size)]
         return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
@@ -260,14 +260,14 @@ class Sampler:
             image = image[..., ::-1, :] if flip_x else image
             return (np.swapaxes(image, -3, -2) if transpose else image).astype(np.float32)
 
-        color, albedo = crop(clip.color, channels), crop(clip.albedo, channels)
+        color, albedo, estimate = (crop(window, channels) for window in (clip.color, clip.albedo, clip.estimate))
         normal = crop(clip.normal, rng.permutation(3)) * rng.choice((-1, 1), 3).astype(np.float32)
         confidence = crop(clip.confidence[..., None])
         centre = len(color) // 2
         if len(color) > 1 and rng.random() < config.drop_frames:
             dropped = rng.random(len(color)) < 0.5
             dropped[centre] = False
-            for window in (color, albedo, normal):
+            for window in (color, albedo, normal, estimate):
                 window[dropped] = window[centre]
             confidence[dropped] = 0
         if rng.random() < config.fireflies:
@@ -284,7 +284,7 @@ class Sampler:
             "confidence": _frames_to_torch(confidence),
             "modulation": _frames_to_torch(crop(clip.modulation, channels)),
             "target": _frames_to_torch(crop(clip.target, channels)),
-            "estimate": _frames_to_torch(crop(clip.estimate, channels)[None]),
+            "estimate": _frames_to_torch(estimate),
             "present": torch.tensor(float(rng.random() >= config.drop_estimate)),
             "exposure": torch.tensor(exposure, dtype=torch.float32),
         }
@@ -308,10 +308,9 @@ def whole_frame(clip: Clip, multiple: int) -> dict[str, Tensor]:
     height, width = (length // multiple * multiple for length in clip.color.shape[1:3])
     batch = {
         name: _frames_to_torch(getattr(clip, name)[..., :height, :width, :])[None]
-        for name in ("color", "albedo", "normal", "modulation", "target")
+        for name in ("color", "albedo", "normal", "estimate", "modulation", "target")
     }
     batch["confidence"] = _frames_to_torch(clip.confidence[:, :height, :width, None])[None]
-    batch["estimate"] = _frames_to_torch(clip.estimate[None, :height, :width])[None]
     batch["present"] = torch.ones(1)
     batch["exposure"] = window_exposure(_frames_to_torch(clip.color)[None])
     return batch
@@ -324,14 +323,15 @@ def _frames_to_torch(image: Array) -> Tensor:
 
 def _crop_chances(clip: Clip, crop: int) -> tuple[list[tuple[int, int]], npt.NDArray[np.float64]]:
     """Corners of the possible crops, every 8 pixels, and the chance of each."""
+    middle = len(clip.color) // 2
     modulation = clip.modulation.astype(np.float32)
     noisy, target, estimate = (
         np.maximum(image.astype(np.float32), 0)
-        for image in (clip.color[len(clip.color) // 2] * modulation, clip.target, clip.estimate * modulation)
+        for image in (clip.color[middle] * modulation, clip.target, clip.estimate[middle] * modulation)
     )
     noisy, target, estimate = (image / (1 + image) for image in (noisy, target, estimate))
     importance = np.abs(noisy - target).mean(2)
-    for guide in (estimate, clip.albedo[len(clip.albedo) // 2].astype(np.float32)):
+    for guide in (estimate, clip.albedo[middle].astype(np.float32)):
         importance[1:] += np.abs(np.diff(guide, axis=0)).mean(2)
         importance[:, 1:] += np.abs(np.diff(guide, axis=1)).mean(2)
     sums = np.zeros((importance.shape[0] + 1, importance.shape[1] + 1))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 #: Channels of a frame without an estimate: color, albedo, normal, confidence (the paper's).
 CHANNELS = 10
-#: Channels an estimate adds: its three, and one that tells that it is there.
-ESTIMATE_CHANNELS = 4
+#: Channels an estimate adds: its three, its difference from the centre's, and one that tells that it is there.
+ESTIMATE_CHANNELS = 7
 
 
 def window_exposure(color: Tensor) -> Tensor:
@@ -63,15 +63,16 @@ def network_inputs(
     takes_estimate : bool
         Whether the model has channels for an estimate.
     estimate : Tensor, optional
-        ``(N, T_e, 3, H, W)`` denoised irradiance, T_e = 1 (of the centre; every frame sees it) or T.
+        ``(N, T, 3, H, W)`` aligned estimates, irradiance.
     present : Tensor, optional
         ``(N,)``, 1 where a sample has its estimate, 0 where it is to be ignored. Default: all have.
 
     Returns
     -------
     Tensor
-        ``(N, T, 10, H, W)``, or ``(N, T, 14, H, W)`` if takes_estimate: ``log1p(color / exposure)``,
-        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)`` and its presence.
+        ``(N, T, 10, H, W)``, or ``(N, T, 17, H, W)`` if takes_estimate: ``log1p(color / exposure)``,
+        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)``, ten times what that differs by
+        from the centre frame's, and its presence.
 
     Raises
     ------
@@ -101,9 +102,11 @@ def network_inputs(
         if estimate is None:
             channels.append(color.new_zeros(()).expand(n, t, ESTIMATE_CHANNELS, h, w))
         else:
-            if estimate.shape not in ((n, 1, 3, h, w), (n, t, 3, h, w)):
-                raise ValueError(f"estimate: expected shape (N, 1 or T, 3, H, W), got {tuple(estimate.shape)}")
+            if estimate.shape != (n, t, 3, h, w):
+                raise ValueError(f"estimate: expected shape {(n, t, 3, h, w)}, got {tuple(estimate.shape)}")
             here = (color.new_ones(n) if present is None else present.to(color.dtype)).view(n, 1, 1, 1, 1)
             log = torch.log1p((estimate * scale).clamp_min(0)) * here
-            channels += [log.expand(n, t, 3, h, w), here.expand(n, t, 1, h, w)]
+            # Ten times: what matters is a few hundredths, on the scale of the other channels some tenths.
+            difference = 10 * (log - log[:, t // 2 : t // 2 + 1])
+            channels += [log, difference, here.expand(n, t, 1, h, w)]
     return torch.cat(channels, 2)

@@ -183,14 +183,14 @@ def filter_window(kernels: Tensor, color: Tensor, size: int, estimate: Tensor | 
     size : int
         K of the window's taps.
     estimate : Tensor, optional
-        ``(N, T_e, C, H, W)``, T_e = 1 (of the centre) or T, of the same quantity as color. Without one (an AOV
-        that has none) the estimate's taps are left out, and dividing renormalises the others.
+        ``(N, T, C, H, W)``, the estimates of the frames, of the same quantity as color. Without (an AOV that has
+        none) their taps are left out, and dividing renormalises the others.
 
     Returns
     -------
     numerators, denominators : Tensor
         As for `apply_kernels`, ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)``. The estimate of a frame is counted
-        with that frame, so the centre's with the centre.
+        with that frame.
 
     Raises
     ------
@@ -202,16 +202,10 @@ def filter_window(kernels: Tensor, color: Tensor, size: int, estimate: Tensor | 
     numerators, denominators = apply_kernels(kernels[:, :taps], color)
     if estimate is None:
         return numerators, denominators
-    if estimate.shape[1] not in (1, frames):
-        raise ValueError(f"estimate: expected 1 or {frames} frames, got {estimate.shape[1]}")
+    if estimate.shape[1] != frames:
+        raise ValueError(f"estimate: expected {frames} frames, got {estimate.shape[1]}")
     more, share = apply_kernels(kernels[:, taps:], estimate)
-    first = 0 if estimate.shape[1] == frames else frames // 2
-    last = first + estimate.shape[1]
-    padding = (0, 0, 0, 0, 0, 0, first, frames - last)
-    return (
-        numerators + torch.nn.functional.pad(more, padding),
-        denominators + torch.nn.functional.pad(share, padding),
-    )
+    return numerators + more, denominators + share
 
 
 def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:

@@ -25,18 +25,17 @@ class KernelConfig:
 
     frames: int = 5  # T, odd; the window
     size: int = 5  # K of the noisy frames' K×K taps
-    estimate_frames: int = 0  # T_e: 0 no estimate (the paper's model), 1 of the centre, or T
-    estimate_size: int = 1  # K of an estimate's K×K taps
-    estimate_share: float = 0.5  # part of the output that the estimate has before training
+    estimate_size: int = 0  # K of the K×K taps on each frame's estimate; 0: takes none (the paper's model)
+    estimate_share: float = 0.95  # part of the output that the estimates have before training
     threshold: float = 0.5  # t·K: 0.5 is the paper's t = 1 / (2K)
 
     def __post_init__(self) -> None:
-        for name in ("frames", "size", "estimate_size"):
+        for name in ("frames", "size"):
             value = getattr(self, name)
             if value < 1 or value % 2 == 0:
                 raise ValueError(f"{name}: expected an odd number >= 1, got {value}")
-        if self.estimate_frames not in (0, 1, self.frames):
-            raise ValueError(f"estimate_frames: expected 0, 1 or {self.frames}, got {self.estimate_frames}")
+        if self.estimate_size < 0 or (self.estimate_size and self.estimate_size % 2 == 0):
+            raise ValueError(f"estimate_size: expected 0 or an odd number, got {self.estimate_size}")
         if not 0 < self.estimate_share < 1:
             raise ValueError(f"estimate_share: expected 0 < share < 1, got {self.estimate_share}")
         _check_threshold(self.threshold)
@@ -48,8 +47,8 @@ class KernelConfig:
 
     @property
     def estimate_taps(self) -> int:
-        """Taps on the estimate."""
-        return self.estimate_frames * self.estimate_size**2
+        """Taps on the estimates, T·K·K, or 0."""
+        return self.frames * self.estimate_size**2
 
     @property
     def centre(self) -> int:
@@ -59,7 +58,7 @@ class KernelConfig:
     @property
     def channels(self) -> int:
         """Feature channels per frame that the model reads."""
-        return CHANNELS + (ESTIMATE_CHANNELS if self.estimate_frames else 0)
+        return CHANNELS + (ESTIMATE_CHANNELS if self.estimate_size else 0)
 
 
 @dataclass(frozen=True)
@@ -129,12 +128,12 @@ class KernelHead(nn.Module):
     Notes
     -----
     In units of 1/K (K the taps at hand), the raw weight of tap i is ``w_i = tK + (1 − tK) K b_i c_i + s_i h_i``: b is
-    the kernel at the start (four fifths on the pixel itself and the rest on all its taps, in each frame of the window;
-    nearly all on the pixel itself in an estimate; each times its source's share), c the confidence of the frame over
-    its mean over the frames, h what the convolution predicts, s the scale of that: 1 on the window, K times b's mean
-    on the estimate. As ``η_t`` takes t away and renormalises, h = 0 gives exactly the kernel ``b_i c_i``: the mean over
-    time weighted by confidence, hardly blurred, blended with the estimate. Blur is what costs at the start: a 3×3 mean
-    of the estimate alone loses 3 dB on a clean shot. The training starts there, with small h; h is added, not
+    the kernel at the start (four fifths on the pixel itself and the rest on all its taps, in each noisy frame; all on
+    the pixel itself in each estimate; each times its source's share), c the confidence of the frame over its mean over
+    the frames, h what the convolution predicts, s the scale of that: 1 on the window, K times b's mean on the
+    estimates. As ``η_t`` takes t away and renormalises, h = 0 gives exactly the kernel ``b_i c_i``: the gated average
+    of the estimates, with a little of the same average of the noisy frames. Blur is what costs at the start: a 3×3
+    mean of an estimate loses 3 dB on a clean shot. The training starts there, with small h; h is added, not
     multiplied, so that it can reach any kernel, also on frames without confidence.
     """
 
@@ -145,9 +144,9 @@ class KernelHead(nn.Module):
         super().__init__()
         self.config = config
         self.window = nn.Conv2d(channels, config.size**2, 3, padding=1)
-        self.estimate = nn.Conv2d(channels, config.estimate_size**2, 3, padding=1) if config.estimate_frames else None
+        self.estimate = nn.Conv2d(channels, config.estimate_size**2, 3, padding=1) if config.estimate_size else None
         self.register_buffer("window_start", _peak(config.size, 0.2), persistent=False)
-        self.register_buffer("estimate_start", _peak(config.estimate_size, 0.05), persistent=False)
+        self.register_buffer("estimate_start", _peak(max(1, config.estimate_size), 0.0), persistent=False)
         with torch.no_grad():
             for convolution in (self.window, self.estimate):
                 if convolution is not None:
@@ -174,7 +173,7 @@ class KernelHead(nn.Module):
             ``(N, taps, H, W)`` float32.
         """
         config = self.config
-        here = present.float().view(-1, 1, 1, 1) if config.estimate_frames else features.new_zeros(1, 1, 1, 1).float()
+        here = present.float().view(-1, 1, 1, 1) if config.estimate_size else features.new_zeros(1, 1, 1, 1).float()
         taps = config.window_taps + here * config.estimate_taps
         share = config.estimate_share * here
         bias = config.threshold
@@ -186,10 +185,8 @@ class KernelHead(nn.Module):
         weights = (bias + (1 - bias) * scale * confidence * self.window_start + raw).flatten(1, 2)
         if self.estimate is not None:
             scale = (taps * share / config.estimate_taps).unsqueeze(1)
-            middle = features.chunk(config.frames)[config.frames // 2]
-            raw = self.estimate(middle if config.estimate_frames == 1 else features)
-            raw = _frames_first(raw, config.estimate_frames)
-            start = bias * here.unsqueeze(1) + (1 - bias) * scale * self.estimate_start
+            raw = _frames_first(self.estimate(features), config.frames)
+            start = bias * here.unsqueeze(1) + (1 - bias) * scale * confidence * self.estimate_start
             weights = torch.cat([weights, torch.addcmul(start, raw, scale).flatten(1, 2)], 1)
         cut = config.threshold if threshold is None else _check_threshold(threshold)
         return predict_kernel(weights, cut / taps, centre=config.centre)
@@ -353,22 +350,19 @@ class TKPCN(nn.Module):
 Model = RAUNet | RAResNet | TKPCN
 
 
-def fast(frames: int = 5, estimate_frames: int = 1, seed: int = 0) -> RAUNet:
+def fast(frames: int = 5, seed: int = 0) -> RAUNet:
     """Small U-Net for two CPU cores: 0.24 M parameters, 0.2 M multiplications per pixel.
 
     Parameters
     ----------
     frames : int
         Window length.
-    estimate_frames : int
-        Frames that come with an estimate: 0, 1 (the centre) or all.
     seed : int
         Of the initial weights.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        kernel = KernelConfig(frames=frames, estimate_frames=estimate_frames, estimate_size=3, estimate_share=0.95)
-        return RAUNet(RAUNetConfig(kernel))
+        return RAUNet(RAUNetConfig(KernelConfig(frames=frames, estimate_size=3)))
 
 
 def paper(frames: int = 5, conv_size: int = 3, seed: int = 0) -> RAResNet:
@@ -430,7 +424,7 @@ def denoise_tile(
         ``(N,)`` of the *whole* window, from `network.inputs.window_exposure`. Default: of this tile, which is
         right only if the tile is the frame.
     estimate : Tensor, optional
-        ``(N, T_e, 3, H, W)`` denoised irradiance. Ignored by a model that takes none.
+        ``(N, T, 3, H, W)`` aligned estimates, irradiance. Ignored by a model that takes none.
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.
     aovs : Tensor, optional
@@ -452,7 +446,7 @@ def denoise_tile(
         If shapes do not fit the model; see `RAUNet.forward`.
     """
     config = model.config.kernel
-    if config.estimate_frames == 0:
+    if not config.estimate_size:
         estimate = None
     exposure = window_exposure(color) if exposure is None else exposure
     present = color.new_full((color.shape[0],), 0.0 if estimate is None else 1.0)
@@ -462,7 +456,7 @@ def denoise_tile(
         normal,
         confidence,
         exposure,
-        takes_estimate=config.estimate_frames > 0,
+        takes_estimate=config.estimate_size > 0,
         estimate=estimate,
         present=present,
     )

@@ -82,7 +82,7 @@ class TrainConfig:
 def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> tuple[Tensor, Tensor]:
     """Numerators and denominators of a batch from `Sampler.batch`; see `network.kernels.filter_window`."""
     config = model.config.kernel
-    takes_estimate = config.estimate_frames > 0
+    takes_estimate = config.estimate_size > 0
     present = batch["present"] if takes_estimate else torch.zeros_like(batch["present"])
     estimate = batch["estimate"] if takes_estimate else None
     features = network_inputs(
@@ -106,8 +106,8 @@ def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> T
     Notes
     -----
     What a crop can still gain differs by orders of magnitude between shots, and its targets' noise adds a floor.
-    Each crop's loss is divided by the loss of the mean of the window weighted by confidence, or of the estimate if
-    that is lower, so that every crop counts about the same.
+    Each crop's loss is divided by the loss of the mean of the window weighted by confidence, or of the centre's
+    estimate if that is lower, so that every crop counts about the same.
     """
     loss = LOSSES[config.loss]
     numerators, denominators = predict(model, batch, config.bfloat16)
@@ -120,7 +120,8 @@ def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> T
         scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
         mean = mean_of(color * confidence, confidence, color[:, color.shape[1] // 2])
         # The floor matters only where the input equals the target, as in a synthetic or an empty crop.
-        inputs = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, 0])]
+        alone = batch["estimate"][:, color.shape[1] // 2]
+        inputs = [loss(image * modulation, batch["target"], scale) for image in (mean, alone)]
         reference = torch.minimum(*inputs).clamp_min(1e-4)
     return (value / reference).mean()
 
@@ -139,8 +140,8 @@ def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
     Returns
     -------
     dict
-        PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate``, ``denoised``, and
-        ``blind``, denoised without the estimate. ``mean``: radiance of denoised over that of the targets.
+        PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's),
+        ``gated`` (their average), ``denoised``, and ``blind``, denoised without estimates. ``mean``: radiance of denoised over that of the targets.
         ``side``: weight of the side frames.
     """
     sums: dict[str, float] = {}
@@ -148,7 +149,12 @@ def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
         batch = whole_frame(clip, model.multiple)
         centre = len(clip.color) // 2
         modulation, target = batch["modulation"], batch["target"]
-        images = {"noisy": batch["color"][:, centre], "estimate": batch["estimate"][:, 0]}
+        estimate, confidence = batch["estimate"], batch["confidence"]
+        images = {
+            "noisy": batch["color"][:, centre],
+            "estimate": estimate[:, centre],
+            "gated": mean_of(estimate * confidence, confidence, estimate[:, centre]),
+        }
         for name, present in (("blind", 0.0), ("denoised", 1.0)):
             batch["present"] = torch.full((1,), present)
             numerators, share = predict(model, batch)

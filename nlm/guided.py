@@ -15,8 +15,9 @@ Floats = NDArray[np.float32]
 _STRIP = 64
 
 
-def guided_filter(image: Floats, guide: Floats, *, radius: int, eps: float = 1e-2, subsample: int = 1,
-                  weight: Floats | None = None) -> Floats:
+def guided_filter(
+    image: Floats, guide: Floats, *, radius: int, eps: float = 1e-2, subsample: int = 1, weight: Floats | None = None
+) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 
     Parameters
@@ -60,8 +61,9 @@ def guided_filter(image: Floats, guide: Floats, *, radius: int, eps: float = 1e-
     He and Sun, Fast Guided Filter, 2015, arXiv:1505.00996
     """
     if image.ndim != 3 or guide.ndim != 3 or guide.shape[:2] != image.shape[:2]:
-        raise ValueError(f"guide: expected (height, width, channels) as large as the image's {image.shape},"
-                         f" got {guide.shape}")
+        raise ValueError(
+            f"guide: expected (height, width, channels) as large as the image's {image.shape}, got {guide.shape}"
+        )
     if weight is not None and weight.shape != image.shape[:2]:
         raise ValueError(f"weight: expected shape {image.shape[:2]}, got {weight.shape}")
     if radius < 1:

@@ -132,8 +132,18 @@ def joint_nlm(
     variance, features, feature_variance, confidence = (
         np.ascontiguousarray(array, np.float32) for array in (variance, features, feature_variance, confidence)
     )
-    return _filter(window, variance, features, feature_variance, confidence, time_radius, radius, patch_radius,
-                   np.float32(k), np.float32(k_features))
+    return _filter(
+        window,
+        variance,
+        features,
+        feature_variance,
+        confidence,
+        time_radius,
+        radius,
+        patch_radius,
+        np.float32(k),
+        np.float32(k_features),
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
@@ -267,8 +277,14 @@ def _filter(window, variance, features, feature_variance, confidence, frames, ra
                             row[x] = 0
                         py, qy, qx = y + margin, y + margin + dy, radius + dx
                         for c in range(C):
-                            _add_color_distance(row, pu[c, py, radius : radius + pw], pa[c, py, radius : radius + pw],
-                                                qu[c, qy, qx : qx + pw], qa[c, qy, qx : qx + pw], cancel)
+                            _add_color_distance(
+                                row,
+                                pu[c, py, radius : radius + pw],
+                                pa[c, py, radius : radius + pw],
+                                qu[c, qy, qx : qx + pw],
+                                qa[c, qy, qx : qx + pw],
+                                cancel,
+                            )
                         for x in range(pw):
                             column[x] += row[x]
                         oy = y - patch
@@ -283,9 +299,14 @@ def _filter(window, variance, features, feature_variance, confidence, frames, ra
                         for f in range(F):
                             _max_feature_distance(frow, pf[f, oy], qf[f, qy, qx : qx + tw], fn[f, oy], fs[f, oy])
                         for c in range(C):
-                            _reject_far(frow, pu[c, oy + margin, margin : margin + tw],
-                                        pa[c, oy + margin, margin : margin + tw],
-                                        qu[c, qy, qx : qx + tw], qa[c, qy, qx : qx + tw], far)
+                            _reject_far(
+                                frow,
+                                pu[c, oy + margin, margin : margin + tw],
+                                pa[c, oy + margin, margin : margin + tw],
+                                qu[c, qy, qx : qx + tw],
+                                qa[c, qy, qx : qx + tw],
+                                far,
+                            )
                         trow = trust[qy, qx : qx + tw]
                         for x in range(tw):
                             d = wrow[x] * norm

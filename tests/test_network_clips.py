@@ -28,7 +28,7 @@ def make_clip(height: int = 24, width: int = 32, frames: int = 3, shot: str = "a
         normal=rng.uniform(-1, 1, window).astype(np.float32),
         confidence=rng.uniform(0, 1, window[:3]).astype(np.float32),
         modulation=rng.uniform(0.1, 1, window[1:]).astype(np.float32),
-        estimate=rng.uniform(0, 2, window[1:]).astype(np.float32),
+        estimate=rng.uniform(0, 2, window).astype(np.float32),
         target=rng.uniform(0, 2, window[1:]).astype(np.float32),
         target_kind="noisy",
         shot=shot,
@@ -107,7 +107,7 @@ def test_a_batch_has_the_networks_layout() -> None:
         "confidence": (2, 3, 1, 16, 16),
         "modulation": (2, 3, 16, 16),
         "target": (2, 3, 16, 16),
-        "estimate": (2, 1, 3, 16, 16),
+        "estimate": (2, 3, 3, 16, 16),
         "present": (2,),
         "exposure": (2,),
     }
@@ -128,7 +128,7 @@ def test_layers_stay_registered_through_all_variations() -> None:
     """One picture in all layers: flips, transposition and channel permutation must move them alike."""
     base = np.random.default_rng(0).uniform(0.1, 1, (24, 32, 3)).astype(np.float32)
     window = np.repeat(base[None], 3, 0)
-    clip = Clip(window, window, window, window[..., 0], base, base, base, "noisy", "a")
+    clip = Clip(window, window, window, window[..., 0], base, window, base, "noisy", "a")
     sampler = Sampler([clip], PLAIN, 0)
     seen = set()
     for _ in range(40):
@@ -203,7 +203,7 @@ def test_a_dropped_frame_is_the_centre_without_confidence() -> None:
         for frame in (0, 1, 3, 4):
             if bool((batch["confidence"][frame] == 0).all()):
                 dropped += 1
-                for name in ("color", "albedo", "normal"):
+                for name in ("color", "albedo", "normal", "estimate"):
                     assert torch.equal(batch[name][frame], batch[name][2])
             else:
                 kept += 1
@@ -238,7 +238,7 @@ def test_a_whole_frame_is_cut_to_the_multiple() -> None:
     assert batch["color"].shape == (1, 3, 3, 20, 28)
     np.testing.assert_array_equal(batch["target"][0].permute(1, 2, 0).numpy(), clip.target[:20, :28])
     np.testing.assert_array_equal(batch["color"][0].permute(0, 2, 3, 1).numpy(), clip.color[:, :20, :28])
-    np.testing.assert_array_equal(batch["estimate"][0, 0].permute(1, 2, 0).numpy(), clip.estimate[:20, :28])
+    np.testing.assert_array_equal(batch["estimate"][0].permute(0, 2, 3, 1).numpy(), clip.estimate[:, :20, :28])
     np.testing.assert_array_equal(batch["confidence"][0, :, 0].numpy(), clip.confidence[:, :20, :28])
 
 

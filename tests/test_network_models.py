@@ -29,7 +29,7 @@ from network.models import (
 
 pytestmark = pytest.mark.neural
 
-SMALL = KernelConfig(frames=3, size=3, estimate_frames=1)
+SMALL = KernelConfig(frames=3, size=3, estimate_size=1)
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -63,11 +63,11 @@ def small_tkpcn(kernel: KernelConfig = SMALL) -> TKPCN:
 
 @torch.no_grad()
 def run(model: RAUNet | RAResNet, data: dict[str, torch.Tensor], present: float = 0.0) -> torch.Tensor:
-    """Kernels of a window, with an estimate that is its mean."""
+    """Kernels of a window, with estimates that are its mean."""
     n = len(data["color"])
-    takes = model.config.kernel.estimate_frames > 0
+    takes = model.config.kernel.estimate_size > 0
     here = torch.full((n,), present)
-    estimate = data["color"].mean(1, keepdim=True) if takes else None
+    estimate = data["color"].mean(1, keepdim=True).expand_as(data["color"]) if takes else None
     features = network_inputs(
         **data, exposure=window_exposure(data["color"]), takes_estimate=takes, estimate=estimate, present=here
     )
@@ -103,15 +103,17 @@ def test_the_exposure_of_a_black_window_is_one() -> None:
 
 def test_channels_and_their_order() -> None:
     data = window()
-    estimate = uniform(1, 1, 3, 8, 12, seed=9)
+    estimate = uniform(1, 3, 3, 8, 12, seed=9)
     features = network_inputs(**data, exposure=torch.tensor([0.5]), takes_estimate=True, estimate=estimate)
+    log = torch.log1p(estimate / 0.5)
     expected = torch.cat(
         [
             torch.log1p(data["color"] / 0.5),
             torch.log1p(data["albedo"]),
             data["normal"],
             data["confidence"],
-            torch.log1p(estimate / 0.5).expand(1, 3, 3, 8, 12),
+            log,
+            10 * (log - log[:, 1:2]),
             torch.ones(1, 3, 1, 8, 12),
         ],
         2,
@@ -132,11 +134,12 @@ def test_what_is_missing_is_zero() -> None:
 
 def test_an_estimate_that_is_not_present_is_not_seen() -> None:
     data = window(n=2)
-    estimate = uniform(2, 1, 3, 8, 12, seed=9)
+    estimate = uniform(2, 3, 3, 8, 12, seed=9)
     present = torch.tensor([0.0, 1.0])
     features = network_inputs(**data, exposure=torch.ones(2), takes_estimate=True, estimate=estimate, present=present)
     assert not bool(features[0, :, 10:].any())
     torch.testing.assert_close(features[1, 0, 10:13], torch.log1p(estimate[1, 0]))
+    assert not bool(features[1, 1, 13:16].any())  # the centre does not differ from itself
 
 
 def test_features_do_not_depend_on_the_scale_of_the_radiance() -> None:
@@ -196,31 +199,32 @@ def test_without_an_estimate_and_at_full_confidence_the_kernels_start_at_the_mea
     torch.testing.assert_close(kernels, expected)
 
 
-@pytest.mark.parametrize("estimate_frames", [0, 1, 3])
+@pytest.mark.parametrize("estimate_size", [0, 1, 3])
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9])
-def test_the_kernels_start_at_the_confidence_and_half_the_estimate(estimate_frames: int, threshold: float) -> None:
-    config = KernelConfig(frames=3, size=3, estimate_frames=estimate_frames, threshold=threshold)
+def test_the_kernels_start_at_the_confidence_in_both_sources(estimate_size: int, threshold: float) -> None:
+    config = KernelConfig(frames=3, size=3, estimate_size=estimate_size, estimate_share=0.6, threshold=threshold)
     confidence = torch.tensor([0.5, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(2, 3, 1, 4, 4)
     present = torch.tensor([0.0, 1.0])
     kernels = silent_head(config)(torch.zeros(6, 4, 4, 4), confidence, present)
-    share = 0.5 if estimate_frames else 0.0
-    for sample, here in ((0, 0.0), (1, share)):
-        frames = kernels[sample, :27].unflatten(0, (3, 9)).sum(1)
-        expected = torch.tensor([1 / 3, 2 / 3, 0]).view(3, 1, 1).expand(3, 4, 4) * (1 - here)
-        torch.testing.assert_close(frames, expected, rtol=0, atol=2e-3)  # 1e-3 is added to each confidence
-        torch.testing.assert_close(kernels[sample, 27:].sum(0), torch.full((4, 4), here), rtol=0, atol=1e-6)
+    taps = estimate_size**2
+    for sample, here in ((0, 0.0), (1, 0.6 if taps else 0.0)):
+        for part, size, share in ((kernels[sample, :27], 9, 1 - here), (kernels[sample, 27:], taps, here)):
+            if size:
+                frames = part.unflatten(0, (3, size)).sum(1)
+                expected = torch.tensor([1 / 3, 2 / 3, 0]).view(3, 1, 1).expand(3, 4, 4) * share
+                torch.testing.assert_close(frames, expected, rtol=0, atol=2e-3)  # 1e-3 is added to each confidence
 
 
-def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
-    config = KernelConfig(frames=3, size=3, estimate_frames=1, estimate_size=3, estimate_share=0.9)
+def test_an_estimates_taps_start_at_its_own_pixel() -> None:
+    config = KernelConfig(frames=3, size=3, estimate_size=3, estimate_share=0.9)
     kernels = silent_head(config)(torch.zeros(3, 4, 4, 4), torch.ones(1, 3, 1, 4, 4), torch.ones(1))
-    torch.testing.assert_close(kernels[0, 27:, 1, 1], 0.9 * start(3, 0.05))
+    torch.testing.assert_close(kernels[0, 27:, 1, 1], 0.9 / 3 * start(3, 0.0).repeat(3))
     torch.testing.assert_close(kernels[0, :27, 1, 1], 0.1 / 3 * start(3, 0.2).repeat(3))
 
 
 def test_a_correction_reaches_any_kernel() -> None:
     """Also all weight on one tap of a frame without confidence."""
-    config = KernelConfig(frames=3, size=3, estimate_frames=1)
+    config = KernelConfig(frames=3, size=3, estimate_size=1)
     head = silent_head(config)
     with torch.no_grad():
         head.window.bias.fill_(-50)
@@ -231,7 +235,7 @@ def test_a_correction_reaches_any_kernel() -> None:
     features[2] = 0
     confidence = torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(1, 3, 1, 5, 5)
     kernels = head(features, confidence, torch.ones(1))
-    expected = torch.zeros(28)
+    expected = torch.zeros(30)
     expected[18 + 7] = 1
     torch.testing.assert_close(kernels[0, :, 2, 2], expected)
 
@@ -265,14 +269,14 @@ def test_kernels_of_any_window_length_are_kernels(build, frames: int) -> None:  
     model = build(replace(SMALL, frames=frames))
     for present in (0.0, 1.0):
         kernels = run(model, window(n=2, t=frames), present)
-        assert kernels.shape == (2, frames * 9 + 1, 8, 12)
+        assert kernels.shape == (2, frames * 10, 8, 12)
         assert float(kernels.min()) >= 0
         torch.testing.assert_close(kernels.sum(1), torch.ones(2, 8, 12))
-        assert bool(kernels[:, -1].any()) == bool(present)
+        assert bool(kernels[:, -frames:].any()) == bool(present)
 
 
-def test_an_estimate_of_every_frame() -> None:
-    model = small_unet(replace(SMALL, estimate_frames=3, estimate_size=3))
+def test_estimates_and_noisy_frames_share_one_kernel() -> None:
+    model = small_unet(replace(SMALL, estimate_size=3))
     data, estimates = window(), uniform(1, 3, 3, 8, 12, seed=5)
     features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True, estimate=estimates)
     kernels = model(features, data["confidence"], torch.ones(1))
@@ -366,12 +370,12 @@ def test_each_side_must_be_a_multiple(height: int, width: int, axis: str) -> Non
     model = small_unet()
     assert model.multiple == 4
     with pytest.raises(ValueError, match=f"expected a {axis} that is a multiple of 4"):
-        model(torch.zeros(1, 3, 14, height, width), torch.ones(1, 3, 1, height, width), torch.zeros(1))
+        model(torch.zeros(1, 3, 17, height, width), torch.ones(1, 3, 1, height, width), torch.zeros(1))
 
 
-@pytest.mark.parametrize("shape", [(1, 5, 14, 8, 8), (1, 3, 10, 8, 8), (3, 14, 8, 8)])
+@pytest.mark.parametrize("shape", [(1, 5, 17, 8, 8), (1, 3, 10, 8, 8), (3, 17, 8, 8)])
 def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"features: expected \(N, 3, 14, H, W\)"):
+    with pytest.raises(ValueError, match=r"features: expected \(N, 3, 17, H, W\)"):
         small_unet()(torch.zeros(shape), torch.ones(1, 3, 1, 8, 8), torch.zeros(1))
 
 
@@ -380,8 +384,7 @@ def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -
     [
         (lambda: KernelConfig(frames=4), "frames: expected an odd number >= 1, got 4"),
         (lambda: KernelConfig(size=0), "size: expected an odd number"),
-        (lambda: KernelConfig(estimate_size=2), "estimate_size: expected an odd number"),
-        (lambda: KernelConfig(estimate_frames=3), "estimate_frames: expected 0, 1 or 5, got 3"),
+        (lambda: KernelConfig(estimate_size=2), "estimate_size: expected 0 or an odd number, got 2"),
         (lambda: KernelConfig(estimate_share=1.0), "estimate_share: expected 0 < share < 1, got 1.0"),
         (lambda: RAUNetConfig(widths=()), "widths: expected at least one"),
         (lambda: RAUNetConfig(ra_scales=(3,)), "ra_scales: expected scales 0 to 2"),
@@ -406,7 +409,7 @@ def denoised(model: RAUNet, data: dict[str, torch.Tensor], **more: torch.Tensor)
 
 def test_denoising_is_scale_equivariant() -> None:
     model, data = small_unet(), window()
-    estimate = uniform(1, 1, 3, 8, 12, seed=5)
+    estimate = uniform(1, 3, 3, 8, 12, seed=5)
     once = denoised(model, data, estimate=estimate)
     for scale in (1e-3, 37.0, 1e4):
         scaled = denoised(model, {**data, "color": data["color"] * scale}, estimate=estimate * scale)
@@ -439,8 +442,8 @@ def test_a_model_with_an_estimate_also_runs_without() -> None:
 
 
 def test_a_model_without_estimates_ignores_one() -> None:
-    model, data = small_unet(replace(SMALL, estimate_frames=0)), window()
-    with_one = denoised(model, data, estimate=uniform(1, 1, 3, 8, 12, seed=5))
+    model, data = small_unet(replace(SMALL, estimate_size=0)), window()
+    with_one = denoised(model, data, estimate=uniform(1, 3, 3, 8, 12, seed=5))
     assert torch.equal(with_one, denoised(model, data))
 
 
