@@ -141,8 +141,8 @@ def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
     -------
     dict
         PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's),
-        ``gated`` (their average), ``denoised``, and ``blind``, denoised without estimates. ``mean``: radiance of denoised over that of the targets.
-        ``side``: weight of the side frames.
+        ``gated`` (their average), ``denoised``, and ``blind``, denoised without estimates. ``mean``: radiance of
+        denoised over that of the targets. ``side``: weight of the side frames.
     """
     sums: dict[str, float] = {}
     for clip in clips:
