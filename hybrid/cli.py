@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -12,6 +13,7 @@ import typer
 from hybrid.simulate.command import simulate_command
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
+    from hybrid.estimates import EstimateSource
     from hybrid.frames import Shot
     from hybrid.pipeline import Estimator
     from hybrid.plan import Plan
@@ -42,6 +44,14 @@ OnOption = Annotated[
     list[str] | None, typer.Option("--effects", metavar="NAME", help="run a stage, whatever the plan says")
 ]
 OffOption = Annotated[list[str] | None, typer.Option("--no-effects", metavar="NAME", help="do not run a stage")]
+EstimateOption = Annotated[
+    str,
+    typer.Option(
+        metavar="SOURCE",
+        help="denoised single frames to make stable: auto (in the file, else OIDN if installed, else our own), oidn, "
+        "oidn-fast, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
+    ),
+]
 AovOption = Annotated[
     list[str] | None, typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels")
 ]
@@ -86,28 +96,40 @@ def inspect(
 def pseudoref(
     shot: ShotArgument,
     output: OutputOption,
-    preset: Annotated[str, typer.Option(help="draft, balanced or final")] = "balanced",
+    preset: Annotated[str, typer.Option(help="of our own estimate: draft, balanced or final")] = "balanced",
+    estimate: EstimateOption = "none",
     preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
     effects: OnOption = None,
     no_effects: OffOption = None,
 ) -> None:
-    """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too."""
+    """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too.
+
+    With --estimate, pictures that are denoised already, each by itself, are made stable instead.
+    """
+    from hybrid.estimates import choose_estimate
     from hybrid.pipeline import Denoised
-    from hybrid.pseudo_reference import PRESETS, estimate
+    from hybrid.pseudo_reference import PRESETS, gated_average
+    from hybrid.pseudo_reference import estimate as estimate_centre
     from hybrid.timing import Timings
 
     chosen = _choose(PRESETS, preset, "preset")
     opened = _open(shot, frames, layer)
     plan = _plan(opened, effects, no_effects)
     timings = Timings()
+    source = choose_estimate(estimate, opened, own=chosen)
+    if source.estimate is None:
+        make = partial(estimate_centre, preset=chosen, timings=timings)
+    else:
+        make = partial(gated_average, timings=timings)
     _run(
         opened,
         output,
-        lambda aligned: Denoised(estimate(aligned, chosen, timings=timings)),
+        lambda aligned: Denoised(make(aligned)),
         plan,
         timings,
+        source,
         command="pseudoref",
         preset=preset,
         preview=preview,
@@ -123,6 +145,7 @@ def denoise(
     threshold: Annotated[
         float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
     ] = None,
+    estimate: EstimateOption = "auto",
     aov: AovOption = None,
     preview: PreviewOption = None,
     frames: FramesOption = None,
@@ -134,6 +157,7 @@ def denoise(
 ) -> None:
     """Denoise with the Robust Average network."""
     neural = _neural()
+    from hybrid.estimates import choose_estimate
     from hybrid.timing import Timings
 
     opened = _open(shot, frames, layer, aov)
@@ -147,6 +171,7 @@ def denoise(
         denoiser,
         plan,
         timings,
+        choose_estimate(estimate, opened),
         command="denoise",
         preset=preset if weights is None else path.name,
         preview=preview,
@@ -169,7 +194,6 @@ def compare(
 ) -> None:
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
     import tempfile
-    from functools import partial
 
     from rich.console import Console
 
@@ -204,8 +228,9 @@ def prepare(
     target: Annotated[str, typer.Option(help="the same frames with independent noise, and not more of it")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips")],
     name: Annotated[str, typer.Option(help="of the shot; validation shots are chosen by it")],
+    estimate: EstimateOption = "auto",
     pseudo_reference: Annotated[
-        bool, typer.Option(help="take the target's pseudo-reference instead of its noisy frames")
+        bool, typer.Option(help="take the average of the target's estimates instead of its noisy frames")
     ] = False,
     frames: FramesOption = None,
     layer: LayerOption = None,
@@ -216,7 +241,7 @@ def prepare(
     neural = _neural()
     opened, wanted = _open(shot, frames, layer), _open(target, frames, layer)
     output.mkdir(parents=True, exist_ok=True)
-    clips = neural.write_clips(opened, wanted, output, name, pseudo_reference=pseudo_reference)
+    clips = neural.write_clips(opened, wanted, output, name, estimate=estimate, pseudo_reference=pseudo_reference)
     written = len(list(track(clips, "prepare", total=len(opened))))
     typer.echo(f"wrote {written} clips to {output}")
 
@@ -284,6 +309,7 @@ def _run(
     estimator: Estimator,
     plan: Plan,
     timings: Timings,
+    source: EstimateSource,
     *,
     command: str,
     preset: str,
@@ -301,12 +327,21 @@ def _run(
     for decision in plan.decisions:
         if not decision.on:
             console.print(f"  not run: {decision.effect} ({decision.reason})", highlight=False)
-    attributes = {"ravg/command": command, "ravg/preset": preset, "ravg/effects": " ".join(sorted(plan.effects))}
+    console.print(f"estimates: {source.name} ({source.reason})", highlight=False)
+    attributes = {
+        "ravg/command": command,
+        "ravg/preset": preset,
+        "ravg/estimate": source.name,
+        "ravg/effects": " ".join(sorted(plan.effects)),
+    }
     pixels, outliers, finished = 0, 0, None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(command, total=len(shot))
-        for finished in denoise_shot(shot, output, estimator, plan, attributes=attributes, timings=timings):
+        frames = denoise_shot(
+            shot, output, estimator, plan, estimate=source.estimate, attributes=attributes, timings=timings
+        )
+        for finished in frames:
             progress.advance(task)
             pixels += finished.pixels
             outliers += finished.outliers
@@ -330,6 +365,7 @@ def _run(
         report,
         command=command,
         preset=preset,
+        estimate=source.name,
         frames=len(shot),
         pixels=pixels,
         outliers=outliers,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
-OIDN_MODES = {
+OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn": {"quality": "high"},
     "oidn-fast": {"quality": "fast"},
     "oidn-best": {"quality": "high", "prefilter": True},
@@ -96,10 +97,10 @@ def _from_file(frame: Frame) -> Array | None:
     return frame.estimate
 
 
-def _run_oidn(frame: Frame, **mode: object) -> Array:
+def _run_oidn(frame: Frame, **mode: Any) -> Array:
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)
-    return denoise_oidn(replace_nonfinite(frame.color)[0], albedo, normal, **mode)  # type: ignore[arg-type]
+    return denoise_oidn(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
 
 
 def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:

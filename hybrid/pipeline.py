@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid.files import replace_file
 from hybrid.frames import Shot, open_shot, output_path
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import AlignedWindow, Aligner
+from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate
 from hybrid.timing import Timings
 from hybrid.transfer import measure_exposure
 from nlm.average import replace_nonfinite
@@ -62,6 +62,7 @@ def denoise_shot(
     plan: Plan,
     *,
     radius: int = 2,
+    estimate: Estimate = None,
     interpolation: str = "bilinear",
     attributes: Mapping[str, str] | None = None,
     timings: Timings | None = None,
@@ -80,6 +81,8 @@ def denoise_shot(
         Which stages to run.
     radius : int
         Frames on each side of the centre.
+    estimate : function or Preset, optional
+        Where the estimates of single frames come from (`hybrid.estimates`).
     interpolation : str
         Of the warp.
     attributes : mapping of str to str, optional
@@ -98,7 +101,9 @@ def denoise_shot(
         If a frame would be written over its own input.
     """
     timings = timings or Timings()
-    aligner = Aligner(shot, plan.effects, radius=radius, interpolation=interpolation, timings=timings)
+    aligner = Aligner(
+        shot, plan.effects, radius=radius, interpolation=interpolation, estimate=estimate, timings=timings
+    )
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)

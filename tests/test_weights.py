@@ -23,7 +23,7 @@ FRAME = 11
 @pytest.fixture(scope="module")
 def window():
     shot = open_shot(SHOT / "noisy.####.exr")
-    return Aligner(shot, plan_shot(shot).effects).align(FRAME)
+    return Aligner(shot, plan_shot(shot).effects, estimate=FINAL).align(FRAME)
 
 
 @pytest.fixture(scope="module")

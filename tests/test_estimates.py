@@ -1,0 +1,183 @@
+"""Per-frame estimates: where they come from, and what time makes of them."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import Scene
+
+from hybrid import estimates
+from hybrid.cli import main
+from hybrid.estimates import choose_estimate
+from hybrid.frames import open_shot
+from hybrid.metrics import psnr
+from hybrid.pseudo_reference import BALANCED, DRAFT, Aligner, gated_average
+
+EFFECTS = {"demodulate", "outliers", "warp", "gate"}
+SCENE = Scene(frames=5, height=48, width=64)
+MIDDLE = SCENE.first + 2
+
+
+def flickering(frame, seed=0):
+    """A denoiser of single frames: the truth, but for a smooth error of its own in every frame."""
+    rng = np.random.default_rng((seed, frame.number))
+    truth = SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
+    return truth * np.float32(1 + 0.02 * rng.standard_normal())
+
+
+def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
+    asked = []
+
+    def estimate(frame):
+        asked.append(frame.number)
+        return frame.color
+
+    aligner = Aligner(open_shot(SCENE.write(tmp_path)), EFFECTS, estimate=estimate)
+    for number in aligner.shot.numbers:
+        assert aligner.align(number).estimate.shape == (5, SCENE.height, SCENE.width, 3)
+    assert sorted(asked) == list(aligner.shot.numbers)
+
+
+def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_from(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    sliding = Aligner(shot, EFFECTS, estimate=DRAFT)
+    windows = [sliding.align(number) for number in shot.numbers]
+    alone = Aligner(shot, EFFECTS, estimate=DRAFT).align(MIDDLE)
+    np.testing.assert_array_equal(windows[2].estimate, alone.estimate)
+    np.testing.assert_array_equal(gated_average(windows[2]), gated_average(alone))
+
+
+def test_the_centres_estimate_comes_through_unchanged(tmp_path):
+    window = Aligner(open_shot(SCENE.write(tmp_path)), EFFECTS, estimate=flickering).align(MIDDLE)
+    given = flickering(open_shot(tmp_path).read(MIDDLE))
+    np.testing.assert_allclose(window.estimate[2] * window.modulation, given, rtol=1e-6)
+
+
+def test_flicker_is_averaged_away(tmp_path):
+    """Five independent errors: their mean has a fifth of the variance, 7 dB, less where frames lack the pixel."""
+    shot = open_shot(SCENE.write(tmp_path))
+    gain = []
+    for seed in range(4):
+        aligner = Aligner(shot, EFFECTS, estimate=lambda frame, seed=seed: flickering(frame, seed))
+        # Errors of one factor per frame are all that differs; the gate is wide, as the frames are noisy.
+        window = aligner.align(MIDDLE)
+        truth = SCENE.clean(2)["ViewLayer.Combined"]
+        before = np.mean((window.estimate[2] * window.modulation - truth) ** 2)
+        gain.append((before, np.mean((gated_average(window) - truth) ** 2)))
+    before, after = np.mean(gain, axis=0)
+    assert after < before / 2.5
+
+
+def test_light_that_changes_is_not_averaged(tmp_path):
+    """A shadow that falls on the centre frame only: geometry does not see it, the gate does."""
+
+    def shadowed(index, layers):
+        if index == 2:
+            layers["ViewLayer.Combined"][:, :32] *= 0.25
+
+    def estimate(frame):
+        layers = SCENE.clean(frame.number - SCENE.first)
+        shadowed(frame.number - SCENE.first, layers)
+        return layers["ViewLayer.Combined"]
+
+    shot = open_shot(SCENE.write(tmp_path, edit=shadowed))
+    truth = estimate(shot.read(MIDDLE))
+    errors = []
+    for effects in (EFFECTS, EFFECTS - {"gate"}):
+        result = gated_average(Aligner(shot, effects, estimate=estimate).align(MIDDLE))
+        errors.append(np.abs(result - truth)[:, :28].mean() / truth[:, :28].mean())
+    assert errors[0] < 0.02  # of the shadow's light
+    assert errors[1] > 1  # dragged in from the bright frames
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_average_scales_with_the_radiance(tmp_path, scale):
+    plain = gated_average(Aligner(open_shot(SCENE.write(tmp_path / "a")), EFFECTS, estimate=DRAFT).align(MIDDLE))
+    shot = open_shot(SCENE.write(tmp_path / "b", scale=scale))
+    scaled = gated_average(Aligner(shot, EFFECTS, estimate=DRAFT).align(MIDDLE))
+    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3)
+
+
+def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path):
+    def broken(frame):
+        image = flickering(frame)
+        image[5, 5], image[9, 9] = np.nan, -1
+        return image
+
+    shot = open_shot(SCENE.write(tmp_path))
+    result = gated_average(Aligner(shot, EFFECTS, estimate=broken).align(MIDDLE))
+    assert np.isfinite(result).all()
+    assert result.min() >= 0
+    with pytest.raises(ValueError, match=r"estimate of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
+        Aligner(shot, EFFECTS, estimate=lambda frame: np.ones((3, 4, 3), np.float32)).align(MIDDLE)
+    with pytest.raises(ValueError, match=f"frame {MIDDLE} has no estimate"):
+        Aligner(shot, EFFECTS, estimate=lambda frame: None).align(MIDDLE)
+    with pytest.raises(ValueError, match="expected a window with estimates"):
+        gated_average(Aligner(shot, EFFECTS).align(MIDDLE))
+
+
+def test_a_neighbour_without_an_estimate_counts_for_nothing(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    window = Aligner(shot, EFFECTS, estimate=lambda f: None if f.number == MIDDLE + 1 else flickering(f)).align(MIDDLE)
+    assert (window.confidence[3] == 0).all()
+    assert window.confidence[1].max() > 0
+
+
+def denoised(index, layers):
+    """What Cycles writes where it denoises at render time."""
+    layers["ViewLayer.Noisy Image"] = layers["ViewLayer.Combined"]
+    layers["ViewLayer.Combined"] = SCENE.clean(index)["ViewLayer.Combined"]
+
+
+def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeypatch):
+    plain = open_shot(SCENE.write(tmp_path / "plain"))
+    cycles = open_shot(SCENE.write(tmp_path / "cycles", edit=denoised))
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    assert choose_estimate("auto", cycles).name == "file"
+    assert choose_estimate("auto", plain).name == "oidn"
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: False)
+    source = choose_estimate("auto", plain, own=BALANCED)
+    assert (source.name, source.estimate) == ("nlm", BALANCED)
+    assert choose_estimate("none", plain).estimate is None
+    with pytest.raises(ValueError, match="pyoidn is not installed"):
+        choose_estimate("oidn-fast", plain)
+
+
+def test_what_cycles_has_denoised_is_taken_and_stays_what_it_is_at_the_centre(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path, edit=denoised))
+    window = Aligner(shot, EFFECTS, estimate=choose_estimate("auto", shot).estimate).align(MIDDLE)
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    np.testing.assert_allclose(window.estimate[2] * window.modulation, truth, rtol=1e-5)
+
+
+def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    SCENE.write(tmp_path / "clean", clean=True, without={"Vector", "Depth"})
+    source = choose_estimate(str(tmp_path / "clean" / "shot.####.exr"), shot)
+    window = Aligner(shot, EFFECTS, estimate=source.estimate).align(MIDDLE)
+    assert psnr(gated_average(window), SCENE.clean(2)["ViewLayer.Combined"]) > 50
+    replace(SCENE, frames=2).write(tmp_path / "short", clean=True)
+    with pytest.raises(ValueError, match=f"expected frame {MIDDLE}, which the shot has"):
+        choose_estimate(str(tmp_path / "short" / "shot.####.exr"), shot)
+    with pytest.raises(FileNotFoundError):
+        choose_estimate(str(tmp_path / "nothing.####.exr"), shot)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
+def test_oidn_estimates_come_out_stable(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    window = Aligner(shot, EFFECTS, estimate=choose_estimate("oidn", shot).estimate).align(MIDDLE)
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    alone, stable = psnr(window.estimate[2] * window.modulation, truth), psnr(gated_average(window), truth)
+    assert stable > alone > psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)
+
+
+def test_the_command_says_what_was_taken(tmp_path, capfd):
+    folder = SCENE.write(tmp_path / "noisy", edit=denoised)
+    out = tmp_path / "out"
+    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", "auto"]) == 0
+    assert "estimates: file (the file holds a denoised picture)" in capfd.readouterr().err
+    assert open_shot(out).numbers == open_shot(folder).numbers
+    assert '"estimate": "file"' in (out / "ravg.json").read_text(encoding="utf-8")
+    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", str(tmp_path / "no.####.exr")]) == 1
