@@ -37,6 +37,12 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="of the reference; default: all")
     parser.add_argument("--second-reference", action="store_true", help="another one, reference_b, of other seeds")
     parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
+    parser.add_argument(
+        "--defaults",
+        action="store_true",
+        help="as a new Blender file renders: denoised by OIDN with its passes stored, adaptive sampling, indirect "
+        "light clamped at 10, one seed for all frames",
+    )
     parser.add_argument("--compact", action="store_true", help="all channels as half, without the denoising depth")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
@@ -141,13 +147,23 @@ def configure(scene: bpy.types.Scene, threads: int) -> None:
     view_layer.cycles.pass_debug_sample_count = False
 
 
+def set_defaults(scene: bpy.types.Scene) -> None:
+    """What a new file of Blender 5.0 has, where `configure` differs from it."""
+    cycles = scene.cycles
+    cycles.use_denoising, cycles.denoiser = True, "OPENIMAGEDENOISE"
+    cycles.use_adaptive_sampling, cycles.adaptive_threshold = True, 0.01
+    cycles.sample_clamp_indirect = 10
+    scene.view_layers[0].cycles.pass_debug_sample_count = True
+
+
 def render_level(scene: bpy.types.Scene, folder: Path, name: str, spp: int, frames: range, seed: int) -> None:
     scene.cycles.samples = spp
     for frame in frames:
         path = folder / f"{name}.{frame:04d}.exr"
         if path.exists():
             continue
-        scene.cycles.seed = seed * 100_003 + frame  # another seed for every frame and level
+        if not scene.cycles.use_denoising:
+            scene.cycles.seed = seed * 100_003 + frame  # another seed for every frame and level
         scene.frame_set(frame)
         partial = path.with_name(f".{os.getpid()}-{path.name}")
         scene.render.filepath = str(partial)
@@ -177,6 +193,8 @@ def main(argv: list[str]) -> int:
     scene = bpy.context.scene
     scene.camera = bpy.data.objects[options.camera]
     configure(scene, options.threads)
+    if options.defaults:
+        set_defaults(scene)
     set_crop(scene.render, options.film, options.size, options.center)
     first, last = map(int, options.frames.split("-"))
     frames = range(first, last + 1)
@@ -191,6 +209,7 @@ def main(argv: list[str]) -> int:
     if options.reference:
         # Blender 5.0 renders wrong pictures if passes change while it keeps the scene between renders.
         scene.render.use_persistent_data = False
+        scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
         scene.view_layers[0].cycles.denoising_store_passes = False
         scene.view_layers[0].use_pass_z = scene.view_layers[0].use_pass_vector = False
         if options.reference_frames:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +29,7 @@ EFFECTS = {
     "dense-flow": "find the motion in the pictures",
     "refine": "correct the renderer's vectors by TV-L1",
     "gate": "do not average over time where the light itself changes",
+    "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
@@ -41,6 +43,9 @@ REFINE_ABOVE = 0.01
 GATE_ABOVE = 0.002
 # One firefly in a hundred thousand pixels is twenty in a 1080p frame: visible.
 OUTLIERS_ABOVE = 1e-5
+# Correlation of the noise of neighbouring frames at equal pixels. Renders of different seeds stay below 0.1, where
+# unresolved detail of a still picture is all that correlates; one seed for all frames gives 0.5 and more.
+FIXED_NOISE_ABOVE = 0.25
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003
@@ -177,6 +182,7 @@ def plan_shot(shot: Shot) -> Plan:
             GATE_ABOVE,
             "{:.2%} of the picture changes its light between frames" + ("" if has_vectors else " (motion included)"),
         ),
+        _decide_fixed_noise(pairs, single),
         _decide_prefilter(pairs),
         _decide_alpha(shot),
         _decide(
@@ -234,6 +240,17 @@ def _decide_refine(moves: bool, has_vectors: bool, unexplained: float) -> Decisi
     return _decide("refine", unexplained, REFINE_ABOVE, "the vectors leave {:.2%} of the picture unexplained")
 
 
+def _decide_fixed_noise(pairs: list[_Pair], single: bool) -> Decision:
+    if single:
+        return Decision("fixed-noise", False, None, FIXED_NOISE_ABOVE, "no two neighbouring frames")
+    figure = float(np.median([noise_correlation(pair.here, pair.there) for pair in pairs]))
+    words = "the noise of neighbouring frames correlates {:.2f} at equal pixels"
+    if figure > FIXED_NOISE_ABOVE:
+        words += ": the render has one seed for all frames, and time adds little where nothing moves; in Blender, "
+        words += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
+    return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, words)
+
+
 def _decide_prefilter(pairs: list[_Pair]) -> Decision:
     if pairs[0].here.guide is None:
         return Decision("prefilter", False, None, GUIDE_NOISE_ABOVE, "no guides in the file")
@@ -270,6 +287,38 @@ def _unexplained(pair: _Pair, vectors: tuple[Array, NDArray[np.bool_]] | None) -
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
     # noise brings one in a thousand.
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
+
+
+def noise_correlation(a: PreparedFrame, b: PreparedFrame) -> float:
+    """Correlation of the noise of two frames at equal pixels.
+
+    Parameters
+    ----------
+    a, b : PreparedFrame
+        Of one size, prepared with "gate", which estimates their light.
+
+    Returns
+    -------
+    float
+        In [−1, 1]; 0 where either has no noise.
+
+    Notes
+    -----
+    Noise is what the frame differs from its own smoothed light by, relative to that light, less its 5×5 mean, which
+    holds what the smoothing has lost. It is clipped at three times its median size: fireflies must not decide.
+    """
+    signals = []
+    for frame in (a, b):
+        light = _light_of(frame).mean(axis=-1)
+        # A hundredth of the exposure, so that black corners do not divide by nothing.
+        floor = 0.01 * measure_exposure(light[..., None])
+        noise = (frame.irradiance.mean(axis=-1) - light) / (light + floor)
+        noise = noise - cv2.blur(noise, (5, 5))
+        limit = 3 * float(np.median(np.abs(noise)))
+        signals.append(np.clip(noise, -limit, limit))
+    first, second = (signal - signal.mean() for signal in signals)
+    power = float(np.sqrt(np.mean(first**2) * np.mean(second**2)))
+    return float(np.mean(first * second)) / power if power > 0 else 0.0
 
 
 def _light_of(frame: PreparedFrame) -> Array:

@@ -33,6 +33,9 @@ Mask = NDArray[np.bool_]
 ALPHA = "alpha"
 # Where the confidence is below this, the centre's estimate takes the place of a neighbour's by and by.
 DISTRUSTED = 0.1
+# With one seed for all frames a neighbour's noise is the centre's until the picture has moved so far, pixels: a
+# bilinear sample half a pixel away still shares its noise, one and a half pixels away hardly.
+SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 # Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
 HIDDEN = 3.0
 
@@ -460,7 +463,7 @@ class Aligner:
         """Confidence in a warped neighbour, from geometry."""
         # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
         valid = link[1] & (warped["valid"][..., 0] > 0.999)
-        return estimate_confidence(
+        confidence = estimate_confidence(
             link[0],
             inside=inside,
             reverse=back if "warp" in self.effects else None,
@@ -470,6 +473,10 @@ class Aligner:
             warped_normal=warped.get("normal"),
             valid=valid,
         )
+        if "fixed-noise" in self.effects:
+            distance = np.hypot(link[0][..., 0], link[0][..., 1])
+            confidence *= np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
+        return confidence
 
     def _finish(
         self, centre: PreparedFrame, window: dict[str, Array], estimates: Array | None, confidence: Array
