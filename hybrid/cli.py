@@ -386,7 +386,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         app(args=None if argv is None else list(argv), prog_name="ravg")
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0
-    except (ValueError, OSError) as error:
+    except ModuleNotFoundError:
+        raise  # a broken installation, not something optional that is missing
+    except (ValueError, OSError, ImportError) as error:
         typer.echo(f"error: {_one_line(error)}", err=True)
         return 1
     return 0

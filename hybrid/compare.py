@@ -26,11 +26,12 @@ from rich.table import Table
 
 from flow.motion import forward_backward_error, normalize_motion
 from flow.warp import warp
+from hybrid.estimates import choose_estimate
 from hybrid.frames import Frame, Shot
 from hybrid.metrics import Reference, flip, mean_bias, psnr, relmse, smape, ssim, temporal_psnr
 from hybrid.oidn import Quality, denoise_oidn
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate
+from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate, gated_average
 from hybrid.results import (
     METRICS,
     MethodResult,
@@ -108,12 +109,20 @@ def aligned_robust_average(aligned: AlignedWindow) -> Array:
     return robust_average(aligned.color, aligned.confidence) * aligned.modulation
 
 
-def network(shot: Shot, *, preset: str) -> Iterator[tuple[int, Array]]:
-    """The Robust Average network with the weights of a preset."""
+def gated(shot: Shot, *, source: str) -> Iterator[tuple[int, Array]]:
+    """Estimates of single frames, averaged where the light is the same."""
+    aligner = Aligner(shot, plan_shot(shot).effects, estimate=choose_estimate(source, shot).estimate)
+    for number in shot.numbers:
+        yield number, gated_average(aligner.align(number))
+
+
+def network(shot: Shot, *, preset: str, source: str) -> Iterator[tuple[int, Array]]:
+    """The Robust Average network with the weights of a preset, on estimates from `source`."""
     from hybrid import neural  # torch may be absent
 
     denoiser = neural.Denoiser(neural.shipped_weights(preset))
-    aligner = Aligner(shot, plan_shot(shot).effects, radius=denoiser.radius)
+    estimate = choose_estimate(source, shot).estimate
+    aligner = Aligner(shot, plan_shot(shot).effects, radius=denoiser.radius, estimate=estimate)
     for number in shot.numbers:
         yield number, denoiser(aligner.align(number)).color
 
@@ -123,7 +132,10 @@ METHODS: dict[str, Method] = {
     "aligned average": partial(classical, estimator=aligned_average),
     "aligned robust average": partial(classical, estimator=aligned_robust_average),
     **{name: partial(classical, estimator=partial(estimate, preset=preset)) for name, preset in PRESETS.items()},
-    "network fast": partial(network, preset="fast"),
+    "gated": partial(gated, source="nlm"),
+    "gated OIDN": partial(gated, source="oidn"),
+    "network fast": partial(network, preset="fast", source="nlm"),
+    "network fast, OIDN": partial(network, preset="fast", source="oidn"),
     "OIDN high": partial(oidn, quality="high"),
     "OIDN best": partial(oidn, quality="high", prefilter=True),
 }
@@ -134,7 +146,8 @@ FAMILIES = {
     **dict.fromkeys(("aligned average", "aligned robust average"), "Averages"),
     **dict.fromkeys(PRESETS, "Pseudo-references"),
     **dict.fromkeys(("OIDN high", "OIDN best"), "OIDN"),
-    "network fast": "Networks",
+    **dict.fromkeys(("gated", "gated OIDN"), "Gated averages"),
+    **dict.fromkeys(("network fast", "network fast, OIDN"), "Networks"),
 }
 
 

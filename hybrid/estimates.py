@@ -63,8 +63,10 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
 
     Raises
     ------
+    ImportError
+        If OIDN is asked for by name and not installed.
     ValueError
-        If OIDN is asked for by name and not installed, or a sequence lacks frames of the shot.
+        If a sequence lacks frames of the shot.
     FileNotFoundError
         If there is no such sequence.
     """
@@ -80,7 +82,7 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
         return EstimateSource("nlm", own, "asked for")
     if spec in OIDN_MODES:
         if not _has_oidn():
-            raise ValueError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
+            raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
         return EstimateSource(spec, partial(_run_oidn, **OIDN_MODES[spec]), "asked for")
     sequence = open_shot(spec)
     missing = [number for number in shot.numbers if not sequence.has(number)]

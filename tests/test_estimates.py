@@ -140,7 +140,7 @@ def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeyp
     source = choose_estimate("auto", plain, own=BALANCED)
     assert (source.name, source.estimate) == ("nlm", BALANCED)
     assert choose_estimate("none", plain).estimate is None
-    with pytest.raises(ValueError, match="pyoidn is not installed"):
+    with pytest.raises(ImportError, match="pyoidn is not installed"):
         choose_estimate("oidn-fast", plain)
 
 

@@ -4,6 +4,7 @@ from conftest import Scene
 
 from hybrid.frames import open_shot
 from hybrid.plan import EFFECTS, plan_shot
+from hybrid.pseudo_reference import Aligner
 
 
 def decisions(folder):
@@ -93,3 +94,37 @@ def test_the_user_may_force_what_was_measured(shot_folder):
 def test_forcing_nonsense_is_refused(shot_folder, on, off):
     with pytest.raises(ValueError, match=r"wrap|both"):
         plan_shot(open_shot(shot_folder)).force(on=on, off=off)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_noise_that_stands_still_on_the_screen_is_found(tmp_path, moving, fixed):
+    """One seed for all frames: the grain is a function of the pixel, not of the frame."""
+    scene = Scene(height=64, width=96, frames=4, step=(2, 1) if moving else (0, 0))
+
+    def one_seed(index, layers):
+        grain = np.random.default_rng(5).gamma(11, 1 / 11, (scene.height, scene.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = scene.clean(index)["ViewLayer.Combined"] * grain
+
+    shot = open_shot(scene.write(tmp_path, edit=one_seed if fixed else None))
+    decision = next(d for d in plan_shot(shot).decisions if d.effect == "fixed-noise")
+    assert decision.on == fixed
+    assert ("Animate Seed" in decision.reason) == fixed
+
+
+def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_path):
+    scene = Scene(height=48, width=64, frames=5, step=(0, 0))
+
+    def one_seed(index, layers):
+        grain = np.random.default_rng(5).gamma(11, 1 / 11, (scene.height, scene.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = scene.clean(index)["ViewLayer.Combined"] * grain
+
+    shot = open_shot(scene.write(tmp_path, edit=one_seed))
+    effects = {"demodulate", "warp", "fixed-noise"}
+    window = Aligner(shot, effects).align(scene.first + 2)
+    assert (window.confidence[[0, 1, 3, 4]] == 0).all()
+    trusting = Aligner(shot, effects - {"fixed-noise"}).align(scene.first + 2)
+    assert trusting.variance.max() < 1e-10  # five times the same picture
+    # Grain of a standard deviation of 0.3: what is left of it says so, within what a 5×5 box of it varies.
+    truth = (0.3 * scene.clean(2)["ViewLayer.Combined"] / window.modulation) ** 2
+    assert np.median(window.variance / truth) == pytest.approx(1, abs=0.35)
