@@ -34,7 +34,9 @@ FramesOption = Annotated[str | None, typer.Option("--frames", metavar="RANGE", h
 LayerOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--layer", metavar="ROLE=LAYER", help="take a layer for color, albedo, normal, depth, motion, variance"
+        "--layer",
+        metavar="ROLE=LAYER",
+        help="take a layer for color, albedo, normal, depth, motion, variance, half_a, half_b, estimate",
     ),
 ]
 PreviewOption = Annotated[

@@ -411,6 +411,8 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "depth": ("denoising depth", "depth", "z", "zdepth", ""),
     "motion": ("vector", "motion"),
     "variance": ("variance", "mse"),
+    "half_a": ("half a", "half_a"),
+    "half_b": ("half b", "half_b"),
     "alpha": (),
     "estimate": ("denoised", "estimate"),
 }
@@ -422,7 +424,8 @@ class Layers:
     """Which channels of a file are taken for what; None where there is nothing.
 
     A layer here holds just the channels that are used: three for `color`, `albedo`, `normal`, `estimate`, one
-    or three for `variance`, one for `depth` and `alpha`, four or two for `motion`.
+    or three for `variance`, one for `depth` and `alpha`, four or two for `motion`. `half_a` and `half_b` are the color
+    of two independent halves of the samples, whose difference gives the variance.
 
     `target` is where the denoised picture belongs: the color itself, except where Cycles denoised already:
     there the color is ``Noisy Image``, which stays, and ``Combined`` is replaced.
@@ -441,6 +444,8 @@ class Layers:
     depth: Layer | None = None
     motion: Layer | None = None
     variance: Layer | None = None
+    half_a: Layer | None = None
+    half_b: Layer | None = None
     alpha: Layer | None = None
     estimate: Layer | None = None
     motion_convention: str | None = None
@@ -510,6 +515,8 @@ _NEEDS = {
     "depth": "it needs one channel, or Z",
     "motion": "it needs channels X, Y, Z and W, or two (X Y, U V or R G)",
     "variance": "it needs channels R, G and B, or one channel",
+    "half_a": "it needs channels R, G and B",
+    "half_b": "it needs channels R, G and B",
     "alpha": "it needs one channel, or A",
 }
 
@@ -522,6 +529,8 @@ _COMPONENTS = {
     "depth": ["Z"],
     "motion": ["XYZW", "XY", "UV", "RG"],
     "variance": ["RGB"],
+    "half_a": ["RGB"],
+    "half_b": ["RGB"],
     "alpha": ["A"],
 }
 
@@ -580,7 +589,7 @@ _LACK = {
     "normal": "edges between surfaces of one color are held by color alone",
     "depth": "edges between surfaces of one color and direction are held by color alone",
     "motion": "flow is estimated from the picture: slower, and less exact",
-    "variance": "noise is estimated from the window",
+    "variance": "noise is estimated from half buffers where there are two, else from the window",
     "alpha": "nothing, if the picture has no transparent parts",
     "estimate": "moving light is told from noise by noisy frames alone",
 }
@@ -594,6 +603,8 @@ def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
     rows = []
     for role in ROLES:
         layer = getattr(layers, role)
+        if layer is None and role in ("half_a", "half_b"):
+            continue  # rare: nothing is wrong without them
         if layer is None:
             rows.append((role, "missing", _LACK[role]))
         else:

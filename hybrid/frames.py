@@ -16,6 +16,7 @@ import fileseq
 import numpy as np
 
 from hybrid.exr import ROLES, ExrError, ExrImage, Layer, Layers, Part, find_layers, read_exr, write_exr
+from nlm.variance import variance_from_halves
 
 # One "#" or "@" is one digit, as in Nuke, RV and ffmpeg's %04d.
 _PADDING = fileseq.PAD_STYLE_HASH1
@@ -453,6 +454,9 @@ def _frame(
         taken[role] = np.ascontiguousarray(taken[role][..., 0])
     if "variance" in taken and taken["variance"].shape[2] == 1:
         taken["variance"] = np.repeat(taken["variance"], 3, axis=2)
+    halves = taken.pop("half_a", None), taken.pop("half_b", None)
+    if "variance" not in taken and halves[0] is not None and halves[1] is not None:
+        taken["variance"] = variance_from_halves(halves[0], halves[1])
     return Frame(
         number=number,
         **taken,

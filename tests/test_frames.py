@@ -147,6 +147,20 @@ def test_frame_has_all_roles_with_their_shapes(tmp_path):
     assert frame.source == tmp_path / "a.0001.exr"
 
 
+def test_two_half_buffers_give_the_variance_where_there_is_none(tmp_path):
+    rng = np.random.default_rng(0)
+    layers = {f"ViewLayer.{name}": rng.random((*SIZE, 3), np.float32) for name in ("Combined", "Half A", "Half B")}
+    write_layers(tmp_path / "a.0001.exr", layers, half=False)
+    frame = open_shot(tmp_path).read(1)
+    difference = layers["ViewLayer.Half A"] - layers["ViewLayer.Half B"]
+    np.testing.assert_allclose(frame.variance, difference**2 / 4, rtol=1e-6)
+    np.testing.assert_array_equal(frame.color, layers["ViewLayer.Combined"])
+    write_layers(tmp_path / "a.0001.exr", layers | {"ViewLayer.Variance": layers["ViewLayer.Combined"]}, half=False)
+    np.testing.assert_array_equal(open_shot(tmp_path).read(1).variance, layers["ViewLayer.Combined"])
+    write_layers(tmp_path / "a.0001.exr", {k: v for k, v in layers.items() if "B" not in k}, half=False)
+    assert open_shot(tmp_path).read(1).variance is None
+
+
 def test_variance_of_one_channel_holds_for_all_three(tmp_path):
     write_layers(tmp_path / "a.exr", {"color": image(1), "variance": image(0.5, 1)})
     np.testing.assert_array_equal(open_shot(tmp_path / "a.exr").read(1).variance, image(0.5))
