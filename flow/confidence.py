@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import cv2
 import numpy as np
 
@@ -20,7 +22,9 @@ def _agree_albedo(albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: n
     """exp(-d² / σ²) of the difference, relative where the albedo is above 1 (emitters, sky)."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.atleast_3d(albedo - warped)
-        greatest = np.maximum(np.atleast_3d(albedo).max(axis=-1), np.atleast_3d(warped).max(axis=-1))
+        # Plane by plane: several times faster than a reduction over so short an axis.
+        planes = (image[..., c] for image in map(np.atleast_3d, (albedo, warped)) for c in range(image.shape[-1]))
+        greatest = reduce(np.maximum, planes)
         scale = np.square(np.maximum(greatest, 1))
         # Two noisy values differ by √2 times their noise; twice that costs no more than 1/e.
         tolerated = np.square(sigma) + 8 * np.square(noise) / scale

@@ -71,7 +71,7 @@ def measure_exposure(radiance: Array) -> float:
         Positive, and proportional to the image, so that what is divided by it does not depend on the image's
         scale. 1 for an image without light.
     """
-    level = radiance.mean(axis=-1).ravel()
+    level = np.einsum("...c->...", radiance).ravel() / np.float32(radiance.shape[-1])
     level = level[np.isfinite(level)]
     if level.size == 0:
         return 1.0

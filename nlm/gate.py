@@ -75,12 +75,13 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
 
 def _tone_map(image: Floats, exposure: float) -> tuple[Floats, Mask]:
     """x / (x + exposure) in [0, 1), 0 at non-finite pixels, and where the image is finite."""
-    finite: Mask = np.all(np.isfinite(image), axis=-1, keepdims=True)
-    x = np.where(finite, np.maximum(image, 0), np.float32(0))
+    # einsum: several times faster than a reduction over so short an axis
+    finite: Mask = np.isfinite(np.einsum("...c->...", image))
+    x = np.where(finite[..., None], np.maximum(image, 0), np.float32(0))
     # exposure / (x + exposure) and not x / …: it cannot overflow
     mapped = 1 - np.float32(exposure) / (x + np.float32(exposure))
-    return np.asarray(mapped, np.float32), finite[..., 0]
+    return np.asarray(mapped, np.float32), finite
 
 
 def _mean_square(x: Floats) -> Floats:
-    return np.asarray(np.mean(np.square(x), axis=-1), np.float32)
+    return np.asarray(np.einsum("...c,...c->...", x, x) / np.float32(x.shape[-1]), np.float32)
