@@ -54,6 +54,9 @@ EstimateOption = Annotated[
         "oidn-fast, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
     ),
 ]
+KeepOption = Annotated[
+    str | None, typer.Option("--keep-estimates", metavar="OUT", help="keep OIDN's pictures, and take them from there")
+]
 AovOption = Annotated[
     list[str] | None, typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels")
 ]
@@ -100,6 +103,7 @@ def pseudoref(
     output: OutputOption,
     preset: Annotated[str, typer.Option(help="of our own estimate: draft, balanced or final")] = "balanced",
     estimate: EstimateOption = "none",
+    keep_estimates: KeepOption = None,
     preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
@@ -120,7 +124,7 @@ def pseudoref(
     opened = _open(shot, frames, layer)
     plan = _plan(opened, effects, no_effects)
     timings = Timings()
-    source = choose_estimate(estimate, opened, own=chosen)
+    source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     if source.estimate is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -148,6 +152,7 @@ def denoise(
         float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
     ] = None,
     estimate: EstimateOption = "auto",
+    keep_estimates: KeepOption = None,
     aov: AovOption = None,
     preview: PreviewOption = None,
     frames: FramesOption = None,
@@ -173,7 +178,7 @@ def denoise(
         denoiser,
         plan,
         timings,
-        choose_estimate(estimate, opened),
+        choose_estimate(estimate, opened, kept=keep_estimates),
         command="denoise",
         preset=preset if weights is None else path.name,
         preview=preview,

@@ -7,6 +7,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.frames import Frame, Shot, open_shot
+from hybrid.frames import Frame, Shot, open_shot, output_path
 from hybrid.oidn import denoise_oidn
 from hybrid.pseudo_reference import FINAL, Estimate, Preset
 from nlm.average import replace_nonfinite
@@ -47,7 +48,7 @@ class EstimateSource:
     reason: str
 
 
-def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSource:
+def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | None = None) -> EstimateSource:
     """Find the estimates that are asked for.
 
     Parameters
@@ -60,6 +61,8 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
         The noisy shot.
     own : Preset
         Of our own estimate.
+    kept : str, optional
+        Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder.
 
     Raises
     ------
@@ -74,7 +77,7 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", _from_file, "the file holds a denoised picture")
         if _has_oidn():
-            return EstimateSource("oidn", partial(_run_oidn, **OIDN_MODES["oidn"]), "OIDN is installed")
+            return EstimateSource("oidn", _oidn("oidn", shot, kept), "OIDN is installed")
         return EstimateSource("nlm", own, "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
@@ -83,7 +86,7 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
     if spec in OIDN_MODES:
         if not _has_oidn():
             raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
-        return EstimateSource(spec, partial(_run_oidn, **OIDN_MODES[spec]), "asked for")
+        return EstimateSource(spec, _oidn(spec, shot, kept), "asked for")
     sequence = open_shot(spec)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
@@ -93,6 +96,11 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL) -> EstimateSo
 
 def _has_oidn() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
+
+
+def _oidn(mode: str, shot: Shot, kept: str | None) -> Callable[[Frame], Array]:
+    run = partial(_run_oidn, **OIDN_MODES[mode])
+    return run if kept is None else partial(_run_or_read, run=run, shot=shot, kept=kept)
 
 
 def _from_file(frame: Frame) -> Array | None:
@@ -107,4 +115,21 @@ def _run_oidn(frame: Frame, **mode: Any) -> Array:
 
 def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:
     # Neighbours outside the frames that were asked for may be missing: they then count for nothing.
-    return sequence.read(frame.number).color if sequence.has(frame.number) else None
+    return _denoised(sequence, frame.number) if sequence.has(frame.number) else None
+
+
+def _denoised(sequence: Shot, number: int) -> Array:
+    """A finished frame; where Cycles has denoised, the file's color is the noisy image beside it."""
+    found = sequence.read(number)
+    return found.color if found.estimate is None else found.estimate
+
+
+def _run_or_read(frame: Frame, *, run: Callable[[Frame], Array], shot: Shot, kept: str) -> Array:
+    """What an earlier run has left on disk, or what is left there now."""
+    path = output_path(kept, shot, frame.number)
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shot.write(path, frame.number, {"color": run(frame)})
+    # Read back also what was just written, half as it may be: every run then sees the same.
+    sequence = open_shot(path)
+    return _denoised(sequence, sequence.numbers[0])

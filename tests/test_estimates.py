@@ -164,6 +164,26 @@ def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
         choose_estimate(str(tmp_path / "nothing.####.exr"), shot)
 
 
+def test_of_a_sequence_that_cycles_has_denoised_the_denoised_picture_is_taken(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    SCENE.write(tmp_path / "cycles", edit=denoised)
+    source = choose_estimate(str(tmp_path / "cycles"), shot)
+    np.testing.assert_array_equal(source.estimate(shot.read(MIDDLE)), SCENE.clean(2)["ViewLayer.Combined"])
+
+
+def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    sources = [choose_estimate("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
+    images = [source.estimate(shot.read(MIDDLE)) for source in sources]
+    assert len(made) == 1
+    assert (tmp_path / f"kept.{MIDDLE}.exr").is_file()
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_allclose(images[0], 0.5 * shot.read(MIDDLE).color, rtol=1e-3)
+
+
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_estimates_come_out_stable(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
