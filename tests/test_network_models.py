@@ -195,14 +195,13 @@ def start(size: int, spread: float) -> torch.Tensor:
 def test_without_an_estimate_and_at_full_confidence_the_kernels_start_at_the_mean_over_time() -> None:
     config = KernelConfig()
     kernels = silent_head(config)(torch.zeros(5, 4, 6, 6), torch.ones(1, 5, 1, 6, 6), torch.zeros(1))
-    expected = (start(5, 0.2) / 5).repeat(5).view(1, 125, 1, 1).expand(1, 125, 6, 6)
+    expected = torch.full((1, 125, 6, 6), 1 / 125)
     torch.testing.assert_close(kernels, expected)
 
 
 @pytest.mark.parametrize("estimate_size", [0, 1, 3])
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9])
-def test_the_kernels_start_at_the_confidence_in_both_sources(estimate_size: int, threshold: float) -> None:
-    config = KernelConfig(frames=3, size=3, estimate_size=estimate_size, estimate_share=0.6, threshold=threshold)
+def test_the_kernels_start_at_the_confidence_in_both_sources(estimate_size: int) -> None:
+    config = KernelConfig(frames=3, size=3, estimate_size=estimate_size, estimate_share=0.6, threshold=0)
     confidence = torch.tensor([0.5, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(2, 3, 1, 4, 4)
     present = torch.tensor([0.0, 1.0])
     kernels = silent_head(config)(torch.zeros(6, 4, 4, 4), confidence, present)
@@ -215,29 +214,25 @@ def test_the_kernels_start_at_the_confidence_in_both_sources(estimate_size: int,
                 torch.testing.assert_close(frames, expected, rtol=0, atol=2e-3)  # 1e-3 is added to each confidence
 
 
-def test_an_estimates_taps_start_at_its_own_pixel() -> None:
-    config = KernelConfig(frames=3, size=3, estimate_size=3, estimate_share=0.9)
+def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
+    config = KernelConfig(frames=3, size=3, estimate_size=3, estimate_share=0.9, spread=0.2, threshold=0)
     kernels = silent_head(config)(torch.zeros(3, 4, 4, 4), torch.ones(1, 3, 1, 4, 4), torch.ones(1))
-    torch.testing.assert_close(kernels[0, 27:, 1, 1], 0.9 / 3 * start(3, 0.0).repeat(3))
+    torch.testing.assert_close(kernels[0, 27:, 1, 1], 0.9 / 3 * start(3, 0.01).repeat(3))
     torch.testing.assert_close(kernels[0, :27, 1, 1], 0.1 / 3 * start(3, 0.2).repeat(3))
 
 
-def test_a_correction_reaches_any_kernel() -> None:
-    """Also all weight on one tap of a frame without confidence."""
+def test_a_correction_reaches_nearly_any_kernel_but_no_frame_without_confidence() -> None:
+    """Nearly all weight on one tap at the edge of a noisy frame; a frame that is not trusted stays out all the same."""
     config = KernelConfig(frames=3, size=3, estimate_size=1)
     head = silent_head(config)
     with torch.no_grad():
         head.window.bias.fill_(-50)
         head.window.bias[7] = 50
         head.estimate.bias.fill_(-50)
-        head.window.weight[7, 0, 1, 1] = -200  # and only where the feature is not 1: in frame 2
-    features = torch.ones(3, 4, 5, 5)
-    features[2] = 0
     confidence = torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(1, 3, 1, 5, 5)
-    kernels = head(features, confidence, torch.ones(1))
-    expected = torch.zeros(30)
-    expected[18 + 7] = 1
-    torch.testing.assert_close(kernels[0, :, 2, 2], expected)
+    kernels = head(torch.ones(3, 4, 5, 5), confidence, torch.ones(1))[0, :, 2, 2].detach()
+    assert float(kernels[[7, 9 + 7]].sum()) > 0.95
+    assert not bool(kernels[18:27].any())  # below the threshold: not small but nothing
 
 
 def test_a_higher_threshold_at_run_time_uses_fewer_taps() -> None:
@@ -276,7 +271,7 @@ def test_kernels_of_any_window_length_are_kernels(build, frames: int) -> None:  
 
 
 def test_estimates_and_noisy_frames_share_one_kernel() -> None:
-    model = small_unet(replace(SMALL, estimate_size=3))
+    model = small_unet(replace(SMALL, estimate_size=3, threshold=0))
     data, estimates = window(), uniform(1, 3, 3, 8, 12, seed=5)
     features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True, estimate=estimates)
     kernels = model(features, data["confidence"], torch.ones(1))
@@ -385,7 +380,8 @@ def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -
         (lambda: KernelConfig(frames=4), "frames: expected an odd number >= 1, got 4"),
         (lambda: KernelConfig(size=0), "size: expected an odd number"),
         (lambda: KernelConfig(estimate_size=2), "estimate_size: expected 0 or an odd number, got 2"),
-        (lambda: KernelConfig(estimate_share=1.0), "estimate_share: expected 0 < share < 1, got 1.0"),
+        (lambda: KernelConfig(estimate_share=1.5), "estimate_share: expected 0 < estimate_share <= 1, got 1.5"),
+        (lambda: KernelConfig(spread=0.0), "spread: expected 0 < spread <= 1, got 0.0"),
         (lambda: RAUNetConfig(widths=()), "widths: expected at least one"),
         (lambda: RAUNetConfig(ra_scales=(3,)), "ra_scales: expected scales 0 to 2"),
         (lambda: RAResNetConfig(ra_after=(3, 25)), "ra_after: expected ascending blocks 1 to 24"),
