@@ -171,20 +171,28 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     return numerators, denominators
 
 
-def filter_window(kernels: Tensor, color: Tensor, size: int, estimate: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Apply kernels that span the noisy window and, where there is one, the estimate.
+def filter_window(
+    kernels: Tensor,
+    color: Tensor,
+    size: int,
+    estimate: Tensor | None = None,
+    confidence: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Apply kernels that span the noisy window and, where there are any, the estimates.
 
     Parameters
     ----------
     kernels : Tensor
-        ``(N, taps, H, W)``: T·K·K taps of the window, then those of the estimate.
+        ``(N, taps, H, W)``: T·K·K taps of the window, then those of the estimates.
     color : Tensor
         ``(N, T, C, H, W)`` aligned window: what the kernels were predicted for, or an AOV warped with it.
     size : int
         K of the window's taps.
     estimate : Tensor, optional
-        ``(N, T, C, H, W)``, the estimates of the frames, of the same quantity as color. Without (an AOV that has
-        none) their taps are left out, and dividing renormalises the others.
+        ``(N, T, C, H, W)``, the estimates of the frames, of the same quantity as color; zeros for a sample that has
+        none. Without (an AOV that has none) their taps are left out, and dividing renormalises the others.
+    confidence : Tensor, optional
+        ``(N, T, 1, H, W)``, by which color was mixed with its centre frame; comes with estimate.
 
     Returns
     -------
@@ -196,16 +204,25 @@ def filter_window(kernels: Tensor, color: Tensor, size: int, estimate: Tensor | 
     ------
     ValueError
         If the shapes do not fit together.
+
+    Notes
+    -----
+    With estimates e, the tap at x + d of a noisy frame n stands for ``n(x + d) − e(x + d) + e(x)``: what the estimate
+    knows of the way from there to here is not blurred, and the taps average nothing but what it has missed.
     """
     frames = color.shape[1]
     taps = frames * size * size
-    numerators, denominators = apply_kernels(kernels[:, :taps], color)
     if estimate is None:
-        return numerators, denominators
+        return apply_kernels(kernels[:, :taps], color)
     if estimate.shape[1] != frames:
         raise ValueError(f"estimate: expected {frames} frames, got {estimate.shape[1]}")
+    if confidence is None:
+        raise ValueError("confidence: expected one beside estimate, got none")
+    centre = estimate[:, frames // 2, None]
+    mixed = centre + confidence * (estimate - centre)
+    numerators, denominators = apply_kernels(kernels[:, :taps], color - mixed)
     more, share = apply_kernels(kernels[:, taps:], estimate)
-    return numerators + more, denominators + share
+    return numerators + denominators * mixed + more, denominators + share
 
 
 def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:

@@ -132,12 +132,12 @@ class KernelHead(nn.Module):
     The raw weight of tap i is ``b_i c_i e^{h_i}``, which is normalised and thresholded. b is the kernel at the start:
     on each noisy frame a peak on the pixel itself and the rest (`KernelConfig.spread`) on all its taps, on each
     estimate nearly all on the pixel itself, times the share of the source; c is the confidence of the frame; h is what
-    the convolution predicts, bounded to ±4. The training thus starts from the gated average of the estimates with a
-    little of the same average of the noisy frames, or without estimates from the mean over time and the taps; blur is
-    what costs at the start: a 3×3 mean of an estimate loses 3 dB on a clean shot. A tap may gain or lose a factor of
-    55, and what falls below the threshold is gone; but what has no confidence stays out, whatever is predicted. With
-    sums ``b_i c_i + h_i`` some weight leaked to the taps beside every edge and to frames that were not to be trusted,
-    and a shot with sharp outlines came out 0.6 dB below the start.
+    the convolution predicts, bounded to ±4 on the noisy frames and ±1 on the estimates. The training thus starts from
+    the gated average of the estimates with a tenth of the noisy frames, or without estimates from the mean over time
+    and the taps. A noisy tap may gain or lose a factor of 55, and what falls below the threshold is gone; but what has
+    no confidence stays out, whatever is predicted. With sums ``b_i c_i + h_i``, and with taps around the pixel on the
+    estimates too, some weight leaked past every edge and to frames that were not to be trusted: a shot with sharp
+    outlines came out 0.6 dB below the start.
     """
 
     window_start: Tensor
@@ -181,10 +181,10 @@ class KernelHead(nn.Module):
         share = (config.estimate_share * here).unsqueeze(1)
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         confidence = confidence.float() + 1e-3
-        factor = _factor(_frames_first(self.window(features), config.frames))
+        factor = _factor(_frames_first(self.window(features), config.frames), 4)
         weights = ((1 - share) / config.window_taps * confidence * self.window_start * factor).flatten(1, 2)
         if self.estimate is not None:
-            factor = _factor(_frames_first(self.estimate(features), config.frames))
+            factor = _factor(_frames_first(self.estimate(features), config.frames), 1)
             more = share / config.estimate_taps * confidence * self.estimate_start * factor
             weights = torch.cat([weights, more.flatten(1, 2)], 1)
         cut = config.threshold if threshold is None else _check_threshold(threshold)
@@ -362,7 +362,7 @@ def fast(frames: int = 5, seed: int = 0) -> RAUNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         # The threshold: noisy taps start at a hundredth of the mean weight, and must not be cut before they learn.
-        kernel = KernelConfig(frames=frames, estimate_size=1, spread=0.2, threshold=0.005)
+        kernel = KernelConfig(frames=frames, estimate_size=1, estimate_share=0.9, threshold=0.005)
         return RAUNet(RAUNetConfig(kernel))
 
 
@@ -462,9 +462,9 @@ def denoise_tile(
         present=present,
     )
     kernels = model(features, confidence, present, threshold)
-    numerators, share = filter_window(kernels, color, config.size, estimate)
+    numerators, share = filter_window(kernels, color, config.size, estimate, confidence)
     centre = config.frames // 2
-    denoised = mean_of(numerators, share, color[:, centre])
+    denoised = mean_of(numerators, share, color[:, centre]).clamp_min(0)
     if aovs is None:
         return denoised, share, None
     return denoised, share, mean_of(*filter_window(kernels, aovs, config.size), aovs[:, centre])
@@ -487,9 +487,9 @@ def _frames_first(x: Tensor, frames: int) -> Tensor:
     return x.to(torch.float32, memory_format=torch.contiguous_format)
 
 
-def _factor(predicted: Tensor) -> Tensor:
-    """``e^h``, h the prediction bounded smoothly to ±4."""
-    return torch.exp(4 * torch.tanh(predicted / 4))
+def _factor(predicted: Tensor, bound: float) -> Tensor:
+    """``e^h``, h the prediction bounded smoothly to ±bound."""
+    return torch.exp(bound * torch.tanh(predicted / bound))
 
 
 def _peak(size: int, spread: float) -> Tensor:

@@ -84,7 +84,7 @@ def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> t
     config = model.config.kernel
     takes_estimate = config.estimate_size > 0
     present = batch["present"] if takes_estimate else torch.zeros_like(batch["present"])
-    estimate = batch["estimate"] if takes_estimate else None
+    estimate = batch["estimate"] * present.view(-1, 1, 1, 1, 1) if takes_estimate else None
     features = network_inputs(
         batch["color"],
         batch["albedo"],
@@ -97,7 +97,7 @@ def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> t
     )
     with torch.autocast(features.device.type, torch.bfloat16, enabled=bfloat16):
         kernels = model(features, batch["confidence"], present)
-    return filter_window(kernels, batch["color"], config.size, estimate)
+    return filter_window(kernels, batch["color"], config.size, estimate, batch["confidence"])
 
 
 def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> Tensor:

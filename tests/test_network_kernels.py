@@ -195,14 +195,29 @@ def test_a_firefly_outside_the_support_of_the_kernel_leaves_no_trace() -> None:
     assert torch.equal(filtered[..., :5], torch.ones(1, 3, 9, 5))
 
 
-def test_the_estimate_counts_with_its_frame() -> None:
-    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 27 + 27, 5, 4, seed=1)
-    window, window_share = apply_kernels(kernels[:, :27], color)
-    estimates = uniform(1, 3, 2, 5, 4, seed=2)
-    more, more_share = apply_kernels(kernels[:, 27:], estimates)
-    numerators, denominators = filter_window(kernels, color, 3, estimates)
-    torch.testing.assert_close(numerators, window + more)
-    torch.testing.assert_close(denominators, window_share + more_share)
+def test_a_noisy_tap_is_moved_by_what_the_estimate_says_of_the_way() -> None:
+    """Against plain loops, in the middle of the image; side frames are mixed with the centre by confidence."""
+    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 27 + 3, 5, 4, seed=1)
+    estimates, confidence = uniform(1, 3, 2, 5, 4, seed=2), uniform(1, 3, 1, 5, 4, seed=3)
+    numerators, denominators = filter_window(kernels, color, 3, estimates, confidence)
+    mixed = confidence * estimates + (1 - confidence) * estimates[:, 1:2]
+    y, x = 2, 1
+    for t in range(3):
+        expected, weight = kernels[0, 27 + t, y, x] * estimates[0, t, :, y, x], kernels[0, 27 + t, y, x]
+        for tap in range(9):
+            there = (0, t, slice(None), y + tap // 3 - 1, x + tap % 3 - 1)
+            moved = color[there] - mixed[there] + mixed[0, t, :, y, x]
+            expected = expected + kernels[0, 9 * t + tap, y, x] * moved
+            weight = weight + kernels[0, 9 * t + tap, y, x]
+        torch.testing.assert_close(numerators[0, t, :, y, x], expected)
+        torch.testing.assert_close(denominators[0, t, 0, y, x], weight)
+
+
+def test_an_estimate_that_explains_the_frames_is_not_blurred() -> None:
+    color, kernels = uniform(1, 3, 2, 6, 6), uniform(1, 27 + 3, 6, 6, seed=1)
+    color = color[:, 1:2].expand_as(color)
+    sums = filter_window(kernels, color, 3, color, torch.ones(1, 3, 1, 6, 6))
+    torch.testing.assert_close(mean_of(*sums, color[:, 1]), color[:, 1])
 
 
 def test_a_layer_without_an_estimate_is_filtered_by_the_windows_taps() -> None:
@@ -244,3 +259,5 @@ def test_shapes_that_do_not_fit_are_an_error(kernels, frames, message) -> None: 
 def test_an_estimate_of_another_number_of_frames_is_an_error() -> None:
     with pytest.raises(ValueError, match="estimate: expected 3 frames, got 2"):
         filter_window(torch.zeros(1, 29, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 2, 1, 4, 4))
+    with pytest.raises(ValueError, match="confidence: expected one beside estimate, got none"):
+        filter_window(torch.zeros(1, 30, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 3, 1, 4, 4))

@@ -223,7 +223,7 @@ def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
 
 def test_a_correction_reaches_nearly_any_kernel_but_no_frame_without_confidence() -> None:
     """Nearly all weight on one tap at the edge of a noisy frame; a frame that is not trusted stays out all the same."""
-    config = KernelConfig(frames=3, size=3, estimate_size=1)
+    config = KernelConfig(frames=3, size=3, estimate_size=1, estimate_share=0.1)
     head = silent_head(config)
     with torch.no_grad():
         head.window.bias.fill_(-50)
@@ -276,7 +276,7 @@ def test_estimates_and_noisy_frames_share_one_kernel() -> None:
     features = network_inputs(**data, exposure=torch.ones(1), takes_estimate=True, estimate=estimates)
     kernels = model(features, data["confidence"], torch.ones(1))
     assert kernels.shape[1] == 27 + 27
-    _, share = filter_window(kernels, data["color"], 3, estimates)
+    _, share = filter_window(kernels, data["color"], 3, estimates, data["confidence"])
     # Of a kernel with 1.0 over all, inside the border, some is in every frame.
     torch.testing.assert_close(share.sum(1)[..., 1:-1, 1:-1], torch.ones(1, 1, 6, 10))
     assert bool((share > 0).all())
