@@ -26,7 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from network.blocks import RobustAverage, outermost_first, ravg
 from network.kernels import apply_kernels, predict_kernel, threshold_kernel
-from network.models import denoise_tile, fast, for_inference, paper
+from network.losses import relmse
+from network.models import PRESETS, channels_last, denoise_tile, for_inference
 from network.train import TrainConfig, batch_loss
 
 # CPU seconds per megapixel of the prototypes this replaces: forward, forward and backward.
@@ -38,7 +39,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--tile", type=int, default=256)
-    parser.add_argument("--paper", action="store_true", help="also the paper's network, which takes a minute")
+    parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["fast"], help="paper takes a minute")
     return parser.parse_args(argv)
 
 
@@ -108,8 +109,8 @@ def parts(tile: int) -> Iterator[tuple[str, Callable[[], object], int]]:
         yield f"apply_kernels, unfolded{name}", mode(lambda x, f=frames: unfolded(x, f), weights), size**2
 
 
-def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], object], int]]:
-    for name, build in {"fast": fast, **({"paper": paper} if with_paper else {})}.items():
+def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], object], int]]:
+    for name, build in ((name, PRESETS[name]) for name in presets):
         for bfloat16 in (False, True):
             model = for_inference(build(), bfloat16)
             color = torch.rand(1, 5, 3, tile, tile)
@@ -120,7 +121,7 @@ def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], ob
                 tile**2,
             )
         for count in (1, 2):
-            model, config = build().to(memory_format=torch.channels_last), TrainConfig(steps=1)
+            model, config = channels_last(build()), TrainConfig(steps=1)
             color, image = torch.rand(count, 5, 3, 128, 128), torch.rand(count, 3, 128, 128)
             batch = {
                 **dict.fromkeys(("color", "albedo", "normal", "estimate"), color),
@@ -131,7 +132,7 @@ def networks(tile: int, with_paper: bool) -> Iterator[tuple[str, Callable[[], ob
             }
             yield (
                 f"{name}, training, batch of {count}",
-                lambda m=model, b=batch, c=config: batch_loss(m, b, c).backward(),
+                lambda m=model, b=batch, c=config: batch_loss(m, b, c, relmse).backward(),
                 count * 128**2,
             )
 
@@ -140,7 +141,7 @@ def main(argv: list[str]) -> int:
     options = parse_arguments(argv)
     torch.set_num_threads(options.threads)
     results = {}
-    for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.paper)):
+    for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.presets)):
         seconds = measure(function, options.repeats)
         results[name] = {**seconds, "per_megapixel": seconds["median"] / pixels * 1e6}
         if name in PROTOTYPE:

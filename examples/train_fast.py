@@ -51,9 +51,6 @@ SHOTS = [
     Shot("country_kitchen", "Camera_move", "0.349,0.536", "1280x720", 23, 0, 159, 17),
 ]
 VALIDATION = "ashtray153"  # kept out of training
-# Input and target: independent seeds at n samples (a, b), and n / e samples (c); always to no more noise.
-PAIRS = [("a", "b"), ("b", "a"), ("c", "b")]
-PSEUDO_PAIRS = [("a", "b"), ("b", "a"), ("c", "a")]
 
 
 def main() -> int:
@@ -73,13 +70,9 @@ def main() -> int:
         render += ["--camera", shot.camera, "--center", shot.center, "--film", shot.film, "--size", "256x144"]
         render += ["--levels", levels, "--movers", str(shot.movers), "--seed", str(shot.seed)]
         subprocess.run([*map(str, render), "--frames", f"{shot.first}-{shot.first + 6}"], check=True)
-        for pairs, extra in ((PAIRS, []), (PSEUDO_PAIRS, ["--pseudo-reference"])):
-            for seen, target in pairs:
-                clip = f"{name}.{seen}{target}{len(extra)}"
-                if any(clips.glob(f"{clip}.*.npz")):
-                    continue
-                command = ["prepare", folder / f"{seen}.####.exr", "--target", folder / f"{target}.####.exr"]
-                subprocess.run([*ravg, *map(str, command), "-o", str(clips), "--name", clip, *extra], check=True)
+        # Whole frames, of which training takes crops: a and b at n samples, c at n / e, with independent seeds.
+        command = [*ravg, "prepare", str(folder), "-o", str(clips), "--tile", "0", "--levels", levels]
+        subprocess.run(command, check=True)
     train = ["train", str(clips), "-o", str(options.out / "fast.safetensors"), "--minutes", options.minutes]
     train += ["--preset", "fast", "--whole", "3", "--batch", "1", "--rate", "8e-4", "--seed", "0"]
     subprocess.run([*ravg, *train, "--validation", VALIDATION], check=True)

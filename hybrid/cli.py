@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from hybrid.simulate.command import simulate_command
+from hybrid.training import prepare_command, train_command
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
+    import tempfile
+
     from hybrid.estimates import EstimateSource
     from hybrid.frames import Shot
     from hybrid.pipeline import Estimator
@@ -153,6 +156,11 @@ def denoise(
     ] = None,
     estimate: EstimateOption = "auto",
     keep_estimates: KeepOption = None,
+    passes: Annotated[int, typer.Option(help="run again on the result: a wider window in time, a softer picture")] = 1,
+    breakdown: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="a picture of what each frame contributes, with layers and figures of it"),
+    ] = None,
     aov: AovOption = None,
     preview: PreviewOption = None,
     frames: FramesOption = None,
@@ -164,25 +172,50 @@ def denoise(
 ) -> None:
     """Denoise with the Robust Average network."""
     neural = _neural()
+    import contextlib
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from hybrid.breakdown import Breakdown, write_breakdown
     from hybrid.estimates import choose_estimate
     from hybrid.timing import Timings
 
+    if passes < 1:
+        raise typer.BadParameter(f"--passes is {passes}, expected at least 1")
     opened = _open(shot, frames, layer, aov)
-    plan = _plan(opened, effects, no_effects)
     timings = Timings()
     path = weights or neural.shipped_weights(preset)
+    weighed = None if breakdown is None else Breakdown()
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
-    _run(
-        opened,
-        output,
-        denoiser,
-        plan,
-        timings,
-        choose_estimate(estimate, opened, kept=keep_estimates),
-        command="denoise",
-        preset=preset if weights is None else path.name,
-        preview=preview,
-    )
+    source = choose_estimate(estimate, opened, kept=keep_estimates)
+    with contextlib.ExitStack() as stack:
+        for number in range(1, passes + 1):
+            last = number == passes
+            into = output if last else stack.enter_context(_beside(output))
+            if last:
+                denoiser.breakdown = weighed
+            _run(
+                opened,
+                into,
+                denoiser,
+                _plan(opened, effects, no_effects),
+                timings,
+                source,
+                command="denoise" if passes == 1 else f"denoise, pass {number} of {passes}",
+                preset=preset if weights is None else path.name,
+                preview=preview if last else None,
+                radius=denoiser.radius,
+            )
+            if not last:
+                opened, source = _next_pass(opened, into, layer, aov)
+        if breakdown is not None and weighed is not None:
+            write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
+            table = Table("frame", "average weight", "minimum", "maximum")
+            for row in weighed.rows():
+                table.add_row(*row)
+            Console().print(table)
+            typer.echo(f"wrote {breakdown}")
 
 
 @app.command()
@@ -229,39 +262,8 @@ def compare(
             typer.echo(f"wrote {page}")
 
 
-@app.command()
-def prepare(
-    shot: ShotArgument,
-    target: Annotated[str, typer.Option(help="the same frames with independent noise, and not more of it")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips")],
-    name: Annotated[str, typer.Option(help="of the shot; validation shots are chosen by it")],
-    estimate: EstimateOption = "auto",
-    pseudo_reference: Annotated[
-        bool, typer.Option(help="take the average of the target's estimates instead of its noisy frames")
-    ] = False,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-) -> None:
-    """Make training clips: aligned windows, and what their centres should have been."""
-    from rich.progress import track
-
-    neural = _neural()
-    opened, wanted = _open(shot, frames, layer), _open(target, frames, layer)
-    output.mkdir(parents=True, exist_ok=True)
-    clips = neural.write_clips(opened, wanted, output, name, estimate=estimate, pseudo_reference=pseudo_reference)
-    written = len(list(track(clips, "prepare", total=len(opened))))
-    typer.echo(f"wrote {written} clips to {output}")
-
-
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True}, add_help_option=False)
-def train(context: typer.Context) -> None:
-    """Train a network on clips; `ravg train --help` lists the options."""
-    _neural()
-    from hybrid.neural import train_main
-
-    raise typer.Exit(train_main(context.args))
-
-
+app.command("prepare")(prepare_command)
+app.command("train")(train_command)
 app.command("simulate")(simulate_command)
 
 
@@ -299,6 +301,26 @@ def _plan(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Pl
     return plan_shot(shot).force(_split(on), _split(off))
 
 
+def _beside(output: str) -> tempfile.TemporaryDirectory[str]:
+    """A folder for what the next pass reads, on the disk of the output, gone when all is done."""
+    import tempfile
+
+    folder = Path(output).parent if Path(output).suffix else Path(output)
+    folder.mkdir(parents=True, exist_ok=True)
+    return tempfile.TemporaryDirectory(prefix=".ravg-", dir=folder)
+
+
+def _next_pass(
+    shot: Shot, folder: str, layer: Sequence[str] | None, aovs: Sequence[str] | None
+) -> tuple[Shot, EstimateSource]:
+    """The result of a pass as the shot of the next: its picture is the color, and an estimate already."""
+    from hybrid.estimates import EstimateSource
+
+    denoised = shot.layers(shot.numbers[0]).target.name or "RGBA"
+    again = _open(folder, None, [*(layer or ()), f"color={denoised}"], aovs)
+    return again, EstimateSource("denoised", lambda frame: frame.color, "the pass before has made them")
+
+
 def _split(names: Sequence[str] | None) -> list[str]:
     """Names may be given one by one or separated by commas."""
     return [name for item in names or () for name in item.split(",")]
@@ -321,6 +343,7 @@ def _run(
     command: str,
     preset: str,
     preview: Path | None,
+    radius: int = 2,
 ) -> None:
     """Denoise the shot with a progress bar, say what was met on the way, and leave the timings beside the output."""
     from rich.console import Console
@@ -346,7 +369,14 @@ def _run(
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(command, total=len(shot))
         frames = denoise_shot(
-            shot, output, estimator, plan, estimate=source.estimate, attributes=attributes, timings=timings
+            shot,
+            output,
+            estimator,
+            plan,
+            radius=radius,
+            estimate=source.estimate,
+            attributes=attributes,
+            timings=timings,
         )
         for finished in frames:
             progress.advance(task)

@@ -5,14 +5,17 @@ The only module outside `network` that imports torch. Here HWC becomes NCHW, and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 import network
+from hybrid.breakdown import Breakdown, layers_of
 from hybrid.estimates import choose_estimate
 from hybrid.frames import Shot
 from hybrid.pipeline import Denoised
@@ -20,10 +23,18 @@ from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import ALPHA, AlignedWindow, Aligner, gated_average
 from hybrid.timing import Timings
 from network.checkpoint import load_model
-from network.clips import Clip
+from network.clips import (
+    Clip,
+    SamplerConfig,
+    importance,
+    important_places,
+    open_clips,
+    split_by_shot,
+    write_shards,
+)
 from network.inputs import window_exposure
-from network.models import denoise_tile, for_inference
-from network.train import main as train_main
+from network.models import PRESETS, denoise_tile, for_inference
+from network.train import TrainConfig, train
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
@@ -31,8 +42,6 @@ Array = NDArray[np.float32]
 # Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
 # on a trained net is below half a float's precision.
 HALO = 32
-__all__ = ["Denoiser", "shipped_weights", "train_main", "write_clips"]
-
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 
@@ -71,6 +80,8 @@ class Denoiser:
         One of `PRECISIONS`; "auto" takes bfloat16 where the processor has it.
     threshold : float, optional
         t·K of the kernels, in [0, 1); higher stays closer to the input. Without: what it was trained with.
+    breakdown : Breakdown, optional
+        Where to count the weights of the frames; each frame's contribution and weight then come as extra layers.
     timings : Timings, optional
         Where to count the stages of the estimate, and "network".
 
@@ -87,6 +98,7 @@ class Denoiser:
         tile: int = 256,
         precision: str = "auto",
         threshold: float | None = None,
+        breakdown: Breakdown | None = None,
         timings: Timings | None = None,
     ) -> None:
         if precision not in PRECISIONS:
@@ -99,6 +111,7 @@ class Denoiser:
         self.model = for_inference(load_model(weights), half)
         self.tile = tile
         self.threshold = threshold
+        self.breakdown = breakdown
         self.timings = timings or Timings()
 
     @property
@@ -127,15 +140,20 @@ class Denoiser:
         irradiance = np.empty(color.shape[1:], np.float32)
         channels = sum(layer.shape[-1] for layer in aligned.aovs.values())
         filtered = np.empty((height, width, channels), np.float32)
+        parts = np.zeros((*color.shape[:3], 4), np.float32) if self.breakdown is not None else None
         for inner, outer, offset in _tiles(height, width, self.tile, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if "skip" in aligned.effects and not aligned.variance[outer].any():
                 irradiance[inner] = color[aligned.centre][inner]
                 if filtered.size:
                     filtered[inner] = layers["aovs"][aligned.centre][inner]
+                if parts is not None:
+                    parts[aligned.centre][inner] = np.dstack(
+                        [irradiance[inner], np.ones_like(irradiance[inner][..., :1])]
+                    )
                 continue
             cut = {name: _tensor(_pad(layer[:, *outer], self.model.multiple)) for name, layer in layers.items()}
-            out, _, aovs = denoise_tile(
+            out, sums, aovs = denoise_tile(
                 self.model,
                 cut["color"],
                 cut.get("albedo"),
@@ -149,6 +167,9 @@ class Denoiser:
             irradiance[inner] = _image(out)[offset]
             if aovs is not None:
                 filtered[inner] = _image(aovs)[offset]
+            if parts is not None:
+                tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).numpy()
+                parts[:, *inner] = tile[:, *offset]
         aovs_out, start = {}, 0
         for name, layer in aligned.aovs.items():
             stop = start + layer.shape[-1]
@@ -160,82 +181,202 @@ class Denoiser:
             else:
                 aovs_out[name] = light * aligned.modulation.mean(axis=-1, keepdims=True)
             start = stop
-        return Denoised(irradiance * aligned.modulation, aovs_out)
+        extra = {}
+        if parts is not None and self.breakdown is not None:
+            self.breakdown.add(parts[..., 3])
+            extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3])
+        return Denoised(irradiance * aligned.modulation, aovs_out, extra)
 
 
 def write_clips(
-    shot: Shot,
-    target: Shot,
+    levels: Mapping[str, Shot],
+    samples: Sequence[float],
     folder: Path,
     name: str,
     *,
     radius: int = 2,
+    tile: int = 128,
+    tiles: int = 4,
     estimate: str = "auto",
-    pseudo_reference: bool = False,
-) -> Iterator[Path]:
-    """Write a training clip for each frame that two renders of one shot have in common.
+    seed: int = 0,
+    advance: Callable[[], object] = lambda: None,
+) -> list[Path]:
+    """Write the training clips of a shot.
 
     Parameters
     ----------
-    shot : Shot
-        What the network is to see.
-    target : Shot
-        The same frames with independent noise, and not more of it (Noise2Noise: the mean of the target is clean).
+    levels : mapping of str to Shot
+        Independent renders of the same frames.
+    samples : sequence of float
+        Samples per pixel of each.
     folder : Path
-        Where ``NAME.NUMBER.npz`` is written.
+        Where the shards are written.
     name : str
-        Of the clips. What comes before its first dot is the shot's: sets are split by it.
+        Of the shot; sets are split by it.
     radius : int
         Frames on each side of the centre.
+    tile : int
+        Side of a clip, pixels; 0 for whole frames.
+    tiles : int
+        Clips of each frame, placed by `network.clips.importance`.
     estimate : str
         Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
-    pseudo_reference : bool
-        Take the gated average of the target's estimates, of the same kind, instead of its noisy frame.
+    seed : int
+        Of the places.
+    advance : callable
+        Called after each frame.
 
-    Yields
-    ------
-    Path
-        After each clip.
+    Returns
+    -------
+    list of Path
+        The shards.
 
     Raises
     ------
     ValueError
-        If the two have no frame in common, or there are no estimates.
+        If the levels have no frame in common, frames are smaller than a tile, or there are no estimates.
 
     References
     ----------
-    Lehtinen et al. 2018, Noise2Noise, arXiv:1803.04189; paper, section "Training Data".
+    Kalojanov and Thurston 2023, section 6, "Training Data".
     """
-    numbers = [number for number in shot.numbers if target.has(number)]
+    shots = list(levels.values())
+    numbers = [number for number in shots[0].numbers if all(shot.has(number) for shot in shots)]
     if not numbers:
-        raise ValueError(f"target: expected frames {shot.numbers[0]}-{shot.numbers[-1]}, got none of them")
-    aligner, target_aligner = (
-        Aligner(s, plan_shot(s).effects, radius=radius, estimate=choose_estimate(estimate, s).estimate)
-        for s in (shot, target)
-    )
-    for number in numbers:
-        aligned = aligner.align(number)
-        if aligned.estimate is None:
-            raise ValueError(f"estimate is {estimate!r}, expected one that gives pictures: clips hold estimates")
-        color = aligned.mixed(aligned.color)
-        if pseudo_reference:
-            wanted = gated_average(target_aligner.align(number))
-        else:
-            wanted, _ = replace_nonfinite(target.read(number).color)
-        clip = Clip(
-            color=color,
-            albedo=np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo),
-            normal=np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal),
-            confidence=aligned.confidence,
-            modulation=aligned.modulation,
-            estimate=aligned.estimate,
-            target=wanted,
-            target_kind="pseudo_reference" if pseudo_reference else "noisy",
-            shot=name.partition(".")[0],
-        )
-        path = folder / f"{name}.{number:04d}.npz"
-        clip.save(path)
-        yield path
+        raise ValueError(f"levels: expected frames in common, got none in {', '.join(levels)} of {name}")
+    aligners = [
+        Aligner(shot, plan_shot(shot).effects, radius=radius, estimate=choose_estimate(estimate, shot).estimate)
+        for shot in shots
+    ]
+
+    def make() -> Iterator[Clip]:
+        rng = np.random.default_rng(seed)
+        for number in numbers:
+            whole = _clip([_level(shot, aligner, number) for shot, aligner in zip(shots, aligners, strict=True)])
+            if tile == 0:
+                yield whole
+            else:
+                if min(whole.color.shape[-2:]) < tile:
+                    height, width = whole.color.shape[-2:]
+                    raise ValueError(f"tile: expected at most the frame's {width}×{height} pixels, got {tile}")
+                noisiest = min(range(len(samples)), key=lambda level: samples[level])
+                middle, scale = whole.color.shape[1] // 2, whole.exposure[noisiest]
+                weights = importance(
+                    whole.noisy[noisiest] / scale,
+                    whole.pseudo_reference[noisiest] / scale,
+                    whole.albedo[noisiest, middle],
+                    whole.confidence[noisiest],
+                )
+                for y, x in important_places(weights, tile, tiles, rng):
+                    yield whole.crop(y, x, tile)
+            advance()
+
+    return write_shards(folder, name, samples, make())
+
+
+def _level(shot: Shot, aligner: Aligner, number: int) -> dict[str, torch.Tensor]:
+    """What a clip holds of one noise level, with N = 1 in front."""
+    aligned = aligner.align(number)
+    if aligned.estimate is None:
+        raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
+    color = aligned.mixed(aligned.color)
+    noisy, _ = replace_nonfinite(shot.read(number).color)
+    return {
+        "color": _tensor(color),
+        "albedo": _tensor(np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo)),
+        "normal": _tensor(np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal)),
+        "estimate": _tensor(aligned.estimate),
+        "confidence": _tensor(aligned.confidence[..., None]),
+        "modulation": _tensor(aligned.modulation[None])[:, 0],
+        "noisy": _tensor(noisy[None])[:, 0],
+        "pseudo_reference": _tensor(gated_average(aligned)[None])[:, 0],
+        "exposure": window_exposure(_tensor(color)),
+    }
+
+
+def _clip(levels: list[dict[str, torch.Tensor]]) -> Clip:
+    """A clip of its levels."""
+    return Clip(**{name: torch.cat([level[name] for level in levels]) for name in levels[0]})
+
+
+def train_network(
+    clips: Path,
+    output: Path,
+    *,
+    preset: str = "fast",
+    init: str | None = None,
+    validation: Sequence[str] = (),
+    threads: int | None = None,
+    resume: bool = False,
+    log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
+    crop: int = 128,
+    sets: int = 10,
+    seed: int = 0,
+    **settings: Any,
+) -> list[float]:
+    """Train a preset, or weights there are, on the clips of a folder.
+
+    Parameters
+    ----------
+    clips : Path
+        From `write_clips`.
+    output : Path
+        Weights to write.
+    preset : str
+        Of `network.models.PRESETS`; not looked at with init.
+    init : str, optional
+        Weights to start from: a file, or a preset that ships.
+    validation : sequence of str
+        Shots kept out of training.
+    threads : int, optional
+        Of torch.
+    resume, log
+        As for `network.train.train`.
+    crop, sets
+        Of `network.clips.SamplerConfig`.
+    seed : int
+        Of initial weights and samples.
+    **settings
+        Further fields of `network.train.TrainConfig`.
+
+    Returns
+    -------
+    list of float
+        The losses.
+
+    Raises
+    ------
+    ValueError
+        If settings, clips and model do not fit together.
+
+    Notes
+    -----
+    Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over nccl with GPUs and gloo without.
+    """
+    config = TrainConfig(seed=seed, sampler=SamplerConfig(crop=crop, sets=sets), **settings)
+    if threads is not None:
+        torch.set_num_threads(threads)
+    training, kept_out = split_by_shot(open_clips(clips), validation)
+    if init is None:
+        if preset not in PRESETS:
+            raise ValueError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
+        model = PRESETS[preset](frames=training.frames, seed=seed)
+    else:
+        path = Path(init) if Path(init).suffix else shipped_weights(init)
+        model = load_model(path)
+        if model.config.kernel.frames != training.frames:
+            raise ValueError(
+                f"clips: expected windows of {model.config.kernel.frames} frames as {init} has, got {training.frames}"
+            )
+    output.parent.mkdir(parents=True, exist_ok=True)
+    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if together:
+        torch.distributed.init_process_group()
+    try:
+        return train(training, kept_out, model, config, output, resume=resume, log=log)
+    finally:
+        if together:
+            torch.distributed.destroy_process_group()
 
 
 def _tensor(window: Array) -> torch.Tensor:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,6 +18,8 @@ from network.models import (
     TKPCN,
     KernelConfig,
     Model,
+    MultiScale,
+    MultiScaleConfig,
     RAResNet,
     RAResNetConfig,
     RAUNet,
@@ -30,8 +32,18 @@ FORMAT = "ravg-network"
 VERSION = 1
 
 
+#: Networks by name, with their configurations.
+CLASSES: dict[str, tuple[Any, Any]] = {
+    "RAUNet": (RAUNet, RAUNetConfig),
+    "RAResNet": (RAResNet, RAResNetConfig),
+    "TKPCN": (TKPCN, TKPCNConfig),
+}
+
+
 def describe(model: Model) -> dict[str, Any]:
     """What is needed to build the model anew, as plain JSON values."""
+    if isinstance(model, MultiScale):
+        return {"model": "MultiScale", "scales": model.config.scales, "base": describe(model.base)}
     return {"model": type(model).__name__, "config": asdict(model.config)}
 
 
@@ -44,18 +56,19 @@ def build(description: Mapping[str, Any]) -> Model:
         If the description is not one of `describe`.
     """
     try:
-        name, values = description["model"], dict(description["config"])
+        name = description["model"]
+        if name == "MultiScale":
+            base = cast(RAUNet | RAResNet, build(description["base"]))
+            return MultiScale(MultiScaleConfig(base.config, description["scales"]))
+        if name not in CLASSES:
+            raise ValueError(f"expected model MultiScale, {', '.join(CLASSES)}, got {name!r}")
+        network, configuration = CLASSES[name]
+        values = dict(description["config"])
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         values["kernel"] = KernelConfig(**values["kernel"])
-        if name == "RAUNet":
-            return RAUNet(RAUNetConfig(**values))
-        if name == "RAResNet":
-            return RAResNet(RAResNetConfig(**values))
-        if name == "TKPCN":
-            return TKPCN(TKPCNConfig(**values))
-    except (KeyError, TypeError, ValueError) as error:
+        return cast(Model, network(configuration(**values)))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"model description: {error!r}") from error
-    raise ValueError(f"model description: expected model RAUNet, RAResNet or TKPCN, got {name!r}")
 
 
 def save_model(

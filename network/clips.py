@@ -1,147 +1,353 @@
-"""Training clips: one aligned window with its target per file, and random batches of crops from them."""
+"""Training clips: aligned windows at several noise levels, in shards on disk, and the samples drawn from them.
+
+A shard is a safetensors file that holds clips of one shot, stacked. Of a memory-mapped safetensors file any slice can
+be read by itself: a sample costs what it reads (one clip, one level), no shard is ever loaded, and the order is free.
+"""
 
 from __future__ import annotations
 
+import json
 import os
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
+from torch.utils.data import Dataset
 
-from network.inputs import window_exposure
-
-Array = npt.NDArray[Any]
-
-#: Largest finite half: brighter radiance (fireflies only) is stored as this.
+FORMAT = "ravg-clips"
+VERSION = "1"
+#: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
+#: (fireflies only) becomes this.
 HALF_MAX = 65504.0
+#: Bytes after which a shard is full: small enough to copy about, large enough that files are few.
+SHARD_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
 class Clip:
-    """An aligned window of one noise level, and the radiance its centre should have.
+    """A frame of a shot, or a tile of it, at L noise levels, each with its aligned window.
 
     Parameters
     ----------
-    color : ndarray
-        ``(T, H, W, 3)`` aligned irradiance, side frames mixed with the centre where not trusted.
-    albedo, normal : ndarray
-        ``(T, H, W, 3)`` aligned likewise; zeros where the renderer gave none.
-    confidence : ndarray
-        ``(T, H, W)`` in [0, 1].
-    modulation : ndarray
-        ``(H, W, 3)``; radiance is irradiance times modulation.
-    estimate : ndarray
-        ``(T, H, W, 3)`` aligned estimates of the frames, irradiance, made from the same noisy frames and nothing else.
-    target : ndarray
-        ``(H, W, 3)`` radiance of the centre, of noise independent of color's.
-    target_kind : str
-        What it is, "noisy" or "pseudo_reference" for example.
-    shot : str
-        Sets are split by it.
+    color : Tensor
+        ``(L, T, 3, H, W)`` aligned irradiance, side frames mixed with the centre where not trusted.
+    albedo, normal : Tensor
+        ``(L, T, 3, H, W)`` aligned likewise; zeros where the renderer gave none.
+    estimate : Tensor
+        ``(L, T, 3, H, W)`` aligned estimates of the frames, irradiance, made from the same noisy frames alone.
+    confidence : Tensor
+        ``(L, T, 1, H, W)`` in [0, 1].
+    modulation : Tensor
+        ``(L, 3, H, W)``; radiance is irradiance times modulation.
+    noisy, pseudo_reference : Tensor
+        ``(L, 3, H, W)`` radiance of the centre, as rendered and as estimated from the level's own window.
+    exposure : Tensor
+        ``(L,)``, of the windows of whole frames.
 
     Raises
     ------
     ValueError
         If shapes do not fit together or a value is not finite.
-
-    Notes
-    -----
-    Stored as float16: normal numbers from 6e-5 to 65504; brighter values become 65504.
     """
 
-    color: Array
-    albedo: Array
-    normal: Array
-    confidence: Array
-    modulation: Array
-    estimate: Array
-    target: Array
-    target_kind: str
-    shot: str
+    color: Tensor
+    albedo: Tensor
+    normal: Tensor
+    estimate: Tensor
+    confidence: Tensor
+    modulation: Tensor
+    noisy: Tensor
+    pseudo_reference: Tensor
+    exposure: Tensor
 
     def __post_init__(self) -> None:
-        if self.color.ndim != 4 or self.color.shape[0] % 2 == 0 or self.color.shape[3] != 3:
-            raise ValueError(f"color: expected shape (T, H, W, 3) with T odd, got {self.color.shape}")
-        window, image = self.color.shape, self.color.shape[1:]
+        shape = tuple(self.color.shape)
+        if len(shape) != 5 or shape[1] % 2 == 0 or shape[2] != 3:
+            raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
+        image = (shape[0], *shape[2:])
         expected = {
-            "color": window,
-            "albedo": window,
-            "normal": window,
-            "confidence": window[:3],
-            "modulation": image,
-            "estimate": window,
-            "target": image,
+            **dict.fromkeys(("color", "albedo", "normal", "estimate"), shape),
+            **dict.fromkeys(("modulation", "noisy", "pseudo_reference"), image),
+            "confidence": (*shape[:2], 1, *shape[3:]),
+            "exposure": shape[:1],
         }
-        for name, shape in expected.items():
+        for name, wanted in expected.items():
             value = getattr(self, name)
-            if value.shape != shape:
-                raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
-            if not np.isfinite(value).all():
+            if tuple(value.shape) != wanted:
+                raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+            if not bool(torch.isfinite(value).all()):
                 raise ValueError(f"{name}: expected finite values, got NaN or infinity")
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as .npz of float16 (not compressed: noise does not compress); the file appears whole."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                values[name] = np.clip(value, -HALF_MAX, HALF_MAX).astype(np.float16)
-        path = Path(path)
-        partial = path.with_name(path.name + ".part")
+    def crop(self, y: int, x: int, size: int) -> Clip:
+        """Square tile with its corner at row y and column x; the exposure stays the frame's."""
+        here = np.s_[..., y : y + size, x : x + size]
+        return Clip(**{n: v if n == "exposure" else v[here] for n, v in _values(self).items()})
+
+
+def _values(clip: Clip) -> dict[str, Tensor]:
+    return {item.name: getattr(clip, item.name) for item in fields(clip)}
+
+
+def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
+    """For each noise level what it may be trained towards: other levels of no more noise, never the other way.
+
+    Parameters
+    ----------
+    samples : sequence of float
+        Samples per pixel of each level. The levels must be independent renders.
+
+    Returns
+    -------
+    list of list of (int, str)
+        For each level the levels and kinds of targets, "noisy" and "pseudo_reference", cleanest first. A level
+        without an independent one of no more noise gets its own pseudo-reference: the network can then learn no more
+        than the estimate knows.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 6; Lehtinen et al. 2018, Noise2Noise, arXiv:1803.04189.
+    """
+    order = sorted(range(len(samples)), key=lambda level: -samples[level])
+    pairs = []
+    for level, own in enumerate(samples):
+        others = [other for other in order if other != level and samples[other] >= own]
+        both = [(other, kind) for other in others for kind in ("noisy", "pseudo_reference")]
+        pairs.append(both or [(level, "pseudo_reference")])
+    return pairs
+
+
+def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
+    """How much a network can learn at each pixel: noise, detail, and motion that could not be followed.
+
+    Parameters
+    ----------
+    noisy, estimate : Tensor
+        ``(3, H, W)`` radiance of the centre over the exposure.
+    albedo : Tensor
+        ``(3, H, W)`` of the centre.
+    confidence : Tensor
+        ``(T, 1, H, W)``.
+
+    Returns
+    -------
+    Tensor
+        ``(H, W)``, 0 where a flat sky is. Differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇ albedo|; and a
+        tenth of the mistrust of the frames, which would otherwise outweigh all else where an object passes.
+    """
+    noisy, estimate = (image.clamp_min(0) / (1 + image.clamp_min(0)) for image in (noisy.float(), estimate.float()))
+    found = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))
+    for guide in (estimate, albedo.float()):
+        found[1:] += guide.diff(dim=1).abs().mean(0)
+        found[:, 1:] += guide.diff(dim=2).abs().mean(0)
+    return found
+
+
+def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Corners of the possible tiles, every 8 pixels, and the chance of each: half even, half by importance."""
+    height, width = importance.shape
+    sums = np.zeros((height + 1, width + 1))
+    sums[1:, 1:] = importance.double().numpy().cumsum(0).cumsum(1)
+    starts = [sorted({*range(0, length - size, 8), length - size}) for length in (height, width)]
+    corners = [(y, x) for y in starts[0] for x in starts[1]]
+    means = np.array(
+        [sums[y + size, x + size] - sums[y, x + size] - sums[y + size, x] + sums[y, x] for y, x in corners]
+    )
+    # A noise-free clip without any detail has no important place: all are alike.
+    chances = means + means.mean() if means.mean() > 0 else np.ones(len(means))
+    return corners, chances / chances.sum()
+
+
+def important_places(importance: Tensor, size: int, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Corners of up to `count` tiles, drawn by importance, none closer to another than half a tile both ways."""
+    corners, chances = place_chances(importance, size)
+    places: list[tuple[int, int]] = []
+    while len(places) < count and chances.sum() > 0:
+        y, x = corners[rng.choice(len(corners), p=chances / chances.sum())]
+        places.append((y, x))
+        near = [abs(v - y) < size / 2 and abs(u - x) < size / 2 for v, u in corners]
+        chances = np.where(near, 0.0, chances)
+    return places
+
+
+def write_shards(
+    folder: str | os.PathLike[str], shot: str, samples: Sequence[float], clips: Iterable[Clip]
+) -> list[Path]:
+    """Write the clips of a shot as ``SHOT.0000.safetensors``, ``SHOT.0001.safetensors`` and so on.
+
+    Parameters
+    ----------
+    folder : path
+        Where to.
+    shot : str
+        Name; training and validation are split by it.
+    samples : sequence of float
+        Samples per pixel of each level.
+    clips : iterable of Clip
+        At least one, all of one shape; drawn from as they are written.
+
+    Returns
+    -------
+    list of Path
+        The shards. They appear together when the last is done.
+
+    Raises
+    ------
+    ValueError
+        If there are no clips, or they are not alike.
+    """
+    folder = Path(folder)
+    partial: list[Path] = []
+    waiting: list[dict[str, Tensor]] = []
+
+    def flush() -> None:
+        path = folder / f"{shot}.{len(partial):04d}.safetensors.part"
+        metadata = {"format": FORMAT, "version": VERSION, "shot": shot, "samples": json.dumps(list(samples))}
+        save_file({name: torch.stack([clip[name] for clip in waiting]) for name in waiting[0]}, path, metadata)
+        partial.append(path)
+        waiting.clear()
+
+    try:
+        for clip in clips:
+            packed = _pack(clip)
+            if waiting and packed["color"].shape != waiting[0]["color"].shape:
+                found, wanted = (tuple(values["color"].shape) for values in (packed, waiting[0]))
+                raise ValueError(f"clips: expected color of shape {wanted} as in those before, got {found}")
+            waiting.append(packed)
+            if len(waiting) * sum(value.nbytes for value in packed.values()) > SHARD_BYTES:
+                flush()
+        if waiting:
+            flush()
+        if not partial:
+            raise ValueError(f"clips: expected at least one of shot {shot!r}, got none")
+        done = [path.with_suffix("") for path in partial]
+        for path, final in zip(partial, done, strict=True):
+            os.replace(path, final)
+        return done
+    finally:
+        for path in partial:
+            path.unlink(missing_ok=True)
+
+
+def _pack(clip: Clip) -> dict[str, Tensor]:
+    """Values as they are stored: radiance and irradiance over the exposure of the last level, float16."""
+    scale = clip.exposure[-1]
+    packed = {"exposure": (clip.exposure / scale).float()}
+    for name, value in _values(clip).items():
+        if name in ("color", "estimate", "noisy", "pseudo_reference"):
+            value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
+        if name != "exposure":
+            packed[name] = value.to(torch.float16).contiguous()
+    return packed
+
+
+@dataclass(frozen=True)
+class _Shard:
+    """What is known of a shard without reading its clips."""
+
+    path: Path
+    shot: str
+    samples: tuple[float, ...]
+    shape: tuple[int, ...]  # of color: clips, levels, frames, 3, height, width
+
+
+class Clips:
+    """Clips in shards, by number.
+
+    Parameters
+    ----------
+    shards : sequence
+        From `open_clips`.
+    """
+
+    def __init__(self, shards: Sequence[_Shard]) -> None:
+        self._shards = list(shards)
+        self._starts = np.cumsum([0, *(shard.shape[0] for shard in shards)])
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    @property
+    def shots(self) -> list[str]:
+        """Names of the shots, sorted."""
+        return sorted({shard.shot for shard in self._shards})
+
+    @property
+    def frames(self) -> int:
+        """Length of the windows, T."""
+        return self._shards[0].shape[2]
+
+    @property
+    def size(self) -> int:
+        """Least height or width of a clip."""
+        return min(min(shard.shape[4:]) for shard in self._shards)
+
+    def of(self, shots: Sequence[str]) -> Clips:
+        """Those of some shots."""
+        return Clips([shard for shard in self._shards if shard.shot in shots])
+
+    def pairs(self, index: int) -> list[list[tuple[int, str]]]:
+        """`noise_pairs` of a clip."""
+        return noise_pairs(self._find(index)[0].samples)
+
+    def read(self, index: int, level: int, target: tuple[int, str]) -> dict[str, Tensor]:
+        """One level of a clip with a target of `pairs`: `Clip`'s fields without L, ``target``, and float32 exposure."""
+        shard, number = self._find(index)
+        names = ("color", "albedo", "normal", "estimate", "confidence", "modulation", "exposure")
         try:
-            with open(partial, "wb") as file:
-                np.savez(file, **values)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+            with safe_open(shard.path, framework="pt") as file:
+                values = {name: file.get_slice(name)[number, level] for name in names}
+                values["target"] = file.get_slice(target[1])[number, target[0]]
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"clips {os.fspath(shard.path)!r}: cut short ({error})") from error
+        return values
 
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Clip:
-        """Read a clip.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            If it is no clip, or cut short.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                values = {item.name: file[item.name] for item in fields(cls)}
-        except (KeyError, EOFError, OSError, ValueError, zipfile.BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise FileNotFoundError(f"clip: no file {os.fspath(path)!r}") from error
-            raise ValueError(f"clip {os.fspath(path)!r}: no clip, or cut short ({error})") from error
-        values["target_kind"], values["shot"] = str(values["target_kind"]), str(values["shot"])
-        return cls(**values)
+    def _find(self, index: int) -> tuple[_Shard, int]:
+        shard = int(np.searchsorted(self._starts, index, side="right")) - 1
+        return self._shards[shard], index - int(self._starts[shard])
 
 
-def load_clips(folder: str | os.PathLike[str]) -> list[Clip]:
-    """All clips (``*.npz``) of a folder, in the order of their names.
+def open_clips(folder: str | os.PathLike[str]) -> Clips:
+    """Open all shards of a folder.
 
     Raises
     ------
     FileNotFoundError
         If there are none.
+    ValueError
+        If one is no shard of clips, or of another version, or their windows differ in length.
     """
-    paths = sorted(Path(folder).glob("*.npz"))
+    paths = sorted(Path(folder).glob("*.safetensors"))
     if not paths:
-        raise FileNotFoundError(f"clips: no *.npz in {os.fspath(folder)!r}")
-    return [Clip.load(path) for path in paths]
+        raise FileNotFoundError(f"clips: no *.safetensors in {os.fspath(folder)!r}; expected what ravg prepare writes")
+    shards = []
+    for path in paths:
+        where = f"clips {os.fspath(path)!r}"
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                shape = tuple(file.get_slice("color").get_shape()) if "color" in file.keys() else ()  # noqa: SIM118
+        except SafetensorError as error:
+            raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
+        for key, wanted in (("format", FORMAT), ("version", VERSION)):
+            if metadata.get(key) != wanted:
+                raise ValueError(f"{where}: expected {key} {wanted!r}, got {metadata.get(key)!r}")
+        shards.append(_Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape))
+        if shards[-1].shape[2] != shards[0].shape[2]:
+            raise ValueError(f"{where}: expected windows of {shards[0].shape[2]} frames, got {shards[-1].shape[2]}")
+    return Clips(shards)
 
 
-def split_by_shot(clips: Sequence[Clip], validation: Sequence[str]) -> tuple[list[Clip], list[Clip]]:
+def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
     """Training and validation clips; no shot is in both.
 
     Parameters
     ----------
-    clips : sequence of Clip
+    clips : Clips
         All clips.
     validation : sequence of str
         Names of the shots to keep out of training.
@@ -151,200 +357,170 @@ def split_by_shot(clips: Sequence[Clip], validation: Sequence[str]) -> tuple[lis
     ValueError
         If a name is not among the shots, or no clip is left to train on.
     """
-    shots = sorted({clip.shot for clip in clips})
-    unknown = sorted(set(validation) - set(shots))
+    unknown = sorted(set(validation) - set(clips.shots))
     if unknown:
-        raise ValueError(f"validation: expected shots among {shots}, got {unknown}")
-    training = [clip for clip in clips if clip.shot not in validation]
+        raise ValueError(f"validation: expected shots among {clips.shots}, got {unknown}")
+    training = [shot for shot in clips.shots if shot not in validation]
     if not training:
-        raise ValueError(f"validation: expected a shot left to train on, got all of {shots}")
-    return training, [clip for clip in clips if clip.shot in validation]
+        raise ValueError(f"validation: expected a shot left to train on, got all of {clips.shots}")
+    return clips.of(training), clips.of(validation)
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """How crops are drawn and varied. Probabilities are per sample."""
+    """How samples are drawn and varied. Probabilities are per sample."""
 
-    crop: int = 128  # height and width; smaller clips are used whole, if square
+    crop: int = 128  # height and width; of larger clips a place is drawn by importance
+    sets: int = 10  # disjoint sets of clips, one for each epoch; the paper's ten
     drop_estimate: float = 0.1  # the model must also work without one
     drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
 
     def __post_init__(self) -> None:
-        if self.crop < 1:
-            raise ValueError(f"crop: expected a positive size, got {self.crop}")
+        for name in ("crop", "sets"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("drop_estimate", "drop_frames", "fireflies"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a probability, got {getattr(self, name)}")
 
 
-class Sampler:
-    """Random batches of crops from clips held in memory.
+class Samples(Dataset[dict[str, Tensor]]):
+    """The samples of a training, by number: each is a function of the seed and its number alone.
+
+    So the state of the sampling is one number, any process may make any sample, and a training that is resumed or
+    spread over processes sees the same ones.
 
     Parameters
     ----------
-    clips : sequence of Clip
-        At least one, each at least crop pixels high and wide, all of one window length.
+    clips : Clips
+        At least one, each at least crop pixels high and wide.
     config : SamplerConfig
         Crops and variations.
     seed : int
-        Of the generator, `rng`, whose state is all the state there is.
+        Of everything random.
 
     Raises
     ------
     ValueError
-        If there are no clips, or one is too small or of another window length.
+        If there are no clips, or one is too small.
 
     Notes
     -----
-    Shots are drawn evenly, then a clip of the shot, then the crop, in proportion to its importance: half the mean
-    over all crops, half the local error of the noisy centre against the target on x/(1+x), plus the detail of
-    estimate and albedo. Important places thus come up more often and no place never.
+    The clips are split at random into disjoint sets, one per epoch. An epoch takes each clip of its set once, in random
+    order, at a noise level and towards a target drawn from `noise_pairs`; after the last set the first comes again.
 
     Variations: flips, transposition (with flips: quarter turns), permutations of the color channels, signed
-    permutations of the normal's axes (normals may be in any fixed space, so none is turned with the image),
-    and those of `SamplerConfig`.
+    permutations of the normal's axes (normals may be in any fixed space, so none is turned with the image; what is
+    stored has been aligned, so there are no flows to turn), and those of `SamplerConfig`.
     """
 
-    def __init__(self, clips: Sequence[Clip], config: SamplerConfig, seed: int) -> None:
-        if not clips:
+    def __init__(self, clips: Clips, config: SamplerConfig, seed: int) -> None:
+        if len(clips) == 0:
             raise ValueError("clips: expected at least one, got none")
-        for clip in clips:
-            if min(clip.color.shape[1:3]) < config.crop or clip.color.shape[0] != clips[0].color.shape[0]:
-                raise ValueError(
-                    f"clips: expected {clips[0].color.shape[0]} frames of at least {config.crop} pixels each way, "
-                    f"got {clip.color.shape[:3]} (shot {clip.shot!r})"
-                )
-        self.clips = list(clips)
-        self.config = config
-        self.rng = np.random.default_rng(seed)
-        shots: dict[str, list[int]] = {}
-        for index, clip in enumerate(clips):
-            shots.setdefault(clip.shot, []).append(index)
-        self._shots = list(shots.values())
-        self._exposures = [float(window_exposure(_frames_to_torch(clip.color)[None])) for clip in clips]
-        self._corners, self._chances = zip(*(_crop_chances(clip, config.crop) for clip in clips), strict=True)
+        if clips.size < config.crop:
+            raise ValueError(f"clips: expected at least {config.crop} pixels each way, got {clips.size}")
+        self.clips, self.config, self.seed = clips, config, seed
+        order = np.random.default_rng((seed, 0)).permutation(len(clips))
+        self._sets = [order[first :: config.sets] for first in range(config.sets)]
+        self._cycle: tuple[int, np.ndarray] | None = None
 
-    def batch(self, size: int) -> dict[str, Tensor]:
-        """Draw a batch.
+    def clip_of(self, number: int) -> int:
+        """The clip that a sample is made of."""
+        cycle, place = divmod(number, len(self.clips))
+        if self._cycle is None or self._cycle[0] != cycle:
+            rng = np.random.default_rng((self.seed, 1, cycle))
+            self._cycle = cycle, np.concatenate([rng.permutation(part) for part in self._sets])
+        return int(self._cycle[1][place])
 
-        Parameters
-        ----------
-        size : int
-            N.
+    def __getitem__(self, number: int) -> dict[str, Tensor]:
+        """Make a sample.
 
         Returns
         -------
         dict of Tensor
-            float32: ``color``, ``albedo``, ``normal`` ``(N, T, 3, H, W)``, ``confidence`` ``(N, T, 1, H, W)``,
-            ``estimate`` ``(N, T, 3, H, W)``, ``modulation``, ``target`` ``(N, 3, H, W)``, ``present`` ``(N,)`` (1 where
-            the estimate may be used), ``exposure`` ``(N,)``.
+            float32: ``color``, ``albedo``, ``normal``, ``estimate`` ``(T, 3, H, W)``, ``confidence`` ``(T, 1, H, W)``,
+            ``modulation``, ``target`` ``(3, H, W)``, ``present`` (1 where the estimate may be used) and ``exposure``
+            ``()``. A `torch.utils.data.DataLoader` stacks them to a batch.
         """
-        samples = [self._sample() for _ in range(size)]
-        return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
-
-    def _sample(self) -> dict[str, Tensor]:
-        rng, config = self.rng, self.config
-        shot = self._shots[rng.integers(len(self._shots))]
-        index = shot[rng.integers(len(shot))]
-        clip = self.clips[index]
-        y, x = self._corners[index][rng.choice(len(self._chances[index]), p=self._chances[index])]
-        here = np.s_[..., y : y + config.crop, x : x + config.crop, :]
-        flip_y, flip_x, transpose = rng.random(3) < 0.5
-        channels = rng.permutation(3)
-
-        def crop(image: Array, order: npt.NDArray[np.int64] | None = None) -> Array:
-            image = image[here] if order is None else image[here][..., order]
-            image = image[..., ::-1, :, :] if flip_y else image
-            image = image[..., ::-1, :] if flip_x else image
-            return (np.swapaxes(image, -3, -2) if transpose else image).astype(np.float32)
-
-        color, albedo, estimate = (crop(window, channels) for window in (clip.color, clip.albedo, clip.estimate))
-        normal = crop(clip.normal, rng.permutation(3)) * rng.choice((-1, 1), 3).astype(np.float32)
-        confidence = crop(clip.confidence[..., None])
-        centre = len(color) // 2
-        if len(color) > 1 and rng.random() < config.drop_frames:
-            dropped = rng.random(len(color)) < 0.5
+        config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
+        pairs = self.clips.pairs(index)
+        level = int(rng.integers(len(pairs)))
+        values = self.clips.read(index, level, pairs[level][rng.integers(len(pairs[level]))])
+        exposure, frames = values.pop("exposure").float(), len(values["color"])
+        centre = frames // 2
+        y, x = self._place(values, rng)
+        flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
+        transpose = rng.random() < 0.5
+        channels = torch.from_numpy(rng.permutation(3))
+        axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
+        sample = {}
+        for name, value in values.items():
+            value = value[..., y : y + config.crop, x : x + config.crop].float().flip(flips)
+            value = value.transpose(-2, -1) if transpose else value
+            if name == "normal":
+                value = value[..., axes, :, :] * signs
+            elif name != "confidence":
+                value = value[..., channels, :, :]
+            sample[name] = value.contiguous()
+        if frames > 1 and rng.random() < config.drop_frames:
+            dropped = torch.from_numpy(rng.random(frames) < 0.5)
             dropped[centre] = False
-            for window in (color, albedo, normal, estimate):
-                window[dropped] = window[centre]
-            confidence[dropped] = 0
+            for name in ("color", "albedo", "normal", "estimate"):
+                sample[name][dropped] = sample[name][centre].clone()
+            sample["confidence"][dropped] = 0
         if rng.random() < config.fireflies:
             count = rng.integers(1, 9)
             rows, columns = rng.integers(config.crop, size=(2, count))
-            gain = 10 ** rng.uniform(1, 3, (count, 1))
             # Not black where it was black: a firefly comes from a path, not from the pixel it lands in.
-            color[rng.integers(len(color)), rows, columns] += gain * self._exposures[index]
-        exposure = self._exposures[index] * 2 ** rng.uniform(-config.exposure_stops, config.exposure_stops)
-        return {
-            "color": _frames_to_torch(color),
-            "albedo": _frames_to_torch(albedo),
-            "normal": _frames_to_torch(normal),
-            "confidence": _frames_to_torch(confidence),
-            "modulation": _frames_to_torch(crop(clip.modulation, channels)),
-            "target": _frames_to_torch(crop(clip.target, channels)),
-            "estimate": _frames_to_torch(estimate),
-            "present": torch.tensor(float(rng.random() >= config.drop_estimate)),
-            "exposure": torch.tensor(exposure, dtype=torch.float32),
-        }
+            gain = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * exposure
+            sample["color"][rng.integers(frames), :, rows, columns] += gain
+        sample["exposure"] = exposure * 2 ** rng.uniform(-config.exposure_stops, config.exposure_stops)
+        sample["present"] = torch.tensor(float(rng.random() >= config.drop_estimate))
+        return sample
+
+    def _place(self, values: dict[str, Tensor], rng: np.random.Generator) -> tuple[int, int]:
+        """Corner of the crop: the clip's own if that is as large, else drawn by importance."""
+        if values["target"].shape[-2:] == (self.config.crop, self.config.crop):
+            return 0, 0
+        centre = len(values["color"]) // 2
+        modulation = values["modulation"]
+        corners, chances = place_chances(
+            importance(
+                values["color"][centre] * modulation,
+                values["estimate"][centre] * modulation,
+                values["albedo"][centre],
+                values["confidence"],
+            ),
+            self.config.crop,
+        )
+        return corners[rng.choice(len(corners), p=chances)]
 
 
-def whole_frame(clip: Clip, multiple: int) -> dict[str, Tensor]:
-    """A whole clip as a batch of one, unvaried, cropped at the right and the bottom to a multiple.
+def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tensor]]:
+    """A clip at each of its levels, towards the cleanest target, as batches of one, unvaried.
 
     Parameters
     ----------
-    clip : Clip
-        The clip.
+    clips : Clips
+        The clips.
+    index : int
+        Which.
     multiple : int
-        Of height and width; the model's.
+        Of height and width; the model's. The rest is left off at the right and the bottom.
 
     Returns
     -------
-    dict of Tensor
-        As from `Sampler.batch`.
+    list of dict of Tensor
+        As from `Samples`, with N = 1 in front.
     """
-    height, width = (length // multiple * multiple for length in clip.color.shape[1:3])
-    batch = {
-        name: _frames_to_torch(getattr(clip, name)[..., :height, :width, :])[None]
-        for name in ("color", "albedo", "normal", "estimate", "modulation", "target")
-    }
-    batch["confidence"] = _frames_to_torch(clip.confidence[:, :height, :width, None])[None]
-    batch["present"] = torch.ones(1)
-    batch["exposure"] = window_exposure(_frames_to_torch(clip.color)[None])
-    return batch
-
-
-def _frames_to_torch(image: Array) -> Tensor:
-    """``(..., H, W, C)`` to float32 ``(..., C, H, W)``: the one change of layout in training."""
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, -3), dtype=np.float32))
-
-
-def _crop_chances(clip: Clip, crop: int) -> tuple[list[tuple[int, int]], npt.NDArray[np.float64]]:
-    """Corners of the possible crops, every 8 pixels, and the chance of each."""
-    middle = len(clip.color) // 2
-    modulation = clip.modulation.astype(np.float32)
-    noisy, target, estimate = (
-        np.maximum(image.astype(np.float32), 0)
-        for image in (clip.color[middle] * modulation, clip.target, clip.estimate[middle] * modulation)
-    )
-    noisy, target, estimate = (image / (1 + image) for image in (noisy, target, estimate))
-    importance = np.abs(noisy - target).mean(2)
-    for guide in (estimate, clip.albedo[middle].astype(np.float32)):
-        importance[1:] += np.abs(np.diff(guide, axis=0)).mean(2)
-        importance[:, 1:] += np.abs(np.diff(guide, axis=1)).mean(2)
-    sums = np.zeros((importance.shape[0] + 1, importance.shape[1] + 1))
-    sums[1:, 1:] = importance.cumsum(0).cumsum(1)
-    corners = [(y, x) for y in _starts(importance.shape[0], crop) for x in _starts(importance.shape[1], crop)]
-    means = np.array(
-        [sums[y + crop, x + crop] - sums[y, x + crop] - sums[y + crop, x] + sums[y, x] for y, x in corners]
-    )
-    # A noise-free clip without any detail has no important place: all are alike.
-    chances = means + means.mean() if means.mean() > 0 else np.ones(len(means))
-    return corners, chances / chances.sum()
-
-
-def _starts(length: int, crop: int) -> list[int]:
-    """Every eighth start of a crop, and the last one."""
-    return sorted({*range(0, length - crop, 8), length - crop})
+    batches = []
+    for level, targets in enumerate(clips.pairs(index)):
+        values = clips.read(index, level, targets[0])
+        height, width = (length // multiple * multiple for length in values["target"].shape[-2:])
+        batch = {n: v[None].float() for n, v in values.items() if n == "exposure"}
+        batch |= {n: v[None, ..., :height, :width].float() for n, v in values.items() if n != "exposure"}
+        batch["present"] = torch.ones(1)
+        batches.append(batch)
+    return batches

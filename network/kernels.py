@@ -10,12 +10,14 @@ the share of each frame, are sums of the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 Slices = tuple[slice, slice]
 
@@ -243,6 +245,111 @@ def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon:
         ``(N, C, H, W)``.
     """
     return (numerators.sum(1) + epsilon * fallback) / (denominators.sum(1) + epsilon)
+
+
+class Pyramid(NamedTuple):
+    """Kernels at several resolutions, each half of the one before, and how they are blended.
+
+    Attributes
+    ----------
+    kernels : tuple of Tensor
+        ``(N, taps, H / 2^s, W / 2^s)``, finest first.
+    blends : tuple of Tensor
+        One fewer, α_s in [0, 1] of ``(N, 1, H / 2^s, W / 2^s)``: how much of the low frequencies of scale s comes from
+        the next coarser one.
+    """
+
+    kernels: tuple[Tensor, ...]
+    blends: tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What kernels made of a window, frame by frame: the images of any of its frames are sums of these.
+
+    Attributes
+    ----------
+    numerators, denominators : Tensor
+        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `filter_window`.
+    coarse : Filtered, optional
+        The same at half the resolution.
+    blend : Tensor, optional
+        ``(N, 1, H, W)``, α of `Pyramid`; with coarse.
+
+    Notes
+    -----
+    ``o_s = f_s + α_s U(o_{s+1} − D f_s)``, with f_s the image of this resolution, D the mean of 2×2 pixels and U linear
+    interpolation: with α = 1 all but the finest detail is that of the coarser image.
+
+    References
+    ----------
+    Vogels et al. 2018, section 5.3 (multi-scale reconstruction), doi:10.1145/3197517.3201388.
+    """
+
+    numerators: Tensor
+    denominators: Tensor
+    coarse: Filtered | None = None
+    blend: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls,
+        kernels: Tensor | Pyramid,
+        color: Tensor,
+        size: int,
+        estimate: Tensor | None = None,
+        confidence: Tensor | None = None,
+    ) -> Filtered:
+        """Apply kernels of one or more resolutions; the arguments are those of `filter_window`."""
+        if isinstance(kernels, Tensor):
+            return cls(*filter_window(kernels, color, size, estimate, confidence))
+        sums = filter_window(kernels.kernels[0], color, size, estimate, confidence)
+        if not kernels.blends:
+            return cls(*sums)
+        rest = Pyramid(kernels.kernels[1:], kernels.blends[1:])
+        halves = [None if image is None else _halve(image) for image in (estimate, confidence)]
+        half = cls.of(rest, _halve(color), size, *halves)
+        return cls(*sums, half, kernels.blends[0])
+
+    def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
+        """Image that these frames give together, all without; fallback and epsilon as for `mean_of`."""
+        numerators, denominators = self.numerators, self.denominators
+        if frames is not None:
+            numerators, denominators = numerators[:, list(frames)], denominators[:, list(frames)]
+        fine = mean_of(numerators, denominators, fallback, epsilon)
+        if self.coarse is None or self.blend is None:
+            return fine
+        low = self.coarse.image(_halve(fallback), frames, epsilon)
+        return fine + self.blend * _double(low - _halve(fine))
+
+    def parts(self) -> tuple[Tensor, Tensor]:
+        """What each frame contributes to the image of all, ``(N, T, C, H, W)``, and its weight, ``(N, T, 1, H, W)``.
+
+        They sum to the image and to 1. With coarser resolutions a weight may leave [0, 1] a little, since what those
+        replace is taken away first.
+        """
+        # 1e-6: as in `mean_of`; nothing of a kernel is left only where no tap is inside the image, which cannot be.
+        total = self.denominators.sum(1, keepdim=True).clamp_min(1e-6)
+        parts, shares = self.numerators / total, self.denominators / total
+        if self.coarse is None or self.blend is None:
+            return parts, shares
+        blend = self.blend.unsqueeze(1)
+        coarse_parts, coarse_shares = self.coarse.parts()
+        return (
+            parts + blend * _double(coarse_parts - _halve(parts)),
+            shares + blend * _double(coarse_shares - _halve(shares)),
+        )
+
+
+def _halve(image: Tensor) -> Tensor:
+    """Mean of 2×2 pixels of ``(..., H, W)``; H and W even."""
+    return functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
+
+
+def _double(image: Tensor) -> Tensor:
+    """Linear interpolation of ``(..., H, W)`` to twice the size."""
+    doubled = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
+    return doubled.unflatten(0, image.shape[:-3])
 
 
 def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:

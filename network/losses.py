@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from network.kernels import mean_of
+from network.kernels import Filtered
 
 #: Frames of a window, and the weight of the loss of the image they give together.
 Term = tuple[tuple[int, ...], float]
@@ -163,8 +163,7 @@ def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -
 
 def temporal_loss(
     loss: ImageLoss,
-    numerators: Tensor,
-    denominators: Tensor,
+    filtered: Filtered,
     color: Tensor,
     target: Tensor,
     modulation: Tensor,
@@ -178,8 +177,8 @@ def temporal_loss(
     ----------
     loss : ImageLoss
         Image loss.
-    numerators, denominators : Tensor
-        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` from `network.kernels.filter_window`.
+    filtered : Filtered
+        The window after its kernels.
     color : Tensor
         ``(N, T, C, H, W)`` aligned irradiance: what a subset to which the kernels give no weight falls back to.
     target : Tensor
@@ -207,14 +206,13 @@ def temporal_loss(
     ----------
     Kalojanov and Thurston 2023, section 5, equation 5.
     """
-    centre = numerators.shape[1] // 2
+    centre = color.shape[1] // 2
     # Scale of the radiance; a black modulation (no albedo anywhere) would make it 0.
     radiance = scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
     total = torch.zeros_like(scale)
     for subset, weight in terms:
-        index = list(subset)
-        fallback = color[:, centre] if centre in subset else color[:, index].mean(1)
-        image = mean_of(numerators[:, index], denominators[:, index], fallback, SUBSET_EPSILON) * modulation
+        fallback = color[:, centre] if centre in subset else color[:, list(subset)].mean(1)
+        image = filtered.image(fallback, subset, SUBSET_EPSILON) * modulation
         sides = None if slope == 1 else asymmetry(image, target, color[:, centre] * modulation, slope)
         total = total + weight * loss(image, target, radiance, sides)
     return total / sum(weight for _, weight in terms)

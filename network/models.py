@@ -6,6 +6,8 @@ convolutions are shared over the frames.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import cast
@@ -16,7 +18,7 @@ from torch.nn import functional
 
 from network.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.inputs import CHANNELS, ESTIMATE_CHANNELS, network_inputs, window_exposure
-from network.kernels import filter_window, mean_of, predict_kernel
+from network.kernels import Filtered, Pyramid, predict_kernel, softmax_kernel
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,11 @@ class KernelConfig:
     estimate_share: float = 0.95  # part of the output that the estimates have before training
     spread: float = 1.0  # part of a noisy frame's weight that is spread over all its taps before training
     threshold: float = 0.5  # t·K: 0.5 is the paper's t = 1 / (2K)
+    activation: str = "softmax"  # or "relu", the paper's; both with the threshold, 0 for none
 
     def __post_init__(self) -> None:
+        if self.activation not in ("relu", "softmax"):
+            raise ValueError(f"activation: expected relu or softmax, got {self.activation!r}")
         for name in ("frames", "size"):
             value = getattr(self, name)
             if value < 1 or value % 2 == 0:
@@ -99,6 +104,23 @@ class RAResNetConfig:
 
 
 @dataclass(frozen=True)
+class MultiScaleConfig:
+    """A Robust Average network with kernels at several resolutions."""
+
+    base: RAUNetConfig | RAResNetConfig = field(default_factory=RAUNetConfig)
+    scales: int = 3  # full, half and quarter resolution
+
+    def __post_init__(self) -> None:
+        if self.scales < 1:
+            raise ValueError(f"scales: expected at least 1, got {self.scales}")
+
+    @property
+    def kernel(self) -> KernelConfig:
+        """The kernels, alike at every resolution."""
+        return self.base.kernel
+
+
+@dataclass(frozen=True)
 class TKPCNConfig:
     """Residual network without Robust Average blocks, with a temporal module at its end: the paper's baseline."""
 
@@ -129,15 +151,20 @@ class KernelHead(nn.Module):
 
     Notes
     -----
-    The raw weight of tap i is ``b_i c_i e^{h_i}``, which is normalised and thresholded. b is the kernel at the start:
-    on each noisy frame a peak on the pixel itself and the rest (`KernelConfig.spread`) on all its taps, on each
-    estimate nearly all on the pixel itself, times the share of the source; c is the confidence of the frame; h is what
-    the convolution predicts, bounded to ±4 on the noisy frames and ±1 on the estimates. The training thus starts from
-    the gated average of the estimates with a tenth of the noisy frames, or without estimates from the mean over time
-    and the taps. A noisy tap may gain or lose a factor of 55, and what falls below the threshold is gone; but what has
-    no confidence stays out, whatever is predicted. With sums ``b_i c_i + h_i``, and with taps around the pixel on the
-    estimates too, some weight leaked past every edge and to frames that were not to be trusted: a shot with sharp
-    outlines came out 0.6 dB below the start.
+    h is what the convolution predicts, c the confidence of the frame, b the kernel at the start: on each noisy frame a
+    peak on the pixel itself and the rest (`KernelConfig.spread`) on all its taps, on each estimate nearly all on the
+    pixel itself, times the share of the source.
+
+    With softmax the raw weights are ``log(b_i c_i) + h_i``, so that the kernel is ``b_i c_i e^{h_i}``, normalised and
+    thresholded, with h bounded to ±4 on the noisy frames and ±1 on the estimates. The training thus starts from the
+    gated average of the estimates with a tenth of the noisy frames, or without estimates from the mean over time and
+    the taps. A noisy tap may gain or lose a factor of 55, and what falls below the threshold is gone; but what has no
+    confidence stays out, whatever is predicted.
+
+    With relu, the paper's η_t, they are ``t + (1 − tK) b_i c_i + s h_i``, s the mean of the source's b. As ``η_t``
+    takes t away and renormalises, h = 0 gives the same start, and a tap may reach any weight and none. With estimates
+    some weight leaked past every edge and to frames that were not to be trusted: a shot with sharp outlines came out
+    0.6 dB below the start.
     """
 
     window_start: Tensor
@@ -178,17 +205,26 @@ class KernelHead(nn.Module):
         config = self.config
         here = present.float().view(-1, 1, 1, 1) if config.estimate_size else features.new_zeros(1, 1, 1, 1).float()
         taps = config.window_taps + here * config.estimate_taps
-        share = (config.estimate_share * here).unsqueeze(1)
+        share = config.estimate_share * here
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         confidence = confidence.float() + 1e-3
-        factor = _factor(_frames_first(self.window(features), config.frames), 4)
-        weights = ((1 - share) / config.window_taps * confidence * self.window_start * factor).flatten(1, 2)
+        confidence = confidence / confidence.mean(1, keepdim=True)
+        # Scales of the sources' weights, in units of 1/K: 1 where there is one source.
+        sources = [(self.window, self.window_start, taps * (1 - share) / config.window_taps, 4.0)]
         if self.estimate is not None:
-            factor = _factor(_frames_first(self.estimate(features), config.frames), 1)
-            more = share / config.estimate_taps * confidence * self.estimate_start * factor
-            weights = torch.cat([weights, more.flatten(1, 2)], 1)
-        cut = config.threshold if threshold is None else _check_threshold(threshold)
-        return predict_kernel(weights, cut / taps, centre=config.centre)
+            sources.append((self.estimate, self.estimate_start, taps * share / config.estimate_taps, 1.0))
+        weights = []
+        for convolution, start, scale, bound in sources:
+            raw = _frames_first(convolution(features), config.frames)
+            scale = scale.view(-1, 1, 1, 1, 1)
+            if config.activation == "softmax":  # absent, a source is at log(0), and has no weight
+                weights.append(bound * torch.tanh(raw / bound) + (confidence.log() + (scale * start).log()))
+            else:
+                floor = config.threshold * (scale > 0)
+                weights.append(floor + scale * ((1 - config.threshold) * confidence * start + raw))
+        cut = (config.threshold if threshold is None else _check_threshold(threshold)) / taps
+        activate = softmax_kernel if config.activation == "softmax" else predict_kernel
+        return activate(torch.cat([weight.flatten(1, 2) for weight in weights], 1), cut, centre=config.centre)
 
 
 class RAUNet(nn.Module):
@@ -242,6 +278,10 @@ class RAUNet(nn.Module):
         ValueError
             If frames or channels are not the model's, or height or width is no multiple of `multiple`.
         """
+        return cast(Tensor, self.head(self.trunk(features), confidence, present, threshold))
+
+    def trunk(self, features: Tensor) -> Tensor:
+        """Features of an aligned window to those that kernels are predicted from, ``(T·N, C, H, W)``, time first."""
         frames = self.config.kernel.frames
         x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
         skips = []
@@ -255,7 +295,7 @@ class RAUNet(nn.Module):
         for scale in reversed(range(len(skips))):
             x = skips[scale] + functional.interpolate(self.up[scale](x), scale_factor=2.0, mode="nearest")
             x = self.decode[scale](x)
-        return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
+        return torch.relu(x)
 
 
 class RAResNet(nn.Module):
@@ -297,6 +337,10 @@ class RAResNet(nn.Module):
 
     def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
         """Kernels of an aligned window; see `RAUNet.forward`."""
+        return cast(Tensor, self.head(self.trunk(features), confidence, present, threshold))
+
+    def trunk(self, features: Tensor) -> Tensor:
+        """See `RAUNet.trunk`."""
         x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
         section, skips = x, iter(self.skip)
         for count, block in enumerate(self.blocks, start=1):
@@ -307,7 +351,7 @@ class RAResNet(nn.Module):
                 if skip is not None:
                     x = skip(torch.cat([x, section], 1))
                 section = x
-        return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
+        return torch.relu(x)
 
 
 class TKPCN(nn.Module):
@@ -346,41 +390,99 @@ class TKPCN(nn.Module):
         return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
 
 
-Model = RAUNet | RAResNet | TKPCN
+class MultiScale(nn.Module):
+    """A Robust Average network whose kernels are predicted at full, half and quarter resolution, and blended.
+
+    Parameters
+    ----------
+    config : MultiScaleConfig
+        The network, and the number of resolutions.
+
+    Notes
+    -----
+    The network's features, averaged over 2×2 pixels once and again, go to a head of each resolution. A convolution on
+    the centre's features tells, pixel by pixel, how much of the low frequencies comes from the next coarser resolution:
+    K×K taps there reach twice as far. It starts at 2 %.
+
+    References
+    ----------
+    Vogels et al. 2018, section 5.3, doi:10.1145/3197517.3201388; Kalojanov and Thurston 2023, section 7.
+    """
+
+    def __init__(self, config: MultiScaleConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.base = RAUNet(config.base) if isinstance(config.base, RAUNetConfig) else RAResNet(config.base)
+        width = self.base.head.window.in_channels
+        self.heads = nn.ModuleList(KernelHead(width, config.kernel) for _ in range(config.scales - 1))
+        self.blend = nn.ModuleList(nn.Conv2d(width, 1, 3, padding=1) for _ in range(config.scales - 1))
+        for convolution in self.blend:
+            nn.init.constant_(cast(Tensor, convolution.bias), -4.0)
+
+    @property
+    def multiple(self) -> int:
+        """Height and width must be multiples of this."""
+        return max(self.base.multiple, int(2 ** (self.config.scales - 1)))
+
+    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Pyramid:
+        """Kernels of an aligned window at each resolution; the arguments are those of `RAUNet.forward`."""
+        for name, length in zip(("height", "width"), features.shape[3:], strict=True):
+            if length % self.multiple:
+                raise ValueError(f"features: expected a {name} that is a multiple of {self.multiple}, got {length}")
+        x = self.base.trunk(features)
+        kernels, blends = [self.base.head(x, confidence, present, threshold)], []
+        for head, blend in zip(self.heads, self.blend, strict=True):
+            centre = x.chunk(self.config.kernel.frames)[self.config.kernel.frames // 2]
+            blends.append(torch.sigmoid(blend(centre)).float())
+            x, confidence = functional.avg_pool2d(x, 2), functional.avg_pool3d(confidence, (1, 2, 2))
+            kernels.append(head(x, confidence, present, threshold))
+        return Pyramid(tuple(kernels), tuple(blends))
+
+
+Model = RAUNet | RAResNet | TKPCN | MultiScale
 
 
 def fast(frames: int = 5, seed: int = 0) -> RAUNet:
-    """Small U-Net for two CPU cores: 0.24 M parameters, 0.2 M multiplications per pixel.
+    """Small U-Net for two CPU cores: 0.25 M parameters, 0.25 M multiplications per pixel and window.
 
     Parameters
     ----------
     frames : int
-        Window length.
+        Window length, odd; so for all presets.
     seed : int
-        Of the initial weights.
+        Of the initial weights; so for all presets.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        # The threshold: noisy taps start at a hundredth of the mean weight, and must not be cut before they learn.
-        kernel = KernelConfig(frames=frames, estimate_size=1, estimate_share=0.9, threshold=0.005)
-        return RAUNet(RAUNetConfig(kernel))
+    with _seeded(seed):
+        return RAUNet(RAUNetConfig(_beside_estimates(frames)))
 
 
-def paper(frames: int = 5, conv_size: int = 3, seed: int = 0) -> RAResNet:
-    """The paper's network: 24 blocks of width 80, no estimate.
+def balanced(frames: int = 5, seed: int = 0) -> RAUNet:
+    """U-Net of twice the width at full resolution, with RA blocks at every scale: 0.4 M parameters."""
+    with _seeded(seed):
+        return RAUNet(RAUNetConfig(_beside_estimates(frames), widths=(32, 48, 64), ra_scales=(0, 1, 2)))
 
-    Parameters
-    ----------
-    frames : int
-        Window length.
-    conv_size : int
-        Size of the convolutions, which the paper leaves open.
-    seed : int
-        Of the initial weights.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return RAResNet(RAResNetConfig(KernelConfig(frames=frames), conv_size=conv_size))
+
+def quality(frames: int = 5, seed: int = 0) -> MultiScale:
+    """Four-scale U-Net with RA blocks at every scale and kernels at three resolutions: 1.6 M parameters."""
+    with _seeded(seed):
+        base = RAUNetConfig(_beside_estimates(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
+        return MultiScale(MultiScaleConfig(base))
+
+
+def paper(frames: int = 5, seed: int = 0, conv_size: int = 3) -> RAResNet:
+    """The paper's network: 24 blocks of width 80, no estimate; conv_size is what the paper leaves open."""
+    with _seeded(seed):
+        return RAResNet(RAResNetConfig(KernelConfig(frames=frames, activation="relu"), conv_size=conv_size))
+
+
+def tkpcn(frames: int = 5, seed: int = 0, conv_size: int = 3) -> TKPCN:
+    """The paper's baseline at the size of `paper`: no RA blocks, the temporal module of Vogels et al. 2018 instead."""
+    with _seeded(seed):
+        return TKPCN(TKPCNConfig(KernelConfig(frames=frames, activation="relu"), conv_size=conv_size))
+
+
+#: What can be asked for by name.
+PRESETS: dict[str, Callable[..., Model]] = {build.__name__: build for build in (fast, balanced, quality, paper, tkpcn)}
 
 
 def for_inference(model: Model, bfloat16: bool) -> Model:
@@ -391,8 +493,15 @@ def for_inference(model: Model, bfloat16: bool) -> Model:
     """
     dtype = torch.bfloat16 if bfloat16 else torch.float32
     for parameter in model.eval().requires_grad_(False).parameters():
-        layout = torch.channels_last if parameter.ndim == 4 else torch.preserve_format
-        parameter.data = parameter.to(dtype=dtype, memory_format=layout)
+        parameter.data = parameter.to(dtype)
+    return channels_last(model)
+
+
+def channels_last(model: Model) -> Model:
+    """Lay the weights of the convolutions out with the channels last, as the activations are; in place."""
+    for parameter in model.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.to(memory_format=torch.channels_last)
     return model
 
 
@@ -408,7 +517,7 @@ def denoise_tile(
     *,
     threshold: float | None = None,
     aovs: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Filtered, Tensor | None]:
     """Denoise one tile of an aligned window.
 
     Parameters
@@ -435,8 +544,8 @@ def denoise_tile(
     -------
     denoised : Tensor
         ``(N, 3, H, W)`` irradiance.
-    share : Tensor
-        ``(N, T, 1, H, W)``, the part each frame has in it; sums to 1 except at the image's border.
+    filtered : Filtered
+        The color's sums of each frame; its ``parts()`` are what each frame contributes.
     aovs : Tensor or None
         ``(N, C, H, W)``, where there were any. Without an estimate of their own, they get the window's taps
         renormalised.
@@ -462,12 +571,26 @@ def denoise_tile(
         present=present,
     )
     kernels = model(features, confidence, present, threshold)
-    numerators, share = filter_window(kernels, color, config.size, estimate, confidence)
     centre = config.frames // 2
-    denoised = mean_of(numerators, share, color[:, centre]).clamp_min(0)
+    filtered = Filtered.of(kernels, color, config.size, estimate, confidence)
+    denoised = filtered.image(color[:, centre]).clamp_min(0)
     if aovs is None:
-        return denoised, share, None
-    return denoised, share, mean_of(*filter_window(kernels, aovs, config.size), aovs[:, centre])
+        return denoised, filtered, None
+    return denoised, filtered, Filtered.of(kernels, aovs, config.size).image(aovs[:, centre])
+
+
+def _beside_estimates(frames: int) -> KernelConfig:
+    """Kernels of the presets that take estimates."""
+    # The threshold: noisy taps start at a hundredth of the mean weight, and must not be cut before they learn.
+    return KernelConfig(frames=frames, estimate_size=1, estimate_share=0.9, threshold=0.005)
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Initial weights of their own; the global generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
 
 
 def _time_first(features: Tensor, config: KernelConfig, multiple: int, dtype: torch.dtype) -> Tensor:
@@ -485,11 +608,6 @@ def _frames_first(x: Tensor, frames: int) -> Tensor:
     """``(T·N, K·K, H, W)`` to float32 ``(N, T, K·K, H, W)``, planes contiguous as the kernels' passes want them."""
     x = x.unflatten(0, (frames, -1)).transpose(0, 1)
     return x.to(torch.float32, memory_format=torch.contiguous_format)
-
-
-def _factor(predicted: Tensor, bound: float) -> Tensor:
-    """``e^h``, h the prediction bounded smoothly to ±bound."""
-    return torch.exp(bound * torch.tanh(predicted / bound))
 
 
 def _peak(size: int, spread: float) -> Tensor:

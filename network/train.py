@@ -1,6 +1,7 @@
-"""Training of a network on clips: a plain loop.
+"""Training of a network on clips: a plain loop, in one process or several.
 
-``python -m network.train CLIPS -o W.safetensors --minutes 30``
+Several processes are those of ``torchrun``: each makes its share of every batch, gradients are averaged, and the first
+process validates and writes. Plain torch does it in a few lines, so no framework is asked for.
 
 Set ``OMP_WAIT_POLICY=PASSIVE`` in the environment (it is read when torch is imported): OpenMP's threads
 otherwise spin while they wait, and a step takes ten times as long on a machine that has other work.
@@ -8,30 +9,33 @@ otherwise spin while they wait, and a step takes ten times as long on a machine 
 
 from __future__ import annotations
 
-import argparse
 import copy
+import itertools
 import json
 import math
 import os
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.data import DataLoader
 
 from network import losses
-from network.checkpoint import describe, load_model, save_model
-from network.clips import Clip, Sampler, SamplerConfig, load_clips, split_by_shot, whole_frame
+from network.checkpoint import describe, save_model
+from network.clips import Clips, SamplerConfig, Samples, whole_frames
 from network.inputs import network_inputs
-from network.kernels import filter_window, mean_of
-from network.models import Model, fast, paper
+from network.kernels import Filtered, mean_of
+from network.models import Model, channels_last
+from network.perceptual import Perceptual, load_vgg19
 
 LOSSES: dict[str, losses.ImageLoss] = {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse}
 TERMS = ("temporal", "power", "spatial")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -40,17 +44,21 @@ class TrainConfig:
 
     steps: int | None = None  # stop after so many steps; reproducible from the seed
     minutes: float | None = None  # or after so long, whichever comes first
-    batch: int = 2
+    batch: int = 2  # of all processes together
     rate: float = 1e-3  # peak learning rate
     warmup: int = 200  # steps of linear rise; the kernels start at a sane mean, and must not be thrown off it
     weight_decay: float = 1e-4
     clip_norm: float = 1.0  # largest norm of the gradient; one firefly is one sample
     ema: float = 0.999  # of the weights that are validated and kept
-    loss: str = "relmse"
+    loss: str = "relmse"  # which leaves the mean alone: of LOSSES, or perceptual
+    vgg: str | None = None  # weights of VGG19 in torchvision's format, or hub; for perceptual
     terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
     whole: float = 1.0  # weight of the whole window's term beside the temporal ones
     slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
     bfloat16: bool = True  # for the convolutions; kernels and losses are float32
+    compile: bool = False  # torch.compile the network: a minute at the start, pays on a GPU
+    device: str = "auto"  # the GPU if there is one
+    workers: int = 0  # processes that read clips; 0: the training itself
     seed: int = 0
     checkpoint_minutes: float = 5.0
     validate_minutes: float = 5.0
@@ -65,10 +73,11 @@ class TrainConfig:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
-        if self.loss not in LOSSES:
-            raise ValueError(f"loss: expected one of {sorted(LOSSES)}, got {self.loss!r}")
-        if self.terms not in TERMS:
-            raise ValueError(f"terms: expected one of {', '.join(TERMS)}, got {self.terms!r}")
+        for name, choices in (("loss", (*LOSSES, "perceptual")), ("terms", TERMS), ("device", DEVICES)):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        if (self.loss == "perceptual") != (self.vgg is not None):
+            raise ValueError("vgg: expected weights with the perceptual loss, and only with it")
         if self.whole < 0 or self.slope < 1:
             raise ValueError(f"whole, slope: expected whole >= 0 and slope >= 1, got {self.whole} and {self.slope}")
 
@@ -78,9 +87,15 @@ class TrainConfig:
             return losses.temporal_terms(frames, self.whole)
         return losses.power_terms(frames) if self.terms == "power" else losses.spatial_terms(frames)
 
+    def image_loss(self) -> losses.ImageLoss:
+        """The image loss by name; reads VGG19 for the perceptual one."""
+        return LOSSES[self.loss] if self.vgg is None else Perceptual(load_vgg19(self.vgg))
 
-def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> tuple[Tensor, Tensor]:
-    """Numerators and denominators of a batch from `Sampler.batch`; see `network.kernels.filter_window`."""
+
+def predict(
+    model: Model, batch: dict[str, Tensor], bfloat16: bool = False, run: Callable[..., Any] | None = None
+) -> Filtered:
+    """Filter a batch of `Samples`; `run` stands for the model where it is wrapped."""
     config = model.config.kernel
     takes_estimate = config.estimate_size > 0
     present = batch["present"] if takes_estimate else torch.zeros_like(batch["present"])
@@ -96,11 +111,17 @@ def predict(model: Model, batch: dict[str, Tensor], bfloat16: bool = False) -> t
         present=present,
     )
     with torch.autocast(features.device.type, torch.bfloat16, enabled=bfloat16):
-        kernels = model(features, batch["confidence"], present)
-    return filter_window(kernels, batch["color"], config.size, estimate, batch["confidence"])
+        kernels = (run or model)(features, batch["confidence"], present)
+    return Filtered.of(kernels, batch["color"], config.size, estimate, batch["confidence"])
 
 
-def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> Tensor:
+def batch_loss(
+    model: Model,
+    batch: dict[str, Tensor],
+    config: TrainConfig,
+    loss: losses.ImageLoss,
+    run: Callable[..., Any] | None = None,
+) -> Tensor:
     """Training loss of a batch: the temporal loss of each crop, relative to that of its best input.
 
     Notes
@@ -109,32 +130,30 @@ def batch_loss(model: Model, batch: dict[str, Tensor], config: TrainConfig) -> T
     Each crop's loss is divided by the loss of the mean of the window weighted by confidence, or of the centre's
     estimate if that is lower, so that every crop counts about the same.
     """
-    loss = LOSSES[config.loss]
-    numerators, denominators = predict(model, batch, config.bfloat16)
+    filtered = predict(model, batch, config.bfloat16, run)
     color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
-    terms = config.loss_terms(color.shape[1])
+    centre, terms = color.shape[1] // 2, config.loss_terms(color.shape[1])
     value = losses.temporal_loss(
-        loss, numerators, denominators, color, batch["target"], modulation, batch["exposure"], terms, config.slope
+        loss, filtered, color, batch["target"], modulation, batch["exposure"], terms, config.slope
     )
     with torch.no_grad():
         scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
-        mean = mean_of(color * confidence, confidence, color[:, color.shape[1] // 2])
+        mean = mean_of(color * confidence, confidence, color[:, centre])
         # The floor matters only where the input equals the target, as in a synthetic or an empty crop.
-        alone = batch["estimate"][:, color.shape[1] // 2]
-        inputs = [loss(image * modulation, batch["target"], scale) for image in (mean, alone)]
+        inputs = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, centre])]
         reference = torch.minimum(*inputs).clamp_min(1e-4)
     return (value / reference).mean()
 
 
 @torch.no_grad()
-def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
-    """Means over whole validation clips.
+def validate(model: Model, clips: Clips) -> dict[str, float]:
+    """Means over whole validation clips, each at all of its noise levels.
 
     Parameters
     ----------
     model : Model
         The model.
-    clips : sequence of Clip
+    clips : Clips
         At least one.
 
     Returns
@@ -145,9 +164,11 @@ def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
         denoised over that of the targets. ``side``: weight of the side frames.
     """
     sums: dict[str, float] = {}
-    for clip in clips:
-        batch = whole_frame(clip, model.multiple)
-        centre = len(clip.color) // 2
+    device = next(model.parameters()).device
+    batches = [batch for index in range(len(clips)) for batch in whole_frames(clips, index, model.multiple)]
+    for batch in batches:
+        batch = {name: value.to(device) for name, value in batch.items()}
+        centre = batch["color"].shape[1] // 2
         modulation, target = batch["modulation"], batch["target"]
         estimate, confidence = batch["estimate"], batch["confidence"]
         images = {
@@ -156,32 +177,32 @@ def validate(model: Model, clips: Sequence[Clip]) -> dict[str, float]:
             "gated": mean_of(estimate * confidence, confidence, estimate[:, centre]),
         }
         for name, present in (("blind", 0.0), ("denoised", 1.0)):
-            batch["present"] = torch.full((1,), present)
-            numerators, share = predict(model, batch)
-            images[name] = mean_of(numerators, share, batch["color"][:, centre])
+            batch["present"] = torch.full_like(batch["present"], present)
+            filtered = predict(model, batch)
+            images[name] = filtered.image(batch["color"][:, centre])
         values = {name: float(losses.tone_mapped_psnr(image * modulation, target)) for name, image in images.items()}
         values["mean"] = float((images["denoised"] * modulation).sum() / target.sum().clamp_min(1e-6))
-        values["side"] = 1 - float(share[:, centre].mean() / share.sum(1).mean())
+        values["side"] = 1 - float(filtered.parts()[1][:, centre].mean())
         for name, value in values.items():
-            sums[name] = sums.get(name, 0.0) + value / len(clips)
+            sums[name] = sums.get(name, 0.0) + value / len(batches)
     return sums
 
 
 def train(
-    training: Sequence[Clip],
-    validation: Sequence[Clip],
+    training: Clips,
+    validation: Clips,
     model: Model,
     config: TrainConfig,
     out: str | os.PathLike[str],
     *,
     resume: bool = False,
-    report: Callable[[str], None] = lambda line: None,
+    log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
 ) -> list[float]:
     """Train a model and write its averaged weights.
 
     Parameters
     ----------
-    training, validation : sequence of Clip
+    training, validation : Clips
         Of disjoint shots; validation may be empty.
     model : Model
         Trained in place from the weights it has.
@@ -192,26 +213,36 @@ def train(
         needs and is removed at the end.
     resume : bool
         Go on from ``OUT.state``, as if the training had not been interrupted.
-    report : callable
-        Is given lines of text on how it goes.
+    log : callable
+        Is given the steps done and, after every step, ``train/loss``, ``train/rate``, ``train/norm`` (of the gradient),
+        ``done`` (0 to 1) and ``seconds`` (since the start); after a validation its values, as ``validation/psnr`` and
+        so on. Only in the first process.
 
     Returns
     -------
     list of float
-        Loss of each step of this run.
+        Loss of each step of this run; of several processes, of this one's share.
 
     Raises
     ------
     ValueError
-        If the state to resume is cut short or of another training.
+        If the state to resume is cut short or of another training, or the batch cannot be shared evenly.
     FileNotFoundError
         If there is no state to resume.
+
+    Notes
+    -----
+    In a process group (``torch.distributed``, gloo or nccl) each process trains on its share of every batch, and
+    `DistributedDataParallel` averages the gradients: the same as one process on the whole batch.
     """
+    rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if _in_group() else (0, 1)
+    if config.batch % world:
+        raise ValueError(f"batch: expected a multiple of the {world} processes, got {config.batch}")
+    device = _device(config.device)
     state_path = Path(f"{os.fspath(out)}.state")
-    model.train()
+    channels_last(model.to(device).train())
     average = copy.deepcopy(model).requires_grad_(False)
     optimizer = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=config.weight_decay)
-    sampler = Sampler(training, config.sampler, config.seed)
     identity = json.dumps({"model": describe(model), "training": _identity(config)}, sort_keys=True)
     step, before = 0, 0.0
     history: list[dict[str, float]] = []
@@ -222,48 +253,83 @@ def train(
         optimizer.load_state_dict(state["optimizer"])
         progress = json.loads(state["progress"])
         step, before, history = progress["step"], progress["seconds"], progress["history"]
-        sampler.rng.bit_generator.state = progress["rng"]
-    report(
-        f"{sum(p.numel() for p in model.parameters())} parameters, {len(training)} clips for training, "
-        f"{len(validation)} for validation, {torch.get_num_threads()} threads"
-    )
+    loss_of_image = config.image_loss()
+    if isinstance(loss_of_image, nn.Module):
+        loss_of_image.to(device)
+    run: nn.Module = DistributedDataParallel(model) if world > 1 else model
+    if config.compile:
+        run = cast(nn.Module, torch.compile(run))
+    batches = _batches(Samples(training, config.sampler, config.seed), config, step, rank, world)
 
     start = time.monotonic() - before
-    checkpointed = validated = spoken = before
+    checkpointed = validated = before
     values: list[float] = []
-    while (done := _done(config, step, time.monotonic() - start)) < 1:
-        optimizer.param_groups[0]["lr"] = config.rate * _rate(config, step, done)
-        loss = batch_loss(model, sampler.batch(config.batch), config)
+    while (done := _done(config, step, _agreed(time.monotonic() - start, device))) < 1:
+        optimizer.param_groups[0]["lr"] = rate = config.rate * _rate(config, step, done)
+        batch = {name: value.to(device, non_blocking=True) for name, value in next(batches).items()}
+        loss = batch_loss(model, batch, config, loss_of_image, run)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm)
-        if bool(torch.isfinite(norm)):
+        norm = float(nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm))
+        if math.isfinite(norm):
             optimizer.step()
         _follow(average, model, min(config.ema, (1 + step) / (10 + step)))
         step += 1
         values.append(loss.item())
-
+        if rank:
+            continue
         now = time.monotonic() - start
-        if now - spoken > 15:
-            spoken = now
-            left = now / done * (1 - done) if done > 0 else math.nan
-            recent = values[-100:]
-            report(f"step {step}  loss {sum(recent) / len(recent):.4f}  {now / 60:.1f} min, {left / 60:.1f} min left")
-        if validation and now - validated > 60 * config.validate_minutes:
+        done = _done(config, step, now)
+        log(step, {"train/loss": values[-1], "train/rate": rate, "train/norm": norm, "done": done, "seconds": now})
+        if len(validation) and now - validated > 60 * config.validate_minutes:
             history.append({"step": step, **validate(average, validation)})
-            report(_line(history[-1]))
+            log(step, {f"validation/{name}": value for name, value in history[-1].items() if name != "step"})
             validated = time.monotonic() - start
         if now - checkpointed > 60 * config.checkpoint_minutes:
             _write(out, average, config, history)
-            progress = {"step": step, "seconds": now, "history": history, "rng": sampler.rng.bit_generator.state}
+            progress = {"step": step, "seconds": now, "history": history}
             _write_state(state_path, identity, model, average, optimizer, progress)
             checkpointed = now
-    if validation:
-        history.append({"step": step, **validate(average, validation)})
-        report(_line(history[-1]))
-    _write(out, average, config, history)
-    state_path.unlink(missing_ok=True)
+    if rank == 0:
+        if len(validation):
+            history.append({"step": step, **validate(average, validation)})
+            log(step, {f"validation/{name}": value for name, value in history[-1].items() if name != "step"})
+        _write(out, average, config, history)
+        state_path.unlink(missing_ok=True)
     return values
+
+
+def _in_group() -> bool:
+    """Whether this is one of several processes that train together."""
+    return torch.distributed.is_available() and torch.distributed.is_initialized()
+
+
+def _device(name: str) -> torch.device:
+    """Where to train; in a group each process has a GPU of its own."""
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise ValueError("device: expected a GPU that torch can use, got none")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+
+
+def _batches(samples: Samples, config: TrainConfig, first: int, rank: int, world: int) -> Iterator[dict[str, Tensor]]:
+    """Batches from step `first` on, without end: of each the share of this process."""
+    share = config.batch // world
+    numbers = ([step * config.batch + rank * share + k for k in range(share)] for step in itertools.count(first))
+    loader: DataLoader[dict[str, Tensor]] = DataLoader(
+        samples, batch_sampler=cast(Any, numbers), num_workers=config.workers, pin_memory=torch.cuda.is_available()
+    )
+    return iter(loader)
+
+
+def _agreed(seconds: float, device: torch.device) -> float:
+    """The first process's clock, so that all stop at the same step."""
+    if not _in_group():
+        return seconds
+    clock = torch.tensor(seconds, dtype=torch.float64, device=device)
+    torch.distributed.broadcast(clock, 0)
+    return float(clock)
 
 
 def _done(config: TrainConfig, step: int, seconds: float) -> float:
@@ -284,15 +350,10 @@ def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
     torch._foreach_lerp_(list(average.parameters()), list(model.parameters()), 1 - decay)
 
 
-def _line(values: dict[str, float]) -> str:
-    """One validation in one line."""
-    return "validation  " + "  ".join(f"{name} {value:.3f}" for name, value in values.items())
-
-
 def _identity(config: TrainConfig) -> dict[str, Any]:
     """The configuration less what may change between an interruption and its resumption."""
     values = asdict(config)
-    for name in ("checkpoint_minutes", "validate_minutes"):
+    for name in ("checkpoint_minutes", "validate_minutes", "workers"):
         del values[name]
     return values
 
@@ -324,7 +385,7 @@ def _write_state(
 
 
 def _read_state(path: Path, identity: str) -> dict[str, Any]:
-    """State of an interrupted training, if it is one of this model and configuration."""
+    """State of an interrupted training of this model and configuration; nothing but tensors is unpickled."""
     if not path.is_file():
         raise FileNotFoundError(f"resume: no file {os.fspath(path)!r}")
     try:
@@ -335,65 +396,3 @@ def _read_state(path: Path, identity: str) -> dict[str, Any]:
     if found != identity:
         raise ValueError(f"resume {os.fspath(path)!r}: expected the same model and configuration, got another")
     return state
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command ``ravg train``; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="ravg train", description="Train a network on clips.")
-    parser.add_argument("clips", help="folder of .npz clips")
-    parser.add_argument("-o", "--out", required=True, help="safetensors file to write")
-    parser.add_argument("--preset", choices=("fast", "paper"), default="fast")
-    parser.add_argument("--init", help="weights to start from, of any preset; without: random ones of --preset")
-    parser.add_argument("--minutes", type=float, help="stop after so many minutes")
-    parser.add_argument("--steps", type=int, help="stop after so many steps")
-    parser.add_argument("--validation", nargs="*", default=[], metavar="SHOT", help="shots kept out of training")
-    parser.add_argument("--batch", type=int, default=TrainConfig.batch)
-    parser.add_argument("--rate", type=float, default=TrainConfig.rate)
-    parser.add_argument("--loss", choices=sorted(LOSSES), default=TrainConfig.loss)
-    parser.add_argument("--whole", type=float, default=TrainConfig.whole, help="weight of the whole window's term")
-    parser.add_argument("--crop", type=int, default=SamplerConfig.crop)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, help="threads of torch")
-    parser.add_argument("--float32", action="store_true", help="no bfloat16")
-    parser.add_argument("--resume", action="store_true", help="go on from OUT.state")
-    options = parser.parse_args(arguments)
-    try:
-        config = TrainConfig(
-            steps=options.steps,
-            minutes=options.minutes,
-            batch=options.batch,
-            rate=options.rate,
-            loss=options.loss,
-            whole=options.whole,
-            bfloat16=not options.float32,
-            seed=options.seed,
-            sampler=SamplerConfig(crop=options.crop),
-        )
-    except ValueError as error:
-        parser.error(str(error))
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    presets: dict[str, Callable[..., Model]] = {"fast": fast, "paper": paper}
-    try:
-        training, validation = split_by_shot(load_clips(options.clips), options.validation)
-        if options.init:
-            model = load_model(options.init).float().train().requires_grad_(True)
-        else:
-            model = presets[options.preset](frames=training[0].color.shape[0], seed=options.seed)
-        train(
-            training,
-            validation,
-            model,
-            config,
-            options.out,
-            resume=options.resume,
-            report=lambda line: print(line, flush=True),
-        )
-    except (ValueError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,6 +12,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from network.kernels import (
+    Filtered,
+    Pyramid,
     apply_kernels,
     filter_window,
     mean_of,
@@ -261,3 +263,75 @@ def test_an_estimate_of_another_number_of_frames_is_an_error() -> None:
         filter_window(torch.zeros(1, 29, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 2, 1, 4, 4))
     with pytest.raises(ValueError, match="confidence: expected one beside estimate, got none"):
         filter_window(torch.zeros(1, 30, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 3, 1, 4, 4))
+
+
+# Several resolutions
+
+
+def pyramid(n: int = 1, frames: int = 3, size: int = 3, side: int = 8) -> Pyramid:
+    taps = frames * size * size
+    kernels = tuple(predict_kernel(uniform(n, taps, side >> s, side >> s, seed=s), centre=taps // 2) for s in range(3))
+    return Pyramid(kernels, tuple(uniform(n, 1, side >> s, side >> s, seed=10 + s) for s in range(2)))
+
+
+def halved(image: torch.Tensor) -> torch.Tensor:
+    """Mean of 2×2 pixels, written out."""
+    return (image[..., ::2, ::2] + image[..., 1::2, ::2] + image[..., ::2, 1::2] + image[..., 1::2, 1::2]) / 4
+
+
+def doubled(image: torch.Tensor) -> torch.Tensor:
+    """Linear interpolation to twice the size, row by row and column by column: weights 3/4 and 1/4, clamped."""
+    for axis in (-2, -1):
+        x = image.movedim(axis, 0)
+        rows = []
+        for i in range(len(x)):
+            rows += [0.75 * x[i] + 0.25 * x[max(i - 1, 0)], 0.75 * x[i] + 0.25 * x[min(i + 1, len(x) - 1)]]
+        image = torch.stack(rows).movedim(0, axis)
+    return image
+
+
+@pytest.mark.parametrize("subset", [None, (0, 2)])
+def test_resolutions_are_blended_as_in_the_equation(subset: tuple[int, ...] | None) -> None:
+    kernels, color = pyramid(), uniform(1, 3, 2, 8, 8, seed=5)
+    fallback = color[:, 1]
+    got = Filtered.of(kernels, color, 3).image(fallback, subset)
+    images = []
+    for kernel in kernels.kernels:
+        numerators, denominators = by_loops(kernel, color)
+        index = list(subset or range(3))
+        images.append((numerators[:, index].sum(1) + 1e-6 * color[:, 1]) / (denominators[:, index].sum(1) + 1e-6))
+        color = halved(color)
+    for fine, blend in ((1, 1), (0, 0)):
+        images[fine] = images[fine] + kernels.blends[blend] * doubled(images[fine + 1] - halved(images[fine]))
+    torch.testing.assert_close(got, images[0])
+
+
+def test_parts_of_several_resolutions_sum_to_the_image_and_to_one() -> None:
+    color = uniform(2, 3, 2, 8, 8, seed=5)
+    for kernels in (pyramid(2), pyramid(2).kernels[0]):
+        filtered = Filtered.of(kernels, color, 3)
+        parts, shares = filtered.parts()
+        torch.testing.assert_close(parts.sum(1), filtered.image(color[:, 1]), rtol=1e-5, atol=1e-5)  # ε = 1e-6
+        torch.testing.assert_close(shares.sum(1), torch.ones(2, 1, 8, 8, dtype=torch.float64))
+
+
+def test_without_blend_only_the_finest_resolution_counts() -> None:
+    kernels, color = pyramid(), uniform(1, 3, 2, 8, 8, seed=5)
+    fine = Pyramid(kernels.kernels, tuple(torch.zeros_like(blend) for blend in kernels.blends))
+    expected = Filtered.of(kernels.kernels[0], color, 3).image(color[:, 1])
+    torch.testing.assert_close(Filtered.of(fine, color, 3).image(color[:, 1]), expected)
+
+
+def test_a_constant_passes_all_resolutions() -> None:
+    color = torch.full((1, 3, 2, 8, 8), 3.7, dtype=torch.float64)
+    torch.testing.assert_close(Filtered.of(pyramid(), color, 3).image(color[:, 1]), color[:, 1])
+
+
+def test_gradient_through_all_resolutions() -> None:
+    kernels, color = pyramid(side=4), uniform(1, 3, 1, 4, 4, seed=5)
+    leaves = [value.clone().requires_grad_() for value in (*kernels.kernels, *kernels.blends)]
+
+    def image(*values: torch.Tensor) -> torch.Tensor:
+        return Filtered.of(Pyramid(values[:3], values[3:]), color, 3).image(color[:, 1], (0, 2), 1e-3)
+
+    assert torch.autograd.gradcheck(image, leaves)

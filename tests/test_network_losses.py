@@ -10,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.kernels import apply_kernels, mean_of, predict_kernel
+from network.kernels import Filtered, apply_kernels, mean_of, predict_kernel
 from network.losses import (
     SUBSET_EPSILON,
     asymmetry,
@@ -172,7 +172,7 @@ def test_temporal_loss_is_the_loss_of_renormalised_subsets(terms) -> None:  # ty
     kernels = predict_kernel(uniform(2, frames * 9, 6, 5), 0.0, centre=frames * 9 // 2)
     color, target = uniform(2, frames, 3, 6, 5, seed=1), uniform(2, 3, 6, 5, seed=2)
     modulation, scale = uniform(2, 3, 6, 5, seed=3), torch.tensor([0.5, 2.0], dtype=torch.float64)
-    numerators, denominators = apply_kernels(kernels, color)
+    filtered = Filtered(*apply_kernels(kernels, color))
 
     expected = 0
     for subset, weight in terms:
@@ -183,7 +183,7 @@ def test_temporal_loss_is_the_loss_of_renormalised_subsets(terms) -> None:  # ty
         image = mean_of(*apply_kernels(part, color), color[:, frames // 2], 0) * modulation
         expected = expected + weight * l1(image, target, scale * modulation.mean((1, 2, 3)))
     expected = expected / sum(weight for _, weight in terms)
-    got = temporal_loss(l1, numerators, denominators, color, target, modulation, scale, terms)
+    got = temporal_loss(l1, filtered, color, target, modulation, scale, terms)
     # A subset has a share of about 1/5 or more; its fallback weighs 1e-3 beside that.
     torch.testing.assert_close(got, expected, rtol=2e-2, atol=0)
     assert SUBSET_EPSILON == 1e-3
@@ -194,8 +194,9 @@ def test_frames_without_weight_are_judged_by_their_own_pixels() -> None:
     color, target = uniform(1, 5, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
     numerators, denominators = torch.zeros(1, 5, 3, 4, 4).double(), torch.zeros(1, 5, 1, 4, 4).double()
     numerators[:, 2], denominators[:, 2] = color[:, 2], 1
+    filtered = Filtered(numerators, denominators)
     one = torch.ones(1, dtype=torch.float64)
-    got = temporal_loss(l1, numerators, denominators, color, target, torch.ones_like(target), one, temporal_terms(5))
+    got = temporal_loss(l1, filtered, color, target, torch.ones_like(target), one, temporal_terms(5))
     images = [color[:, 2], color[:, [0, 3]].mean(1), color[:, [1, 4]].mean(1)]
     torch.testing.assert_close(got, sum(l1(image, target, one) for image in images) / 3)
 
@@ -205,10 +206,10 @@ def test_temporal_loss_does_not_depend_on_the_scale() -> None:
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     scale = torch.ones(1, dtype=torch.float64)
     terms = temporal_terms(3, 1.0)
-    once = temporal_loss(relmse, *sums, color, target, modulation, scale, terms, 3.0)
+    once = temporal_loss(relmse, Filtered(*sums), color, target, modulation, scale, terms, 3.0)
     numerators, denominators = sums
     scaled = temporal_loss(
-        relmse, numerators * 512, denominators, color * 512, target * 512, modulation, scale * 512, terms, 3.0
+        relmse, Filtered(numerators * 512, denominators), color * 512, target * 512, modulation, scale * 512, terms, 3.0
     )
     torch.testing.assert_close(scaled, once)
 
@@ -217,7 +218,7 @@ def test_the_slope_weighs_each_terms_errors() -> None:
     color, target = uniform(1, 3, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     one = torch.ones(1, dtype=torch.float64)
-    got = temporal_loss(smape, *sums, color, target, torch.ones_like(target), one, spatial_terms(3), 2.0)
+    got = temporal_loss(smape, Filtered(*sums), color, target, torch.ones_like(target), one, spatial_terms(3), 2.0)
     image = mean_of(*sums, color[:, 1], SUBSET_EPSILON)
     expected = smape(image, target, one, asymmetry(image, target, color[:, 1], 2.0))
     torch.testing.assert_close(got, expected)

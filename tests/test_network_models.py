@@ -13,9 +13,12 @@ torch = pytest.importorskip("torch")
 from network.inputs import network_inputs, window_exposure
 from network.kernels import filter_window, mean_of
 from network.models import (
+    PRESETS,
     TKPCN,
     KernelConfig,
     KernelHead,
+    MultiScale,
+    MultiScaleConfig,
     RAResNet,
     RAResNetConfig,
     RAUNet,
@@ -214,6 +217,17 @@ def test_the_kernels_start_at_the_confidence_in_both_sources(estimate_size: int)
                 torch.testing.assert_close(frames, expected, rtol=0, atol=2e-3)  # 1e-3 is added to each confidence
 
 
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9])
+def test_the_papers_activation_starts_there_whatever_its_threshold(threshold: float) -> None:
+    sources = KernelConfig(frames=3, size=3, estimate_size=3, estimate_share=0.6)
+    confidence = torch.tensor([0.5, 1.0, 0.0]).view(1, 3, 1, 1, 1).expand(2, 3, 1, 4, 4)
+    kernels, expected = (
+        silent_head(config)(torch.zeros(6, 4, 4, 4), confidence, torch.tensor([0.0, 1.0]))
+        for config in (replace(sources, threshold=threshold, activation="relu"), replace(sources, threshold=0))
+    )
+    torch.testing.assert_close(kernels, expected, rtol=1e-4, atol=1e-6)  # what is left of a weight near the threshold
+
+
 def test_an_estimates_taps_start_almost_at_its_own_pixel() -> None:
     config = KernelConfig(frames=3, size=3, estimate_size=3, estimate_share=0.9, spread=0.2, threshold=0)
     kernels = silent_head(config)(torch.zeros(3, 4, 4, 4), torch.ones(1, 3, 1, 4, 4), torch.ones(1))
@@ -318,6 +332,61 @@ def test_the_baselines_frames_meet_in_its_temporal_module_only() -> None:
     assert not torch.equal(after[0][0], after[1][0])
 
 
+def small_multi_scale(kernel: KernelConfig = SMALL) -> MultiScale:
+    torch.manual_seed(0)
+    return MultiScale(MultiScaleConfig(RAUNetConfig(kernel, widths=(4, 8), ra_scales=(1,))))
+
+
+def test_kernels_at_several_resolutions_are_kernels() -> None:
+    kernels = run(small_multi_scale(), window(n=2), 1.0)
+    assert [k.shape[-2:] for k in kernels.kernels] == [(8, 12), (4, 6), (2, 3)]
+    assert [b.shape for b in kernels.blends] == [(2, 1, 8, 12), (2, 1, 4, 6)]
+    for kernel in kernels.kernels:
+        torch.testing.assert_close(kernel.sum(1), torch.ones_like(kernel[:, 0]))
+    for blend in kernels.blends:
+        assert 0 < float(blend.min()) <= float(blend.max()) < 0.2  # starts near the finest alone
+    with pytest.raises(ValueError, match="expected a height that is a multiple of 4"):
+        run(small_multi_scale(), window(h=10))
+
+
+@pytest.mark.parametrize("base", [RAUNetConfig(SMALL, (4, 8), (1,)), RAResNetConfig(SMALL, 4, 2, (1, 2), 1)])
+def test_any_robust_average_network_can_predict_at_several_resolutions(base: RAUNetConfig | RAResNetConfig) -> None:
+    model = MultiScale(MultiScaleConfig(base))
+    assert model.multiple == 4
+    data = window()
+    assert denoised(model, data).shape == (1, 3, 8, 12)
+    constant = {**data, "color": torch.full_like(data["color"], 3.7)}
+    torch.testing.assert_close(denoised(model, constant), torch.full((1, 3, 8, 12), 3.7))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("threshold", [0.0, 0.5])
+def test_a_softmax_starts_at_the_confidence_and_the_estimate_too(threshold: float) -> None:
+    config = KernelConfig(
+        frames=3, size=3, estimate_size=1, estimate_share=0.5, threshold=threshold, activation="softmax"
+    )
+    confidence = torch.tensor([0.5, 1.0, 0.5]).view(1, 3, 1, 1, 1).expand(2, 3, 1, 4, 4)
+    kernels = silent_head(config)(torch.zeros(6, 4, 4, 4), confidence, torch.tensor([0.0, 1.0]))
+    torch.testing.assert_close(kernels.sum(1), torch.ones(2, 4, 4))
+    assert not bool(kernels[0, 27:].any())  # absent: no weight whatever
+    share = kernels[1, 27:].sum(0).mean()
+    assert share == pytest.approx(0.5, abs=0.02) if threshold == 0 else 0.5 < share < 1  # a threshold takes small taps
+    frames = kernels[0, :27, 1, 1].unflatten(0, (3, 9)).sum(1)
+    assert frames[1] > frames[0] == pytest.approx(frames[2])
+    if threshold == 0:
+        assert bool((kernels[0, :27] > 0).all())
+        torch.testing.assert_close(frames, torch.tensor([0.25, 0.5, 0.25]), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_models_of_any_window_length(name: str) -> None:
+    sizes = {"fast": 250_000, "balanced": 400_000, "quality": 1_700_000, "paper": 3_600_000, "tkpcn": 3_400_000}
+    for frames in (3, 5):
+        model = PRESETS[name](frames=frames, seed=1)
+        assert model.config.kernel.frames == frames
+        assert sum(p.numel() for p in model.parameters()) < sizes[name]
+
+
 def test_the_paper_network_has_the_parameters_it_should() -> None:
     """The parts' counts, width 80 and 3×3 convolutions; the sum is not the paper's 24 M."""
     conv = 80 * 80 * 9 + 80
@@ -389,6 +458,8 @@ def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -
         (lambda: RAResNetConfig(conv_size=4), "conv_size: expected an odd number"),
         (lambda: TKPCNConfig(blocks=-1), "blocks, temporal_blocks: expected 0 or more, got -1 and 2"),
         (lambda: TKPCNConfig(conv_size=2), "conv_size: expected an odd number"),
+        (lambda: MultiScaleConfig(scales=0), "scales: expected at least 1, got 0"),
+        (lambda: KernelConfig(activation="tanh"), "activation: expected relu or softmax, got 'tanh'"),
     ],
 )
 def test_configurations_say_what_is_wrong(make, message: str) -> None:  # type: ignore[no-untyped-def]
@@ -432,9 +503,9 @@ def test_denoising_stays_within_the_range_of_its_input() -> None:
 
 def test_a_model_with_an_estimate_also_runs_without() -> None:
     model, data = small_unet(), window()
-    out, share, _ = denoise_tile(model, **data)
+    out, filtered, _ = denoise_tile(model, **data)
     assert bool(torch.isfinite(out).all())
-    torch.testing.assert_close(share.sum(1)[..., 1:-1, 1:-1], torch.ones(1, 1, 6, 10))
+    torch.testing.assert_close(filtered.denominators.sum(1)[..., 1:-1, 1:-1], torch.ones(1, 1, 6, 10))
 
 
 def test_a_model_without_estimates_ignores_one() -> None:

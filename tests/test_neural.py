@@ -4,11 +4,12 @@ from conftest import Scene
 
 torch = pytest.importorskip("torch")
 
+from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.frames import open_shot  # noqa: E402
 from hybrid.neural import Denoiser, has_bfloat16, shipped_weights, write_clips  # noqa: E402
 from hybrid.pseudo_reference import Aligner  # noqa: E402
 from network.checkpoint import save_model  # noqa: E402
-from network.clips import Clip  # noqa: E402
+from network.clips import open_clips  # noqa: E402
 from network.models import fast  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -126,15 +127,56 @@ def test_a_higher_threshold_stays_closer_to_the_input(folder, weights):
 def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
     noisy = open_shot(SCENE.write(tmp_path / "noisy"))
     clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
-    paths = list(write_clips(noisy, clean, tmp_path, "wall.a"))
-    assert len(paths) == SCENE.frames
-    clip = Clip.load(paths[2])
-    assert clip.shot == "wall"
-    truth = SCENE.clean(2)["ViewLayer.Combined"]
-    np.testing.assert_allclose(clip.target, truth, rtol=1e-3)  # half has 11 bits
+    frames = []
+    levels = {"noisy": noisy, "clean": clean}
+    write_clips(levels, [4, 64], tmp_path, "wall", tile=0, estimate="nlm", advance=lambda: frames.append(1))
+    clips = open_clips(tmp_path)
+    assert len(clips) == len(frames) == SCENE.frames
+    assert clips.shots == ["wall"]
+    assert clips.pairs(2) == [[(1, "noisy"), (1, "pseudo_reference")], [(1, "pseudo_reference")]]
+    values = {name: value.float().numpy() for name, value in clips.read(2, 0, (1, "noisy")).items()}
+    truth = SCENE.clean(2)["ViewLayer.Combined"].transpose(2, 0, 1)
+    unit = truth.mean() / values["target"].mean()  # radiance is stored over the exposure of the cleanest level
+    np.testing.assert_allclose(values["target"] * unit, truth, rtol=2e-3)  # half has 11 bits
     # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
-    radiance = clip.color[2].astype(np.float32) * clip.modulation
-    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"], rtol=5e-3)
+    radiance = values["color"][2] * values["modulation"] * unit
+    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
+
+
+def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
+    (tmp_path / "clips").mkdir()
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "whole", tile=0, estimate="nlm")
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "tiles", tile=32, tiles=3, estimate="nlm")
+    clips = open_clips(tmp_path / "clips")
+    whole = clips.of(["whole"]).read(0, 0, (0, "pseudo_reference"))
+    tiles = clips.of(["tiles"])
+    assert len(tiles) == 3
+    for index in range(3):
+        tile = tiles.read(index, 0, (0, "pseudo_reference"))
+        assert tile["color"].shape == (5, 3, 32, 32)
+        assert float(tile["exposure"]) == float(whole["exposure"])
+        windows = whole["color"][2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
+        assert bool((windows == tile["color"][2]).all(-1).all(-1).all(-1).any())  # it is one of them
+    with pytest.raises(ValueError, match="tile: expected at most the frame's 90×70 pixels, got 80"):
+        write_clips({"noisy": shot}, [4], tmp_path, "large", tile=80, estimate="nlm")
+
+
+def test_contributions_sum_to_the_result_and_weights_to_one(folder, weights):
+    window, counted = align(folder), Breakdown()
+    denoised = Denoiser(weights, precision="float32", tile=32, breakdown=counted)(window)
+    names = ["before2", "before1", "centre", "after1", "after2"]
+    assert list(denoised.extra) == [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
+    parts = sum(denoised.extra[f"contribution.{name}"] for name in names)
+    np.testing.assert_allclose(parts, denoised.color, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
+    shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])
+    np.testing.assert_allclose(shares.sum(0), 1, rtol=1e-5)
+    rows = list(counted.rows())
+    assert [row[0] for row in rows] == names
+    for row, share in zip(rows, shares, strict=True):
+        assert [float(figure) for figure in row[1:]] == pytest.approx(
+            [share.mean(), share.min(), share.max()], abs=1e-4
+        )
 
 
 def test_bad_options_are_refused(weights):

@@ -1,0 +1,123 @@
+"""What each frame of the window has contributed: layers, figures, and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.files import replace_file
+from hybrid.frames import Shot, open_shot, output_path
+from hybrid.transfer import measure_exposure
+from nlm.average import replace_nonfinite
+
+Array = NDArray[np.float32]
+
+# Pixels on a side of a frame in the picture, at most: seven of them stand side by side.
+PICTURE_SIDE = 480
+
+
+def frame_names(frames: int) -> list[str]:
+    """Names of the frames of a window, as layers are called: before2, before1, centre, after1, after2."""
+    offsets = range(-(frames // 2), frames // 2 + 1)
+    return [f"before{-k}" if k < 0 else f"after{k}" if k else "centre" for k in offsets]
+
+
+class Breakdown:
+    """Weights of the frames over all pixels and frames of a shot, as in the paper's Table 1.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, table 1 and figure 6.
+    """
+
+    def __init__(self) -> None:
+        self.pixels = 0
+        self._sum = self._least = self._greatest = np.zeros(0)
+
+    def add(self, weights: Array) -> None:
+        """Count the weights ``(T, H, W)`` of one more frame."""
+        flat = weights.reshape(len(weights), -1).astype(np.float64)
+        if not self.pixels:
+            self._sum = np.zeros(len(flat))
+            self._least, self._greatest = np.full(len(flat), np.inf), np.full(len(flat), -np.inf)
+        self._sum = self._sum + flat.sum(1)
+        self._least = np.minimum(self._least, flat.min(1))
+        self._greatest = np.maximum(self._greatest, flat.max(1))
+        self.pixels += flat.shape[1]
+
+    def rows(self) -> Iterator[tuple[str, str, str, str]]:
+        """Frame, average, minimum and maximum weight, to be printed."""
+        values = (self._sum / max(self.pixels, 1), self._least, self._greatest)
+        for name, *figures in zip(frame_names(len(self._sum)), *values, strict=True):
+            yield (name, *(f"{figure:.4f}" for figure in figures))  # type: ignore[misc]
+
+
+def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
+    """Layers to be added to a frame's file.
+
+    Parameters
+    ----------
+    parts : (T, H, W, 3) array
+        Radiance that each frame contributes; they sum to the result.
+    weights : (T, H, W) array
+        Weight of each frame; they sum to 1.
+
+    Returns
+    -------
+    dict of str to array
+        ``contribution.before2`` and so on, ``weight.before2`` and so on.
+    """
+    names = frame_names(len(parts))
+    layers = {f"contribution.{name}": part for name, part in zip(names, parts, strict=True)}
+    return {**layers, **{f"weight.{name}": weight for name, weight in zip(names, weights, strict=True)}}
+
+
+def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> None:
+    """Write a PNG of the middle frame: noisy and denoised, what each frame contributes, and its weight.
+
+    Parameters
+    ----------
+    shot : Shot
+        The input.
+    output : str or Path
+        Where frames with the layers of `layers_of` have been written.
+    frames : int
+        Length of the window.
+    path : Path
+        Of the PNG. Top row: noisy, denoised. Then the contributions of the frames in order of time, and below each
+        its weight, black 0 and white 1. All but the weights are exposed alike and sRGB encoded.
+    """
+    names = frame_names(frames)
+    number = shot.numbers[len(shot.numbers) // 2]
+    layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
+    finished = open_shot(output_path(output, shot, number), aovs=layers)
+    denoised = finished.read(finished.numbers[0])
+    noisy, _ = replace_nonfinite(shot.read(number).color)
+    exposure = np.float32(measure_exposure(noisy) / 0.18)
+    rows = [
+        [_encode(image / exposure) for image in (noisy, denoised.color)],
+        [_encode(denoised.aovs[name] / exposure) for name in layers[:frames]],
+        [np.repeat(np.clip(denoised.aovs[name], 0, 1), 3, axis=-1) for name in layers[frames:]],
+    ]
+    height, width = noisy.shape[:2]
+    shrink = min(1.0, PICTURE_SIDE / max(height, width))
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    columns = max(len(row) for row in rows)
+    white = np.ones((size[1], size[0], 3), np.float32)
+    small = [[cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in row] for row in rows]
+    sheet = np.vstack([np.hstack(row + [white] * (columns - len(row))) for row in small])
+    _, data = cv2.imencode(".png", np.round(sheet[..., ::-1] * 255).astype(np.uint8))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def _encode(linear: NDArray[Any]) -> Array:
+    """Clip to [0, 1] and encode as sRGB."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)

@@ -1,0 +1,145 @@
+"""The commands `prepare` and `train`, and what `denoise` says of a network's work."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from conftest import Scene
+
+torch = pytest.importorskip("torch")
+
+from hybrid.cli import main  # noqa: E402
+from hybrid.exr import read_exr  # noqa: E402
+from hybrid.frames import open_shot  # noqa: E402
+from hybrid.training import open_levels, parse_samples  # noqa: E402
+from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
+from network.clips import open_clips  # noqa: E402
+from network.models import KernelConfig, RAUNet, RAUNetConfig  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+SCENE = Scene(height=40, width=48)
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    """A shot at three levels with a reference, as ravg simulate leaves it."""
+    folder = tmp_path_factory.mktemp("shots") / "wall"
+    folder.mkdir()
+    for number, level in enumerate(("a", "b", "c", "reference")):
+        scene = Scene(height=40, width=48, noise=0.2 + 0.1 * number)
+        for path in sorted(scene.write(folder / level).glob("*.exr")):
+            path.rename(folder / path.name.replace("shot", level))
+        (folder / level).rmdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A small network of three frames, not trained."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    kernel = KernelConfig(frames=3, size=3, estimate_size=1, estimate_share=0.5)
+    save_model(path, RAUNet(RAUNetConfig(kernel, widths=(4, 4), ra_scales=(1,))))
+    return path
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def test_levels_of_a_shot_are_found_without_its_references(shot):
+    name, levels, samples = open_levels(str(shot), {"a": 24, "c": 8})
+    assert (name, list(levels), samples) == ("wall", ["a", "c"], [24, 8])
+    with pytest.raises(ValueError, match=r"no samples in the header of a; expected --levels a=SAMPLES"):
+        open_levels(str(shot))
+    name, levels, samples = open_levels(str(shot / "a.####.exr"))
+    assert (name, list(levels), samples) == ("wall", ["a"], [1])
+    with pytest.raises(FileNotFoundError, match=r"levels: expected a, d in .*, got a, b, c, reference"):
+        open_levels(str(shot), {"a": 24, "d": 8})
+
+
+def test_samples_are_read_from_cycles_headers():
+    _, levels, samples = open_levels("examples/shot", {"noisy": 24})
+    assert samples == [24]
+    header = read_exr(levels["noisy"].path(8), pixels=False).parts[0].header
+    assert any(key.startswith("cycles.") for key in header) == (open_levels("examples/shot")[2] == [24])
+
+
+@pytest.mark.parametrize("text", ["", "a", "a=", "a=0", "a=x", "=4", "a=4,,b=4"])
+def test_levels_that_are_no_list_are_an_error(text):
+    with pytest.raises(ValueError, match="levels: expected NAME=SAMPLES"):
+        parse_samples(text)
+
+
+def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
+    clips, out = tmp_path / "clips", tmp_path / "w.safetensors"
+    other = tmp_path / "other"
+    shutil.copytree(shot, other)
+    options = ["--levels", "a=24,b=24,c=8", "--window", "3", "--estimate", "nlm"]
+    assert run("prepare", shot, "-o", clips, "--tile", "32", "--tiles", "2", *options) == 0
+    assert run("prepare", shot, other, "-o", clips, "--tile", "0", *options) == 0  # the first is there already
+    found = open_clips(clips)
+    assert (found.shots, len(found.of(["other"]))) == (["other", "wall"], 3)
+    assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
+
+    train = ["train", clips, "-o", out, "--crop", "16", "--batch", "1", "--threads", "1", "--float32"]
+    assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
+    assert "denoised" in capsys.readouterr().err
+    assert load_notes(out)["training"]["steps"] == 2
+    assert load_model(out).config.kernel.frames == 3
+    assert list((tmp_path / "logs").glob("events.*"))
+
+    # On one's own footage, one level and no reference, from weights there are.
+    own = tmp_path / "own"
+    assert run("prepare", shot / "a.####.exr", "-o", own, "--tile", "32", "--window", "3", "--estimate", "nlm") == 0
+    tuned = tmp_path / "tuned.safetensors"
+    assert run("train", own, "-o", tuned, "--init", out, "--steps", "1", "--crop", "32", "--rate", "1e-4") == 0
+    assert load_model(tuned).config == load_model(out).config
+
+    capsys.readouterr()
+    for more, message in (
+        (["--steps", "1", "--resume"], "resume: no file"),
+        (
+            ["--steps", "1", "--preset", "slow"],
+            "preset is 'slow', expected one of fast, balanced, quality, paper",
+        ),
+        (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
+        ([], "steps, minutes: expected at least one limit"),
+        (["--steps", "1", "--validation", "nowhere"], "expected shots among"),
+    ):
+        assert run(*train, *more) == 1
+        assert message in capsys.readouterr().err
+    assert run("train", tmp_path / "logs", "-o", out, "--steps", "1") == 1
+    assert "expected what ravg prepare writes" in capsys.readouterr().err
+
+
+def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
+    picture = tmp_path / "parts.png"
+    options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--breakdown", picture]
+    assert run("denoise", shot / "a.####.exr", "-o", tmp_path / "out", *options) == 0
+    assert picture.stat().st_size > 1000
+    printed = capsys.readouterr().out
+    for name in ("before1", "centre", "after1"):
+        assert name in printed
+    layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in ("before1", "centre", "after1")]
+    frame = open_shot(tmp_path / "out", aovs=layers).read(SCENE.first + 1)
+    total = sum(frame.aovs[layer] for layer in layers[:3])
+    np.testing.assert_allclose(total, frame.color, rtol=2e-3, atol=1e-3)  # layers may be halves
+    np.testing.assert_allclose(sum(frame.aovs[layer] for layer in layers[3:]), 1, rtol=2e-3)
+
+
+def test_a_second_pass_runs_on_the_result_of_the_first(shot, weights, tmp_path, capsys):
+    pictures = []
+    for passes in (1, 2):
+        out = tmp_path / str(passes)
+        options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--passes", passes]
+        assert run("denoise", shot / "a.####.exr", "-o", out, *options) == 0, capsys.readouterr().err
+        assert sorted(path.name for path in out.iterdir()) == [*(f"a.{n}.exr" for n in (1001, 1002, 1003)), "ravg.json"]
+        pictures.append(open_shot(out).read(SCENE.first + 1).color)
+    truth = SCENE.clean(1)["ViewLayer.Combined"]
+    errors = [np.sqrt(np.mean((picture - truth) ** 2)) for picture in pictures]
+    assert errors[1] < errors[0]  # averaging again, on a wall that only passes by
+    assert run("denoise", shot / "a.####.exr", "-o", tmp_path, "--weights", weights, "--passes", "0") == 2
