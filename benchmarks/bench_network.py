@@ -129,6 +129,7 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
                 "confidence": color[:, :, :1],
                 "present": torch.ones(count),
                 "exposure": torch.ones(count),
+                "error": torch.ones(count),
             }
             yield (
                 f"{name}, training, batch of {count}",

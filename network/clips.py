@@ -19,6 +19,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from network import losses
+from network.kernels import mean_of
+from network.losses import ImageLoss
+
 FORMAT = "ravg-clips"
 VERSION = "1"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
@@ -400,6 +404,8 @@ class Samples(Dataset[dict[str, Tensor]]):
         Crops and variations.
     seed : int
         Of everything random.
+    loss : ImageLoss
+        What ``error`` is measured with.
 
     Raises
     ------
@@ -416,12 +422,12 @@ class Samples(Dataset[dict[str, Tensor]]):
     stored has been aligned, so there are no flows to turn), and those of `SamplerConfig`.
     """
 
-    def __init__(self, clips: Clips, config: SamplerConfig, seed: int) -> None:
+    def __init__(self, clips: Clips, config: SamplerConfig, seed: int, loss: ImageLoss = losses.relmse) -> None:
         if len(clips) == 0:
             raise ValueError("clips: expected at least one, got none")
         if clips.size < config.crop:
             raise ValueError(f"clips: expected at least {config.crop} pixels each way, got {clips.size}")
-        self.clips, self.config, self.seed = clips, config, seed
+        self.clips, self.config, self.seed, self.loss = clips, config, seed, loss
         order = np.random.default_rng((seed, 0)).permutation(len(clips))
         self._sets = [order[first :: config.sets] for first in range(config.sets)]
         self._cycle: tuple[int, np.ndarray] | None = None
@@ -441,13 +447,14 @@ class Samples(Dataset[dict[str, Tensor]]):
         -------
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal``, ``estimate`` ``(T, 3, H, W)``, ``confidence`` ``(T, 1, H, W)``,
-            ``modulation``, ``target`` ``(3, H, W)``, ``present`` (1 where the estimate may be used) and ``exposure``
-            ``()``. A `torch.utils.data.DataLoader` stacks them to a batch.
+            ``modulation``, ``target`` ``(3, H, W)``, ``present`` (1 where the estimate may be used), ``exposure`` and
+            ``error`` ``()`` (the loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them to a batch.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
         level = int(rng.integers(len(pairs)))
         values = self.clips.read(index, level, pairs[level][rng.integers(len(pairs[level]))])
+        error = input_error({name: value[None].float() for name, value in values.items()}, self.loss)[0]
         exposure, frames = values.pop("exposure").float(), len(values["color"])
         centre = frames // 2
         y, x = self._place(values, rng)
@@ -478,6 +485,7 @@ class Samples(Dataset[dict[str, Tensor]]):
             sample["color"][rng.integers(frames), :, rows, columns] += gain
         sample["exposure"] = exposure * 2 ** rng.uniform(-config.exposure_stops, config.exposure_stops)
         sample["present"] = torch.tensor(float(rng.random() >= config.drop_estimate))
+        sample["error"] = error
         return sample
 
     def _place(self, values: dict[str, Tensor], rng: np.random.Generator) -> tuple[int, int]:
@@ -496,6 +504,17 @@ class Samples(Dataset[dict[str, Tensor]]):
             self.config.crop,
         )
         return corners[rng.choice(len(corners), p=chances)]
+
+
+def input_error(batch: dict[str, Tensor], loss: ImageLoss) -> Tensor:
+    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's estimate; ``(N,)``."""
+    color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
+    centre = color.shape[1] // 2
+    mean = mean_of(color * confidence, confidence, color[:, centre])
+    scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
+    errors = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, centre])]
+    # The floor matters only where the input equals the target, as in a synthetic or an empty clip.
+    return torch.minimum(*errors).clamp_min(1e-4)
 
 
 def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tensor]]:

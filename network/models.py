@@ -156,7 +156,7 @@ class KernelHead(nn.Module):
     pixel itself, times the share of the source.
 
     With softmax the raw weights are ``log(b_i c_i) + h_i``, so that the kernel is ``b_i c_i e^{h_i}``, normalised and
-    thresholded, with h bounded to ±4 on the noisy frames and ±1 on the estimates. The training thus starts from the
+    thresholded, with h bounded to ±4 on the noisy frames and ±0.3 on the estimates. The training thus starts from the
     gated average of the estimates with a tenth of the noisy frames, or without estimates from the mean over time and
     the taps. A noisy tap may gain or lose a factor of 55, and what falls below the threshold is gone; but what has no
     confidence stays out, whatever is predicted.
@@ -212,7 +212,7 @@ class KernelHead(nn.Module):
         # Scales of the sources' weights, in units of 1/K: 1 where there is one source.
         sources = [(self.window, self.window_start, taps * (1 - share) / config.window_taps, 4.0)]
         if self.estimate is not None:
-            sources.append((self.estimate, self.estimate_start, taps * share / config.estimate_taps, 1.0))
+            sources.append((self.estimate, self.estimate_start, taps * share / config.estimate_taps, 0.3))
         weights = []
         for convolution, start, scale, bound in sources:
             raw = _frames_first(convolution(features), config.frames)

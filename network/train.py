@@ -122,27 +122,22 @@ def batch_loss(
     loss: losses.ImageLoss,
     run: Callable[..., Any] | None = None,
 ) -> Tensor:
-    """Training loss of a batch: the temporal loss of each crop, relative to that of its best input.
+    """Training loss of a batch: the temporal loss of each crop, relative to that of its clip's best input.
 
     Notes
     -----
-    What a crop can still gain differs by orders of magnitude between shots, and its targets' noise adds a floor.
-    Each crop's loss is divided by the loss of the mean of the window weighted by confidence, or of the centre's
-    estimate if that is lower, so that every crop counts about the same.
+    What can still be gained differs by orders of magnitude between shots, and the targets' noise adds a floor. Each
+    crop's loss is divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the
+    centre's estimate), so that every clip counts about the same. Where clips are whole frames and a crop was divided by
+    its own input's loss, flat crops, in which averaging can do no harm, outweighed the edges, and the network averaged
+    where it should not.
     """
     filtered = predict(model, batch, config.bfloat16, run)
-    color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
-    centre, terms = color.shape[1] // 2, config.loss_terms(color.shape[1])
+    terms = config.loss_terms(batch["color"].shape[1])
     value = losses.temporal_loss(
-        loss, filtered, color, batch["target"], modulation, batch["exposure"], terms, config.slope
+        loss, filtered, batch["color"], batch["target"], batch["modulation"], batch["exposure"], terms, config.slope
     )
-    with torch.no_grad():
-        scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
-        mean = mean_of(color * confidence, confidence, color[:, centre])
-        # The floor matters only where the input equals the target, as in a synthetic or an empty crop.
-        inputs = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, centre])]
-        reference = torch.minimum(*inputs).clamp_min(1e-4)
-    return (value / reference).mean()
+    return (value / batch["error"]).mean()
 
 
 @torch.no_grad()
@@ -259,7 +254,7 @@ def train(
     run: nn.Module = DistributedDataParallel(model) if world > 1 else model
     if config.compile:
         run = cast(nn.Module, torch.compile(run))
-    batches = _batches(Samples(training, config.sampler, config.seed), config, step, rank, world)
+    batches = _batches(Samples(training, config.sampler, config.seed, loss_of_image), config, step, rank, world)
 
     start = time.monotonic() - before
     checkpointed = validated = before
