@@ -448,7 +448,7 @@ class Samples(Dataset[dict[str, Tensor]]):
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal``, ``estimate`` ``(T, 3, H, W)``, ``confidence`` ``(T, 1, H, W)``,
             ``modulation``, ``target`` ``(3, H, W)``, ``present`` (1 where the estimate may be used), ``exposure`` and
-            ``error`` ``()`` (the loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them to a batch.
+            ``error`` ``()`` (the loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
