@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.results import (
+    COSTS,
     Cost,
     MethodResult,
     Metric,
@@ -91,7 +92,7 @@ class Chart:
     gutters: Sequence[tuple[float, float, str]]  # left, right, title
     points: list[Point]
     front: list[tuple[float, float]]
-    series: list[tuple[int, list[tuple[float, float]]]]
+    series: list[tuple[int, list[tuple[float, float]]]]  # family and places of what varies one number
     families: list[str]
 
 
@@ -149,22 +150,37 @@ def lay_out(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> Char
         steps += [(p.x, steps[-1][1]), (p.x, p.y)] if steps else [(p.x, p.y)]
     if steps:
         steps.append((right, steps[-1][1]))
-    swept = [p for p in points if p.result.sweep]
     gutters = [(LEFT, LEFT + GUTTER, "nothing")] if free else []
     gutters += [(right, right + GUTTER, "not known")] if unknown else []
-    titles = {"seconds_per_megapixel": "seconds per megapixel-frame", "peak_bytes": "peak memory"}
     return Chart(
         column_title(metric),
-        titles[cost],
+        COSTS[cost],
         (left, TOP, right, BOTTOM),
         ticks_x,
         ticks_y,
         gutters,
         _labelled(points, steps),
         steps,
-        [(k, [(p.x, p.y) for p in group]) for k, group in groupby(swept, key=lambda p: p.family)],
+        _series(points),
         names,
     )
+
+
+def _series(points: Sequence[Point]) -> list[tuple[int, list[tuple[float, float]]]]:
+    """A line through the points of each sweep that varies one number."""
+    groups: dict[tuple[str, str], list[Point]] = {}
+    for p in points:
+        if p.result.sweep:
+            groups.setdefault((p.result.sweep, p.result.base), []).append(p)
+    lines = []
+    for group in groups.values():
+        settings = [list(p.result.settings.items()) for p in group]
+        if len({pairs[0][0] for pairs in settings if pairs}) == 1 and all(len(pairs) == 1 for pairs in settings):
+            values = [pairs[0][1] for pairs in settings]
+            if all(isinstance(v, (int, float)) for v in values):
+                ordered = sorted(zip(values, group, strict=True), key=lambda pair: float(str(pair[0])))
+                lines.append((group[0].family, [(p.x, p.y) for _, p in ordered]))
+    return lines
 
 
 def _memory(value: float) -> str:

@@ -1,39 +1,54 @@
 """Denoisers side by side: accuracy against a reference, time, and memory.
 
-A method is a function from a shot to its finished frames. Each runs in a process of its own, so that its
-peak memory is its own, and leaves its frames on disk, so that a long shot does not fill this process's.
+Each method (`hybrid.methods`) runs in a process of its own, so that its peak memory is its own, and leaves its frames
+on disk, so that a long shot does not fill this process's.
 """
 
 from __future__ import annotations
 
-import re
+import os
+import platform
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from importlib import metadata
+from importlib.util import find_spec
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
+from urllib.parse import quote
 
+import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
 from flow.motion import forward_backward_error, normalize_motion
 from flow.warp import warp
-from hybrid.estimates import choose_estimate
 from hybrid.frames import Frame, Shot
-from hybrid.metrics import Reference, flip, mean_bias, psnr, relmse, smape, ssim, temporal_psnr
-from hybrid.oidn import Quality, denoise_oidn
-from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate, gated_average
+from hybrid.methods import METHODS, AbsentError, Method
+from hybrid.metrics import (
+    Reference,
+    flip_map,
+    mean_bias,
+    psnr,
+    relmse,
+    smape,
+    ssim,
+    static_std,
+    temporal_psnr,
+    tone_map,
+)
+from hybrid.plan import STILL
 from hybrid.results import (
+    CHART_METRICS,
     METRICS,
+    Comparison,
     MethodResult,
     Statistic,
     best_and_ties,
@@ -41,15 +56,16 @@ from hybrid.results import (
     format_bytes,
     format_seconds,
     format_value,
+    format_worth,
     present_metrics,
     summarize,
 )
+from hybrid.samples import NoiseLaw, fit_floor, reference_floor
 from hybrid.timing import peak_memory
-from nlm.average import average, replace_nonfinite, robust_average
 
 Array = NDArray[np.float32]
-Method = Callable[[Shot], Iterator[tuple[int, Array]]]
 Measure = Callable[[Array, Reference, float], float]  # of image, reference, exposure
+Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
 
 
 def _whole(reference: Reference) -> NDArray[np.floating]:
@@ -57,101 +73,23 @@ def _whole(reference: Reference) -> NDArray[np.floating]:
     return (reference[0] + reference[1]) / 2 if isinstance(reference, tuple) else reference
 
 
-# What can be measured on a frame by itself; "temporal_psnr" needs two and is always measured.
+# What is measured on a frame by itself, beside FLIP and the measures over time.
 MEASURES: dict[str, Measure] = {
     "psnr": lambda x, r, e: psnr(x, r, exposure=e),
     "ssim": lambda x, r, e: ssim(x, _whole(r), exposure=e),
     "relmse": lambda x, r, e: relmse(x, r, exposure=e),
     "relmse_trimmed": lambda x, r, e: relmse(x, r, exposure=e, trim=0.001),
     "smape": lambda x, r, e: smape(x, _whole(r), exposure=e),
-    "flip": lambda x, r, e: flip(x * np.float32(e), _whole(r) * np.float32(e)),
     "mean_bias": lambda x, r, _: mean_bias(x, _whole(r)),
 }
-QUICK_MEASURES = ("psnr", "relmse", "mean_bias")  # the first form of the table
+# A pixel's light stands still where the 9×9 means of the reference change by less than this, on the tone curve: well
+# above their noise (a ninth of the pixels'), well below what anyone would call a change.
+STEADY = 0.02
+FLIP_MAP = "FLIP"
+VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn", "flip-evaluator")
 
 
-# Methods
-
-
-def noisy(shot: Shot) -> Iterator[tuple[int, Array]]:
-    """The frames as they are, non-finite pixels replaced."""
-    for number in shot.numbers:
-        yield number, _finite(shot.read(number).color)
-
-
-def oidn(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
-    """OIDN on each frame by itself."""
-    for number in shot.numbers:
-        frame = shot.read(number)
-        guides = [None if guide is None else _finite(guide) for guide in (frame.albedo, frame.normal)]
-        yield number, denoise_oidn(_finite(frame.color), *guides, quality=quality, prefilter=prefilter)
-
-
-def _finite(image: Array) -> Array:
-    """Non-finite pixels replaced as the pipeline does it, so that no method is judged by them."""
-    return replace_nonfinite(image)[0]
-
-
-def classical(shot: Shot, *, estimator: Callable[[AlignedWindow], Array]) -> Iterator[tuple[int, Array]]:
-    """A classical estimate of every aligned window, with the stages that the shot calls for."""
-    aligner = Aligner(shot, plan_shot(shot).effects)
-    for number in shot.numbers:
-        yield number, estimator(aligner.align(number))
-
-
-def aligned_average(aligned: AlignedWindow) -> Array:
-    """The mean over time, weighted by confidence."""
-    return average(aligned.color, aligned.confidence) * aligned.modulation
-
-
-def aligned_robust_average(aligned: AlignedWindow) -> Array:
-    """The same without the darkest and the brightest frame."""
-    return robust_average(aligned.color, aligned.confidence) * aligned.modulation
-
-
-def gated(shot: Shot, *, source: str) -> Iterator[tuple[int, Array]]:
-    """Estimates of single frames, averaged where the light is the same."""
-    aligner = Aligner(shot, plan_shot(shot).effects, estimate=choose_estimate(source, shot).estimate)
-    for number in shot.numbers:
-        yield number, gated_average(aligner.align(number))
-
-
-def network(shot: Shot, *, preset: str, source: str) -> Iterator[tuple[int, Array]]:
-    """The Robust Average network with the weights of a preset, on estimates from `source`."""
-    from hybrid import neural  # torch may be absent
-
-    denoiser = neural.Denoiser(neural.shipped_weights(preset))
-    estimate = choose_estimate(source, shot).estimate
-    aligner = Aligner(shot, plan_shot(shot).effects, radius=denoiser.radius, estimate=estimate)
-    for number in shot.numbers:
-        yield number, denoiser(aligner.align(number)).color
-
-
-METHODS: dict[str, Method] = {
-    "noisy": noisy,
-    "aligned average": partial(classical, estimator=aligned_average),
-    "aligned robust average": partial(classical, estimator=aligned_robust_average),
-    **{name: partial(classical, estimator=partial(estimate, preset=preset)) for name, preset in PRESETS.items()},
-    "gated": partial(gated, source="nlm"),
-    "gated OIDN": partial(gated, source="oidn"),
-    "network fast": partial(network, preset="fast", source="nlm"),
-    "network fast, OIDN": partial(network, preset="fast", source="oidn"),
-    "OIDN high": partial(oidn, quality="high"),
-    "OIDN best": partial(oidn, quality="high", prefilter=True),
-}
-
-
-# What the chart draws alike.
-FAMILIES = {
-    **dict.fromkeys(("aligned average", "aligned robust average"), "Averages"),
-    **dict.fromkeys(PRESETS, "Pseudo-references"),
-    **dict.fromkeys(("OIDN high", "OIDN best"), "OIDN"),
-    **dict.fromkeys(("gated", "gated OIDN"), "Gated averages"),
-    **dict.fromkeys(("network fast", "network fast, OIDN"), "Networks"),
-}
-
-
-# Running one
+# Running a method
 
 
 @dataclass(frozen=True)
@@ -190,15 +128,17 @@ def _clock_reading(shot: Shot) -> Iterator[_Clock]:
         del shot.read
 
 
-def run_method(method: Method, shot: Shot, folder: Path, name: str) -> Run:
+def run_method(method: Method, shot: Shot, name: str = "", folder: Path | None = None) -> Run:
     """Run a method over a shot in this process, and leave its frames in `folder` for `load_frame`.
 
-    The first frame is made once before the clock starts: compilation, weights and caches are paid for there.
+    The first frame is made once before the clock starts: compilation, weights and the plan are paid for there.
     """
-    next(method(shot), None)
+    if method.threads:
+        _limit_threads(method.threads)
+    next(method.run(shot), None)
     pixels, wall, cpu = 0, 0.0, 0.0
     with _clock_reading(shot) as reading:
-        frames = method(shot)
+        frames = method.run(shot)
         while True:
             wall_start, cpu_start = time.perf_counter(), time.process_time()
             done = next(frames, None)
@@ -208,8 +148,16 @@ def run_method(method: Method, shot: Shot, folder: Path, name: str) -> Run:
                 break
             number, image = done
             pixels += image.shape[0] * image.shape[1]
-            _save(folder, name, number, image)
+            if folder is not None:
+                _save(folder, name, number, image)
     return Run(pixels / 1e6, wall - reading.seconds, cpu - reading.cpu_seconds, peak_memory())
+
+
+def _limit_threads(count: int) -> None:
+    """Let this process's libraries use so many threads; torch reads the variable when it is imported."""
+    os.environ["OMP_NUM_THREADS"] = str(count)
+    cv2.setNumThreads(count)
+    numba.set_num_threads(min(count, numba.get_num_threads()))
 
 
 def _apart() -> ProcessPoolExecutor:
@@ -217,9 +165,77 @@ def _apart() -> ProcessPoolExecutor:
 
     It is forked from a server and not from this process, whose peak memory Linux would count as its own.
     """
+    # Threads that wait in turns, instead of spinning, cost little alone, and on a busy machine ten times less CPU time
+    # was counted. The libraries read this when the forked process first uses them.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])  # once, and not for every method
     return ProcessPoolExecutor(1, mp_context=context)
+
+
+def time_methods(
+    methods: Mapping[str, Method], shot: Shot, *, rounds: int = 3, folder: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[dict[str, list[Run]], dict[str, str]]:  # fmt: skip
+    """Run the methods in turns, `rounds` times each, so that whatever else the machine does meets all of them.
+
+    Returns
+    -------
+    runs : those of each method, a round after the other; `spread_seconds` makes figures of them.
+    absent : why the others have none.
+    """
+    runs: dict[str, list[Run]] = {}
+    absent: dict[str, str] = {}
+    names = list(methods)
+    for turn in range(rounds):
+        # Each round starts elsewhere, so that no method always follows the same one.
+        start = turn * len(names) // rounds
+        for done, name in enumerate(names[start:] + names[:start]):
+            if progress is not None:
+                progress(name, turn * len(names) + done, rounds * len(names))
+            if name in absent:
+                continue
+            if turn and not methods[name].timed:
+                continue  # nothing to time again
+            try:
+                with _apart() as pool:
+                    keep = folder if turn == 0 else None
+                    run = pool.submit(run_method, methods[name], shot, name, keep).result()
+            except (ImportError, AbsentError) as error:
+                absent[name] = str(error)
+            except BrokenProcessPool:
+                absent[name] = "its process died, out of memory perhaps"
+            else:
+                runs.setdefault(name, []).append(run)
+    return {name: runs[name] for name in names if name in runs and name not in absent}, absent
+
+
+def spread_seconds(runs: Mapping[str, Sequence[Run]]) -> dict[str, tuple[float, float, float, float]]:
+    """Median, least and most wall seconds per megapixel, and the median CPU seconds.
+
+    Notes
+    -----
+    Runs of one round shared the machine's load. Where there are at least four methods it is estimated, as the median
+    over the methods of a round's time against the method's own median, and divided out: a busy machine
+    makes all methods slow, and says nothing about any of them.
+    """
+    rounds = max(map(len, runs.values()), default=0)
+    complete = [name for name, series in runs.items() if len(series) == rounds]
+    load = np.ones((2, rounds))
+    if len(complete) >= 4 and rounds > 1:
+        table = np.array([[(run.seconds, run.cpu_seconds) for run in runs[name]] for name in complete])
+        middle = np.median(table, axis=1, keepdims=True)
+        load = np.median(table / np.where(middle > 0, middle, 1), axis=0).T
+        load /= np.median(load, axis=1, keepdims=True)
+        load = np.where(load > 0, load, 1)
+    out = {}
+    for name, series in runs.items():
+        wall, cpu = (
+            np.array([getattr(run, field) / run.megapixels for run in series]) / load[k, : len(series)]
+            for k, field in enumerate(("seconds", "cpu_seconds"))
+        )
+        out[name] = float(np.median(wall)), float(wall.min()), float(wall.max()), float(np.median(cpu))
+    return out
 
 
 # Judging it
@@ -230,10 +246,17 @@ def compare_shot(
     reference: Shot | tuple[Shot, Shot],
     methods: Mapping[str, Method] = METHODS,
     *,
-    measures: Collection[str] = QUICK_MEASURES,
+    title: str = "shot",
+    measures: Collection[str] = (*MEASURES, "flip"),
     exposure: float = 1.0,
+    rounds: int = 1,
+    samples: float | None = None,
+    reference_samples: float | None = None,
+    levels: Sequence[tuple[Shot, float]] = (),
+    maps: bool = False,
     folder: Path | None = None,
-) -> list[MethodResult]:
+    progress: Progress | None = None,
+) -> Comparison:
     """Run every method on a shot and measure what it gives against the reference.
 
     Parameters
@@ -242,18 +265,22 @@ def compare_shot(
     reference : the same frames, clean; frames it lacks are not judged. Two independent renders take the
         reference's noise out of PSNR, relMSE and temporal PSNR (`hybrid.metrics`). It is not small: 512
         samples a pixel of a bathroom had half of the squared error that OIDN's best mode shows against them.
-    methods : functions from a shot to (number, (H, W, 3) radiance), by name. They run in processes of
-        their own: what is neither a module's function nor a `functools.partial` of one cannot get there.
-    measures : keys of `MEASURES`, beside the temporal PSNR.
+    methods : by name. They run in processes of their own.
+    title : of the shot.
+    measures : keys of `MEASURES`, and "flip"; those over time are always taken, where there are vectors.
     exposure : factor before the tone curve, and on the radiance of relMSE, one for the whole shot.
+    rounds : how often each method runs, in turns with the others.
+    samples, reference_samples : per pixel, of the shot and of the (whole) reference.
+    levels : further renders of the shot with their samples per pixel, to measure how the noisy error falls.
+    maps : also make the methods' maps, for `load_frame` by "METHOD map TITLE", and keep FLIP's.
     folder : a new one, or an empty one. It keeps the frames of every method, and the reference as "reference",
         for `load_frame`. Without it they are removed in the end.
+    progress : is told what is being done.
 
     Returns
     -------
-    One result per method, in their order. A method that is not installed, or whose process died, comes with
-    an `absent_reason` in place of figures. Seconds are wall time; the CPU's are among the settings. Without
-    motion vectors there is no temporal PSNR.
+    One result per method, in their order, and the facts. A method that is not installed, or whose process died, comes
+    with an `absent_reason` in place of figures.
 
     Raises
     ------
@@ -262,7 +289,11 @@ def compare_shot(
     """
     if folder is None:
         with TemporaryDirectory() as temporary:
-            return compare_shot(shot, reference, methods, measures=measures, exposure=exposure, folder=Path(temporary))
+            return compare_shot(
+                shot, reference, methods, title=title, measures=measures, exposure=exposure, rounds=rounds,
+                samples=samples, reference_samples=reference_samples, levels=levels, maps=maps,
+                folder=Path(temporary), progress=progress,
+            )  # fmt: skip
     halves = reference if isinstance(reference, tuple) else (reference,)
     numbers = [n for n in shot.numbers if all(n in half.numbers for half in halves)]
     if not numbers:
@@ -274,45 +305,103 @@ def compare_shot(
         if len(images) == 2:
             _save(folder, "reference a", number, images[0])
             _save(folder, "reference b", number, images[1])
+    facts = {"Frames": f"{_span_of(numbers)}, {images[0].shape[1]} × {images[0].shape[0]} pixels"}
     with _apart() as pool:  # so that the frames it reads do not travel to the methods inside the shot
         pairs = pool.submit(_save_pairs, shot, numbers, folder).result()
+    static = _static_pixels(folder, numbers, pairs, exposure)
+    facts["Pixels that stand still"] = f"{static.mean():.1%}"
+    if "flip" in measures and find_spec("flip_evaluator") is None:
+        measures = [key for key in measures if key != "flip"]
+        facts["FLIP"] = "absent: flip-evaluator is not installed"
+    busy = os.getloadavg()[0]
+    runs, absent = time_methods(methods, shot, rounds=rounds, folder=folder, progress=progress)
+    costs = spread_seconds({name: series for name, series in runs.items() if methods[name].timed})
+    statistics = {}
+    for done, name in enumerate(runs):
+        if progress is not None:
+            progress(f"measure {name}", done, len(runs))
+        # FLIP takes longer than many a method; what only varies a setting is judged without.
+        wanted = [key for key in measures if key != "flip" or not methods[name].sweep]
+        statistics[name] = _measure(folder, name, numbers, pairs, static, wanted, exposure)
+    law = None
+    if "noisy" in statistics and "psnr" in measures:
+        known = _levels(folder, numbers, statistics["noisy"]["psnr"], samples, levels, exposure)
+        floor, words = _floor(folder, numbers, known, len(halves) == 2, samples, reference_samples, exposure)
+        law = NoiseLaw(tuple(known), known_samples(samples), floor)
+        facts["Reference"] = words
+        facts["Worth in samples"] = law.describe()
     results = []
     for name, method in methods.items():
-        try:
-            with _apart() as pool:
-                run = pool.submit(run_method, method, shot, folder, name).result()
-        except ImportError as error:
-            results.append(MethodResult(name, name, absent_reason=str(error)))
+        if name in absent:
+            results.append(
+                MethodResult(name, name, method.settings, method.family, method.sweep, method.base,
+                             absent_reason=absent[name])
+            )  # fmt: skip
             continue
-        except BrokenProcessPool:
-            results.append(MethodResult(name, name, absent_reason="its process died, out of memory perhaps"))
-            continue
-        result = MethodResult(
-            name,
-            name,
-            settings={"cpu_seconds_per_megapixel": run.cpu_seconds / run.megapixels},
-            family=FAMILIES.get(name, "Methods"),
-            # Handing the frames on is no denoising; its few milliseconds would only stretch the axis of time.
-            seconds_per_megapixel=0.0 if method is noisy else run.seconds / run.megapixels,
-            peak_bytes=run.peak_bytes,
-            metrics=_measure(folder, name, numbers, pairs, measures, exposure),
+        median, least, most, cpu = costs.get(name, (method.cost, 0.0, 0.0, method.cost))
+        results.append(
+            MethodResult(
+                name,
+                name,
+                settings=method.settings,
+                family=method.family,
+                sweep=method.sweep,
+                base=method.base,
+                # Handing frames on is no denoising; its few milliseconds would only stretch the axis of time.
+                seconds_per_megapixel=median,
+                spread=(least, most) if name in costs and rounds > 1 else None,
+                cpu_seconds_per_megapixel=cpu,
+                peak_bytes=None if method.cost is None else max(run.peak_bytes for run in runs[name]),
+                metrics=statistics[name],
+                worth=None if law is None or name == "noisy" else law.worth(_mean_error(statistics[name]["psnr"])),
+            )
         )
-        results.append(result)
-    return results
+        if maps and method.maps is not None:
+            with _apart() as pool:
+                pool.submit(_save_maps, method, shot, numbers, name, folder).result()
+    facts |= {
+        "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
+        "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, in a "
+        "process of its own, after a first frame that is not counted, as reading files is not. Median; with several "
+        "rounds the load they met, as all methods felt it, is divided out. Peak memory as the operating system counted "
+        "it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
+        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {busy:.1f} at the start",
+        "Versions": ", ".join(_versions()),
+    }
+    return Comparison(title, tuple(results), facts)
+
+
+def known_samples(samples: float | None) -> float:
+    """Samples per pixel, or 1 where only ratios can be told."""
+    return samples or 1.0
 
 
 def load_frame(folder: Path, name: str, number: int) -> Array:
-    """Read a frame (H, W, 3) that `compare_shot` has left, by the method's name or "reference"."""
+    """Read a frame (H, W, 3), or a map (H, W), that `compare_shot` has left.
+
+    Parameters
+    ----------
+    name : a method's, "reference", "METHOD map TITLE", or "METHOD map FLIP".
+    """
     image: Array = np.load(_file(folder, name, number))
     return image
 
 
+def map_titles(folder: Path, name: str, number: int) -> list[str]:
+    """Name the maps that `compare_shot` has left for a frame of a method."""
+    return [
+        t
+        for t in (FLIP_MAP, "Confidence", "Temporal contribution")
+        if _file(folder, f"{name} map {t}", number).exists()
+    ]
+
+
 def result_table(results: Sequence[MethodResult]) -> Table:
     """Lay the results out for a terminal: the best of a column bold, what ties with it marked "≈"."""
-    columns = present_metrics(results, METRICS)
+    columns = [m for m in present_metrics(results, METRICS) if m.key in CHART_METRICS]
     verdicts = {m.key: best_and_ties(results, m) for m in columns}
     table = Table("method")
-    for heading in (*map(column_title, columns), "s / MP", "CPU-s / MP", "peak"):
+    for heading in (*map(column_title, columns), "s / MP", "CPU-s / MP", "peak", "worth"):
         table.add_column(heading, justify="right")
     for r in results:
         if r.absent_reason is not None:
@@ -323,9 +412,8 @@ def result_table(results: Sequence[MethodResult]) -> Table:
             text = format_value(r.metrics[m.key].mean, m) if m.key in r.metrics else "–"
             best, ties = verdicts[m.key]
             cells.append(f"[bold]{text}[/]" if r.name == best else f"≈ {text}" if r.name in ties else text)
-        cpu = cast("float | None", r.settings.get("cpu_seconds_per_megapixel"))
-        costs = format_seconds(r.seconds_per_megapixel), format_seconds(cpu), format_bytes(r.peak_bytes)
-        table.add_row(r.label, *cells, *costs)
+        costs = format_seconds(r.seconds_per_megapixel), format_seconds(r.cpu_seconds_per_megapixel)
+        table.add_row(r.label, *cells, *costs, format_bytes(r.peak_bytes), format_worth(r.worth))
     absent = [f"{r.label}: {r.absent_reason}" for r in results if r.absent_reason is not None]
     if absent:
         table.caption = "absent – " + "; ".join(absent)
@@ -375,11 +463,38 @@ def _save_pairs(shot: Shot, numbers: Sequence[int], folder: Path) -> list[tuple[
     return pairs
 
 
+def _save_maps(method: Method, shot: Shot, numbers: Sequence[int], name: str, folder: Path) -> None:
+    """Leave a method's maps for `load_frame`."""
+    for number, maps in method.maps(shot) if method.maps is not None else ():
+        if number in numbers:
+            for title, values in maps.items():
+                _save(folder, f"{name} map {title}", number, values)
+
+
+def _static_pixels(
+    folder: Path, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
+) -> NDArray[np.bool_]:
+    """Where nothing moves from the first frame to the last, and the reference's light stays what it is."""
+    least = most = None
+    for number in numbers:
+        tone = cv2.blur(tone_map(load_frame(folder, "reference", number), exposure), (9, 9))
+        least = tone if least is None else np.minimum(least, tone)
+        most = tone if most is None else np.maximum(most, tone)
+    if least is None or most is None or len(pairs) < len(numbers) - 1 or not pairs:
+        return np.zeros(load_frame(folder, "reference", numbers[0]).shape[:2], bool)
+    static = np.all(most - least < STEADY, axis=-1)
+    for _, number in pairs:
+        motion = load_frame(folder, "flow", number)
+        static &= (np.hypot(motion[..., 0], motion[..., 1]) < STILL) & (motion[..., 2] > 0)
+    return static
+
+
 def _measure(
     folder: Path,
     name: str,
     numbers: Sequence[int],
     pairs: Sequence[tuple[int, int]],
+    static: NDArray[np.bool_],
     measures: Collection[str],
     exposure: float,
 ) -> dict[str, Statistic]:
@@ -389,33 +504,133 @@ def _measure(
         raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(numbers)}")
     values: dict[str, list[float]] = {key: [] for key in (*measures, "temporal_psnr")}
     for number in numbers:
-        image, truth = load_frame(folder, name, number), _load_reference(folder, number)
+        image, truth = load_frame(folder, name, number), load_reference(folder, number)
         for key in measures:
-            values[key].append(MEASURES[key](image, truth, exposure))
+            if key == "flip":
+                errors = flip_map(image * np.float32(exposure), _whole(truth) * np.float32(exposure))
+                _save(folder, f"{name} map {FLIP_MAP}", number, errors)
+                values[key].append(float(errors.mean(dtype=np.float64)))
+            else:
+                values[key].append(MEASURES[key](image, truth, exposure))
     for a, b in pairs:
         images = [load_frame(folder, name, n) for n in (a, b)]
-        truths = [_load_reference(folder, n) for n in (a, b)]
+        truths = [load_reference(folder, n) for n in (a, b)]
         motion = load_frame(folder, "flow", b)
         score = temporal_psnr(images, truths, [motion[..., :2]], [motion[..., 2] > 0], exposure=exposure)
         values["temporal_psnr"].append(float(score[0]))
+    if static.any():
+        frames = (load_frame(folder, name, number) for number in numbers)
+        values["static_std"] = list(static_std(frames, static, exposure=exposure))
     return {key: summarize(series) for key, series in values.items() if series}
 
 
-def _load_reference(folder: Path, number: int) -> Reference:
+def _levels(
+    folder: Path,
+    numbers: Sequence[int],
+    noisy: Statistic,
+    samples: float | None,
+    levels: Sequence[tuple[Shot, float]],
+    exposure: float,
+) -> list[tuple[float, float]]:
+    """Mean squared error on the tone curve of every level there is, the shot's own among them, by samples."""
+    known = [(known_samples(samples), _mean_error(noisy))]
+    if samples is None:
+        if levels:
+            raise ValueError("levels need the samples per pixel of the shot; its files do not tell them")
+        return known
+    for shot, count in levels:
+        common = [number for number in numbers if shot.has(number)]
+        if not common:
+            raise ValueError(
+                f"level of {count:g} samples has frames {_span(shot)}, expected some of {_span_of(numbers)}"
+            )
+        scores = [psnr(shot.read(n).color, load_reference(folder, n), exposure=exposure) for n in common]
+        known.append((count, float(np.mean([_error(score) for score in scores]))))
+    return sorted(known)
+
+
+def _floor(
+    folder: Path,
+    numbers: Sequence[int],
+    known: Sequence[tuple[float, float]],
+    in_halves: bool,
+    samples: float | None,
+    reference_samples: float | None,
+    exposure: float,
+) -> tuple[float, str]:
+    """The reference's part in the errors of `known`, and in words what is known of its noise."""
+    if in_halves:
+        errors = []
+        for number in numbers:
+            a, b = (tone_map(load_frame(folder, f"reference {half}", number), exposure) for half in "ab")
+            errors.append(float(np.mean((a - b) ** 2)) / 4)  # of the mean of two: half of half
+        return 0.0, (
+            f"Two independent halves; their mean has a noise of {_level(np.mean(errors))} PSNR. PSNR, temporal PSNR "
+            "and relMSE are products of the errors against both, free of it; the others are taken against the mean."
+        )
+    if samples is not None and reference_samples is not None:
+        floor = reference_floor(known[-1][1], known[-1][0], reference_samples)
+        source = f"by the 1/n law of its {reference_samples:g} samples per pixel"
+    elif len(known) > 1:
+        floor = fit_floor(known)
+        source = "by what the measured levels have in common"
+    else:
+        return 0.0, "One render; its noise is not known and counts as error of the methods."
+    return floor, (
+        f"One render with a noise of {_level(floor)} PSNR, {source}. It counts as error of the methods and compresses "
+        "differences between those that come near it; it is taken off only for the worth in samples."
+    )
+
+
+def _level(error: float | np.floating) -> str:
+    return f"{-10 * np.log10(error):.2f} dB" if error > 0 else "∞ dB"
+
+
+def _mean_error(statistic: Statistic) -> float:
+    return float(np.mean([_error(score) for score in statistic.values]))
+
+
+def _error(score: float) -> float:
+    """The mean squared error of a PSNR."""
+    return float(10 ** (-score / 10))
+
+
+def load_reference(folder: Path, number: int) -> Reference:
+    """The reference of a frame that `compare_shot` has left, in halves where it came so."""
     if not _file(folder, "reference a", number).exists():
         return load_frame(folder, "reference", number)
     return load_frame(folder, "reference a", number), load_frame(folder, "reference b", number)
 
 
-def _save(folder: Path, name: str, number: int, image: Array) -> None:
+def _save(folder: Path, name: str, number: int, image: NDArray[np.floating]) -> None:
     path = _file(folder, name, number)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, image)
 
 
 def _file(folder: Path, name: str, number: int) -> Path:
-    return folder / re.sub(r"[^\w.-]+", "_", name) / f"{number}.npy"
+    return folder / quote(name, safe=" ,") / f"{number}.npy"
 
 
 def _span(shot: Shot) -> str:
-    return f"{shot.numbers[0]}–{shot.numbers[-1]}" if shot.numbers else "none"
+    return _span_of(shot.numbers)
+
+
+def _span_of(numbers: Sequence[int]) -> str:
+    return f"{numbers[0]}–{numbers[-1]}" if numbers else "none"
+
+
+def _processor() -> str:
+    """The processor's name as Linux knows it, or its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.machine()
+
+
+def _versions() -> Iterator[str]:
+    yield f"Python {platform.python_version()}"
+    for package in ("ravg", *VERSIONS):
+        with suppress(metadata.PackageNotFoundError):
+            yield f"{package} {metadata.version(package)}"

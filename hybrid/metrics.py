@@ -126,11 +126,20 @@ def mean_bias(image: Array, reference: Array) -> float:
 
 
 def flip(image: Array, reference: Array) -> float:
-    """Mean HDR-FLIP error, 0 at best and 1 at worst, by the authors' own code.
+    """Mean HDR-FLIP error, 0 at best and 1 at worst: the mean of `flip_map`."""
+    return float(flip_map(image, reference).mean(dtype=np.float64))
+
+
+def flip_map(image: Array, reference: Array) -> NDArray[np.float32]:
+    """HDR-FLIP error of each pixel, 0 at best and 1 at worst, by the authors' own code.
 
     Parameters
     ----------
     image, reference : (H, W, 3) arrays, linear radiance in sRGB primaries; negative values count as 0.
+
+    Returns
+    -------
+    (H, W) float32 array; NaN everywhere if the image is not finite everywhere.
 
     Raises
     ------
@@ -153,9 +162,9 @@ def flip(image: Array, reference: Array) -> float:
         raise ImportError(message) from error
     x, r, _ = _checked(image, reference)
     if np.isnan(x).any():
-        return float("nan")
+        return np.full(x.shape[:2], np.nan, np.float32)
     linear = (np.ascontiguousarray(np.maximum(v, 0.0), np.float32) for v in (r, x))
-    return float(flip_evaluator.evaluate(*linear, "HDR", applyMagma=False)[1])
+    return np.asarray(flip_evaluator.evaluate(*linear, "HDR", applyMagma=False)[0][..., 0], np.float32)
 
 
 def temporal_psnr(
@@ -206,36 +215,54 @@ def temporal_psnr(
     return np.array(values)
 
 
-def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> float:
-    """Standard deviation over time of the pixels that stand still, on the tone curve.
+def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> NDArray[np.float64]:
+    """Standard deviation over time of the pixels that stand still, on the tone curve, frame by frame.
 
     Parameters
     ----------
-    frames : N ≥ 2 images (H, W, 3), linear radiance.
+    frames : N ≥ 2 images (H, W, 3), linear radiance. Their static pixels are held in memory.
     static : (H, W) mask; True where neither the scene nor its light changes in the picture.
     exposure : factor before the tone curve, one for a whole shot.
 
     Returns
     -------
-    The square root of the mean over pixels and channels of the unbiased variance over time. NaN where no
-    pixel is static, there are less than two frames, or one is not finite.
+    (N,) root mean squares over pixels and channels of each frame's distance to the mean over time, times
+    √(N / (N − 1)): their squares' mean is the unbiased variance over time. NaN where no pixel is static, there are
+    less than two frames, or one is not finite.
     """
-    count, mean, squares = 0, np.zeros(1), np.zeros(1)
+    values = []
     for frame in frames:
         if frame.shape[:2] != static.shape:
             raise ValueError(f"static must have the shape {frame.shape[:2]} of the frames, is {static.shape}")
-        value = tone_map(frame[static], exposure)
-        count += 1
-        step = value - mean  # Welford's update: one pass, whatever the length of the shot
-        mean = mean + step / count
-        squares = squares + step * (value - mean)
-    if count < 2 or not squares.size:
-        return float("nan")
-    return float(np.sqrt(np.mean(squares) / (count - 1)))
+        values.append(tone_map(frame[static], exposure))
+    count = len(values)
+    if count < 2 or not static.any():
+        return np.full(count, np.nan)
+    mean = sum(values) / count
+    return np.array([np.sqrt(np.mean((v - mean) ** 2) * count / (count - 1)) for v in values])
+
+
+def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) -> float:
+    """Mean of the shots' means; `shots` tells how many of the values belong to each, all to one without."""
+    data = np.asarray(values, np.float64)
+    return float(np.mean([part.mean() for part in _by_shot(data, shots)]))
+
+
+def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np.float64]]:
+    if not shots:
+        return [data]
+    if sum(shots) != data.size or min(shots) < 1:
+        raise ValueError(f"shots must add up to the {data.size} values, are {list(shots)}")
+    return np.split(data, np.cumsum(shots)[:-1])
 
 
 def bootstrap_interval(
-    values: Sequence[float] | Array, seed: int = 0, *, level: float = 0.95, resamples: int = 2000
+    values: Sequence[float] | Array,
+    seed: int = 0,
+    *,
+    shots: Sequence[int] = (),
+    level: float = 0.95,
+    resamples: int = 2000,
 ) -> tuple[float, float]:
     """Percentile bootstrap interval of the mean of `values`.
 
@@ -245,6 +272,8 @@ def bootstrap_interval(
         A − B frame by frame: the frames are the same, and most of their spread cancels. An interval
         that contains 0 is a tie.
     seed : of the resampling.
+    shots : how many of the values belong to each shot, if to several. Shots are then resampled first, and the
+        frames within each: frames of one shot are alike, and more of them tell little about another shot.
     level : coverage of the interval.
     resamples : number of bootstrap samples.
 
@@ -261,10 +290,20 @@ def bootstrap_interval(
         raise ValueError(f"values must be one-dimensional and not empty, have shape {data.shape}")
     if np.isnan(data).any():
         return float("nan"), float("nan")
-    picks = np.random.default_rng(seed).integers(0, data.size, (resamples, data.size))
+    rng = np.random.default_rng(seed)
+    parts = _by_shot(data, shots)
+
+    def draw(part: NDArray[np.float64]) -> NDArray[np.float64]:
+        return part[rng.integers(0, part.size, (resamples, part.size))].mean(axis=1)
+
+    if len(parts) == 1:
+        means = draw(parts[0])
+    else:
+        drawn = [rng.integers(0, len(parts), resamples) for _ in parts]
+        means = np.mean([np.choose(shot, [draw(part) for part in parts]) for shot in drawn], axis=0)
     # An order statistic and no interpolation, which would make NaN of two infinite PSNRs.
     tails = [(1 - level) / 2, (1 + level) / 2]
-    low, high = np.quantile(data[picks].mean(axis=1), tails, method="inverted_cdf")
+    low, high = np.quantile(means, tails, method="inverted_cdf")
     return float(low), float(high)
 
 

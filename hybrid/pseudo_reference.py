@@ -264,6 +264,8 @@ class Aligner:
     estimate : function or Preset, optional
         Where the estimates of single frames come from (`hybrid.estimates`). A function is called once per frame. A
         preset's estimate is made from each frame's own window, so a window of them draws on twice its radius.
+    refine : callable
+        What corrects vectors, `flow.tvl1.refine_flow` with other settings perhaps.
     timings : Timings, optional
         Where to count the stages "read", "prepare", "estimate", "flow", "warp" and "confidence".
     """
@@ -276,6 +278,7 @@ class Aligner:
         radius: int = 2,
         interpolation: str = "bilinear",
         estimate: Estimate = None,
+        refine: Callable[..., Array] = refine_flow,
         timings: Timings | None = None,
     ) -> None:
         self.shot = shot
@@ -283,6 +286,7 @@ class Aligner:
         self.estimate = estimate
         self.radius = radius
         self.interpolation = interpolation
+        self.refine = refine
         self.timings = timings or Timings()
         self._frames: dict[int, PreparedFrame] = {}
         self._estimates: dict[int, Array | None] = {}
@@ -389,7 +393,7 @@ class Aligner:
         back = rendered_flow(there, here)
         # Hidden in the other frame: whatever matches there is another surface.
         visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
-        refined = refine_flow(guide, other, flow, noise=noise)
+        refined = self.refine(guide, other, flow, noise=noise)
         flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
         return flow, valid
 

@@ -12,6 +12,7 @@ import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -21,10 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid import chart
+from hybrid.compare import load_frame, map_titles
 from hybrid.results import (
     CHART_METRICS,
     COSTS,
     METRICS,
+    Comparison,
     Cost,
     MethodResult,
     Metric,
@@ -35,11 +38,13 @@ from hybrid.results import (
     format_seconds,
     format_value,
     format_worth,
+    join,
     markdown_table,
     pareto_front,
     plain,
     present_metrics,
     settings_as_text,
+    stage_values,
     to_csv,
     to_json,
 )
@@ -72,31 +77,32 @@ class ReportImages:
 
 def write_report(
     folder: Path | str,
-    shot: str,
-    results: Sequence[MethodResult],
+    comparison: Comparison,
     images: Sequence[ReportImages] = (),
     reference: Callable[[int], Array] | None = None,
     frames: Sequence[int] = (),
     *,
+    others: Sequence[Comparison] = (),
     exposure: float = 1.0,
     metrics: Sequence[Metric] = METRICS,
-    facts: Mapping[str, str] | None = None,
+    cost: Cost = "seconds_per_megapixel",
     crop: Box | None = None,
-    megabytes: float = 14.0,
+    megabytes: float = 24.0,
 ) -> Path:
     """Write ``report.html``, ``results.json``, ``results.csv``, ``results.md`` and ``chart.png`` into a folder.
 
     Parameters
     ----------
     folder : is made where it does not exist.
-    shot : title of the page.
-    results : in the order of the tables. The one named "noisy" is what gains are counted from.
+    comparison : of the shot that the page is about, methods in the order of the tables. The one named "noisy" is what
+        gains are counted from.
     images : of those methods that have pictures, in the order of the viewer; each read one frame at a time.
     reference : (H, W, 3) linear radiance of a frame number. Needed with `images`.
     frames : numbers of the consecutive frames whose pictures are embedded.
+    others : of further shots, which are shown beside this one and put together with it.
     exposure : the factor e of the tone curve e·x / (1 + e·x) of the metrics: 0 EV in the viewer.
     metrics : definitions of the keys of ``MethodResult.metrics``; what is not defined is left out.
-    facts : what to know about the measurement (machine, versions, the reference's noise …), shown as a list.
+    cost : what the chart begins with, and what chart.png shows.
     crop : (x, y, width, height) in pixels of what is embedded; by default everything, or where the methods
         differ most if everything is too much for `megabytes`.
     megabytes : limit on the embedded pictures. What is left out to keep it is said on the page.
@@ -112,6 +118,7 @@ def write_report(
         Two results of one name; images without a result, a reference or frames; pictures of different
         shapes; a crop outside the picture.
     """
+    shot, results, facts = comparison.shot, comparison.results, comparison.facts
     _check(results, images, reference, frames)
     shown = present_metrics(results, metrics)
     charted = [m for m in shown if m.key in CHART_METRICS]
@@ -119,19 +126,21 @@ def write_report(
     if images and reference is not None:
         labels = {r.name: r.label for r in results}
         pictures, parts = _embed(images, labels, reference, list(frames), crop, megabytes * 1e6)
+    costs = [cost, *(c for c in COSTS if c != cost)]
     document = {
         "shot": shot,
-        "facts": dict(facts or {}),
+        "facts": dict(facts),
         "metrics": [asdict(m) for m in shown],
         "results": [plain(r) for r in results],
         "fronts": {f"{m.key} {c}": pareto_front(results, m, c) for m in shown for c in COSTS},
+        "stages": [asdict(s) for s in stage_values(results, shown)],
     }
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(to_json(document, indent=1), encoding="utf-8")
     (folder / "results.csv").write_text(to_csv(results, shown), encoding="utf-8")
-    (folder / "results.md").write_text(markdown_table(results, metrics), encoding="utf-8")
-    layout = chart.lay_out(results, charted[0], "seconds_per_megapixel") if charted else None
+    (folder / "results.md").write_text(markdown_table([comparison, *others], metrics, cost), encoding="utf-8")
+    layout = chart.lay_out(results, charted[0], cost) if charted else None
     if layout is not None:
         cv2.imwrite(str(folder / "chart.png"), chart.to_pixels(layout))
     page = _fill(
@@ -140,12 +149,15 @@ def write_report(
         css=_template("css"),
         js=_template("js"),
         verdict=_verdict(results, shown),
-        charts=_charts(results, charted),
-        tables=_tables(results, shown),
+        charts=_charts(results, charted, costs),
+        tables=_tables(results, shown) + _shots([comparison, *others], metrics),
+        stages=_stages(results, shown),
         definitions=_definitions(shown),
-        facts=_facts(facts or {}, pictures),
+        facts=_facts(facts, pictures),
         # In a script element only "<" could end it; "&" is for readers that take the page for XML.
-        data=to_json({**document, "chart": [m.key for m in charted], "exposure": exposure, "pictures": pictures})
+        data=to_json(
+            {**document, "chart": [m.key for m in charted], "cost": cost, "exposure": exposure, "pictures": pictures}
+        )
         .replace("&", "\\u0026")
         .replace("<", "\\u003c"),
         pictures=parts,
@@ -153,6 +165,25 @@ def write_report(
     path = folder / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def report_images(
+    folder: Path, comparison: Comparison, frames: Sequence[int]
+) -> tuple[list[ReportImages], Callable[[int], Array]]:
+    """Pictures and maps of every method, and the reference, from the folder that `compare_shot` has filled.
+
+    Points of sweeps are left out: there are too many, and they look alike.
+    """
+    images = [
+        ReportImages(
+            r.name,
+            partial(load_frame, folder, r.name),
+            {t: partial(load_frame, folder, f"{r.name} map {t}") for t in map_titles(folder, r.name, frames[0])},
+        )
+        for r in comparison.results
+        if r.absent_reason is None and not r.sweep
+    ]
+    return images, partial(load_frame, folder, "reference")
 
 
 def _check(
@@ -215,13 +246,12 @@ def _verdict(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     return f'<p class="lead">{lead}.</p><dl class="figures">{items}</dl>'
 
 
-def _charts(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+def _charts(results: Sequence[MethodResult], metrics: Sequence[Metric], costs: Sequence[Cost]) -> str:
     """The axis selectors, the legend, and one chart for each pair of axes, all but the first hidden."""
     if not metrics:
         return ""
     ups = "".join(f'<option value="{escape(m.key)}">{escape(column_title(m))}</option>' for m in metrics)
-    names = {"seconds_per_megapixel": "Seconds per megapixel-frame", "peak_bytes": "Peak memory"}
-    overs = "".join(f'<option value="{cost}">{names[cost]}</option>' for cost in COSTS)
+    overs = "".join(f'<option value="{cost}">{COSTS[cost]}</option>' for cost in costs)
     legend = "".join(
         f'<li><label><input type="checkbox" checked data-family="{i}">{chart.legend_marker(i)}'
         f"<span>{escape(name)}</span></label></li>"
@@ -229,7 +259,7 @@ def _charts(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     )
     figures: list[str] = []
     for metric in metrics:
-        for cost in COSTS:
+        for cost in costs:
             layout = chart.lay_out(results, metric, cost)
             drawing = chart.to_svg(layout, metric) if layout else "<p>No finite figure to draw.</p>"
             hidden = " hidden" if figures else ""
@@ -261,8 +291,9 @@ def _advice(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> str:
             f"<li><span>{escape('nothing' if spent == 0 else budget)}</span> "
             f"<b>{escape(r.label)}</b> <i>{escape(figure)}</i></li>"
         )
-    per = "per megapixel-frame" if cost == "seconds_per_megapixel" else "of memory"
-    return f'<div class="advice"><h3>What to use, from this budget {per} on</h3><ol>{"".join(items)}</ol></div>'
+    return (
+        f'<div class="advice"><h3>What to use, from this budget of {COSTS[cost]} on</h3><ol>{"".join(items)}</ol></div>'
+    )
 
 
 def _tables(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
@@ -275,9 +306,85 @@ def _tables(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     out = _table(methods, metrics)
     if absent:
         out += f'<div class="absent"><h3>Absent</h3><ul>{absent}</ul></div>'
-    if swept:
-        out += f"<details><summary>Sweep: {len(swept)} settings</summary>{_table(swept, metrics)}</details>"
+    for group in dict.fromkeys(r.sweep for r in swept):
+        members = [r for r in swept if r.sweep == group]
+        bases = [r for r in methods if r.name in {m.base for m in members}]
+        out += (
+            f"<details><summary>Sweep of {escape(group)}: {len(members)} settings</summary>"
+            f"{_table([*bases, *members], metrics)}</details>"
+        )
     return out
+
+
+def _stages(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """What each stage of the plan buys and costs, or would, where a sweep has measured it."""
+    values = stage_values(results, metrics)
+    if not values:
+        return ""
+    by_key = {m.key: m for m in metrics}
+    shown = [by_key[key] for key in values[0].gains]
+    heads = "".join(
+        f'<th scope="col">{escape(m.label)}<small>{escape(m.unit) or "&nbsp;"}'
+        f"{dict(higher=' ↑', lower=' ↓', zero=' → 0')[m.better]}</small></th>"
+        for m in shown
+    )
+    rows = []
+    for v in values:
+        cells = "".join(
+            f"<td{'' if key in v.told else ' class=tied'}>{_signed(gain, by_key[key])}</td>"
+            for key, gain in v.gains.items()
+        )
+        costs = "".join(
+            f"<td>{'–' if s is None else f'{s:+.2f}'.replace('-', '−')}</td>" for s in (v.seconds, v.cpu_seconds)
+        )
+        state = "on" if v.on else "off: would buy"
+        rows.append(
+            f'<tr><th scope="row">{escape(v.stage)}<small>{escape(v.base)}</small></th><td>{state}</td>'
+            f"{cells}{costs}</tr>"
+        )
+    return (
+        '<section id="stages" aria-labelledby="stages-title"><h2 id="stages-title">What each stage buys</h2>'
+        '<div class="scroll" tabindex="0" role="region" aria-label="Stages"><table><thead><tr>'
+        f'<th scope="col">Stage</th><th scope="col">In the plan</th>{heads}'
+        '<th scope="col">Time<small>s / megapixel</small></th>'
+        f'<th scope="col">CPU<small>s / megapixel</small></th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+        '<p class="hint">Each stage switched the other way round, all else as it is: the change with the stage '
+        "against without it. Grey: the bootstrap interval of the change contains zero.</p></section>"
+    )
+
+
+def _signed(gain: float, metric: Metric) -> str:
+    text = format_value(gain, metric)
+    return text if gain < 0 or math.isnan(gain) else f"+{text}"
+
+
+def _shots(comparisons: Sequence[Comparison], metrics: Sequence[Metric]) -> str:
+    """Several shots side by side, and their mean with intervals over frames and shots."""
+    if len(comparisons) < 2:
+        return ""
+    joined = join(comparisons)
+    columns = [m for m in present_metrics(joined, metrics) if m.key in CHART_METRICS]
+    verdicts = {m.key: best_and_ties(joined, m) for m in columns}
+    scales = {m.key: _scale([r.metrics[m.key] for r in joined if m.key in r.metrics], m) for m in columns}
+    tables = [{r.name: r for r in c.results} for c in comparisons]
+    heads = "".join(
+        f'<th scope="col">{escape(c.shot)}<small>{escape(m.label)}</small></th>' for m in columns for c in comparisons
+    )
+    means = "".join(f'<th scope="col">All shots<small>{escape(column_title(m))}</small></th>' for m in columns)
+    rows = []
+    for r in joined:
+        cells = "".join(
+            f"<td>{format_value(table[r.name].metrics[m.key].mean, m) if m.key in table[r.name].metrics else '–'}</td>"
+            for m in columns
+            for table in tables
+        )
+        over = "".join(_cell(r, m, scales[m.key], *verdicts[m.key]) for m in columns)
+        rows.append(f'<tr><th scope="row">{escape(r.label)}</th>{over}{cells}</tr>')
+    return (
+        '<h3>All shots</h3><div class="scroll" tabindex="0" role="region" aria-label="All shots"><table><thead><tr>'
+        f'<th scope="col">Method</th>{means}{heads}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+        '<p class="hint">Means of the shots’ means; intervals and ties by resampling shots, and frames within them.</p>'
+    )
 
 
 def _table(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
@@ -291,20 +398,22 @@ def _table(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     rows = []
     for name in chart.families(results):
         members = [r for r in results if r.family == name]
-        head = f'<tr class="family"><th scope="rowgroup" colspan="{len(metrics) + 4}">{escape(name)}</th></tr>'
+        head = f'<tr class="family"><th scope="rowgroup" colspan="{len(metrics) + 5}">{escape(name)}</th></tr>'
         rows += [head] if len(members) < len(results) else []
         for r in members:
             cells = "".join(_cell(r, m, scales[m.key], *verdicts[m.key]) for m in metrics)
             settings = ", ".join(f"{k} {v}" for k, v in settings_as_text(r).items())
+            cpu = format_seconds(r.cpu_seconds_per_megapixel)
             spread = f"{format_seconds(r.spread[0])} – {format_seconds(r.spread[1])}" if r.spread else "&nbsp;"
             rows.append(
                 f'<tr><th scope="row">{escape(r.label)}<small>{escape(settings)}</small></th>{cells}'
                 f"<td>{format_seconds(r.seconds_per_megapixel)}<small>{spread}</small></td>"
-                f"<td>{format_bytes(r.peak_bytes)}</td><td>{format_worth(r.worth)}</td></tr>"
+                f"<td>{cpu}</td><td>{format_bytes(r.peak_bytes)}</td><td>{format_worth(r.worth)}</td></tr>"
             )
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="Results"><table><thead><tr>'
         f'<th scope="col">Method</th>{heads}<th scope="col">Time<small>s / megapixel ↓</small></th>'
+        '<th scope="col">CPU<small>s / megapixel ↓</small></th>'
         '<th scope="col">Peak memory<small>&nbsp;↓</small></th><th scope="col">Worth<small>samples ↑</small></th>'
         f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )

@@ -60,6 +60,7 @@ const viewer = data.pictures ? startViewer(data.pictures) : null;
     }
     const spread = result.spread ? ` (${result.spread.map((s) => Number(s.toPrecision(3))).join("–")})` : "";
     row("per megapixel", seconds(result.seconds_per_megapixel) + spread);
+    row("of CPU time", seconds(result.cpu_seconds_per_megapixel));
     row("peak memory", memory(result.peak_bytes));
     if (result.worth !== null) row("worth", Number(Number(result.worth).toPrecision(2)) + "× the samples");
     for (const [name, value] of Object.entries(result.settings)) row(name, value);
@@ -123,7 +124,7 @@ function startViewer(pictures) {
 
   // 0 EV is the exposure of the metrics; start where the shot's mean level is a comfortable middle grey.
   const start = Math.round(2 * Math.log2(0.35 / (data.exposure * pictures.black * 64))) / 2;
-  const front = [...(data.fronts[data.chart[0] + " seconds_per_megapixel"] || [])].reverse();
+  const front = [...(data.fronts[`${data.chart[0]} ${data.cost}`] || [])].reverse();
   const best = front.find((name) => indices.has(name));
   const state = {
     left: indices.get("noisy") ?? Math.min(1, sources.length - 1),

@@ -8,20 +8,25 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from hybrid.metrics import bootstrap_interval
+from hybrid.metrics import bootstrap_interval, mean_over_shots
 
-Cost = Literal["seconds_per_megapixel", "peak_bytes"]
-COSTS: tuple[Cost, ...] = ("seconds_per_megapixel", "peak_bytes")
+Cost = Literal["seconds_per_megapixel", "cpu_seconds_per_megapixel", "peak_bytes"]
+COSTS: dict[Cost, str] = {
+    "seconds_per_megapixel": "seconds per megapixel-frame",
+    "cpu_seconds_per_megapixel": "CPU seconds per megapixel-frame",
+    "peak_bytes": "peak memory",
+}
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """One measure over the frames of a shot: its mean, range, and the interval that the mean is known to."""
+    """One measure over the frames of one or more shots: its mean, range, and the interval that the mean is known to."""
 
     mean: float
     minimum: float
@@ -29,6 +34,7 @@ class Statistic:
     low: float
     high: float
     values: tuple[float, ...] = ()  # frame by frame, where known: paired differences then decide on ties
+    shots: tuple[int, ...] = ()  # how many of the values belong to each shot, where there are several
 
 
 @dataclass(frozen=True)
@@ -50,21 +56,33 @@ class MethodResult:
 
     `seconds_per_megapixel` is the median, `spread` the (low, high) of repeated runs; None where the time is not
     known, 0 where nothing was run. `worth` is the number of times the noisy render's samples that would
-    bring it to the same error. Methods of one `family` share a marker; `sweep` marks a point that only
-    varies the settings of a method. `absent_reason` says why a method that was asked for has no figures.
+    bring it to the same error. Methods of one `family` share a marker. A point of a sweep names what is varied in
+    `sweep` and the method it varies in `base`; its settings are those in which it differs. `absent_reason`
+    says why a method that was asked for has no figures.
     """
 
     name: str
     label: str
     settings: Mapping[str, object] = field(default_factory=dict)
     family: str = "Methods"
-    sweep: bool = False
+    sweep: str = ""
+    base: str = ""
     seconds_per_megapixel: float | None = None
     spread: tuple[float, float] | None = None
+    cpu_seconds_per_megapixel: float | None = None
     peak_bytes: int | None = None
     metrics: Mapping[str, Statistic] = field(default_factory=dict)
     worth: float | None = None
     absent_reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What one shot has shown: the methods' results, and what to know about how they were measured."""
+
+    shot: str
+    results: tuple[MethodResult, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
 
 
 METRICS: tuple[Metric, ...] = (
@@ -122,27 +140,72 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "static_std",
         "Static deviation",
-        "Standard deviation over time of the pixels that stand still, on the tone curve: 0 is no flicker at "
-        "all, which blur reaches too.",
+        "Standard deviation over time, on the tone curve, of the pixels that stand still: the vectors stay below a "
+        "twentieth of a pixel, and the reference's 9 × 9 means within 0.02. Frame by frame: √(n / (n − 1)) times "
+        "the root mean square distance to each pixel's own mean over the n frames. 0 is no flicker at all, which "
+        "blur reaches too.",
         better="lower",
         logarithmic=True,
     ),
 )
+MARKDOWN_METRICS = ("psnr", "temporal_psnr")  # the columns of the README's table
 CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # those the chart offers, the first one first
 
 
-def summarize(values: Sequence[float]) -> Statistic:
-    """Summarize a measure taken frame by frame: mean, range, and the 95 % bootstrap interval of the mean."""
+def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
+    """Summarize a measure taken frame by frame: mean, range, and the 95 % bootstrap interval of the mean.
+
+    Parameters
+    ----------
+    values : N ≥ 1 figures, one per frame.
+    shots : how many of them belong to each shot, if to several. The mean is then that of the shots' means.
+    """
     if len(values) == 0:
         raise ValueError("values must hold at least one frame, is empty")
     data = np.asarray(values, np.float64)
     return Statistic(
-        float(data.mean()),
+        mean_over_shots(data, shots),
         float(data.min()),
         float(data.max()),
-        *bootstrap_interval(data),
+        *bootstrap_interval(data, shots=shots),
         tuple(float(v) for v in data),
+        tuple(shots),
     )
+
+
+def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
+    """Put the results of several shots together: the methods that none of them lacks, points of sweeps left out.
+
+    Figures are means over shots, their intervals over frames and shots. Costs are means too (that of memory the
+    maximum), since shots call for different stages; worth is the geometric mean.
+    """
+    tables = [{r.name: r for r in c.results if r.absent_reason is None and not r.sweep} for c in comparisons]
+    joined = []
+    for name, first in tables[0].items() if tables else ():
+        each = [table[name] for table in tables if name in table]
+        if len(each) < len(tables):
+            continue
+        metrics = {}
+        for key in first.metrics:
+            parts = [r.metrics[key].values for r in each if key in r.metrics]
+            if len(parts) == len(each) and all(parts):
+                metrics[key] = summarize([v for part in parts for v in part], [len(part) for part in parts])
+        seconds = [r.seconds_per_megapixel for r in each if r.seconds_per_megapixel is not None]
+        cpu = [r.cpu_seconds_per_megapixel for r in each if r.cpu_seconds_per_megapixel is not None]
+        worths = [r.worth for r in each if r.worth is not None]
+        joined.append(
+            replace(
+                first,
+                settings={},
+                seconds_per_megapixel=float(np.mean(seconds)) if len(seconds) == len(each) else None,
+                spread=None,
+                cpu_seconds_per_megapixel=float(np.mean(cpu)) if len(cpu) == len(each) else None,
+                peak_bytes=max((r.peak_bytes for r in each if r.peak_bytes is not None), default=None),
+                metrics=metrics,
+                worth=math.exp(float(np.mean(np.log(worths)))) if len(worths) == len(each) else None,
+            )
+        )
+    return joined
 
 
 def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
@@ -187,29 +250,85 @@ def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) ->
     return front
 
 
-def markdown_table(results: Sequence[MethodResult], metrics: Sequence[Metric] = METRICS) -> str:
-    """Return the results as a Markdown table: measures the chart offers, cost, worth in samples.
+def markdown_table(
+    comparisons: Sequence[Comparison],
+    metrics: Sequence[Metric] = METRICS,
+    cost: Cost = "seconds_per_megapixel",
+) -> str:
+    """Return the README's table: PSNR and temporal PSNR on each shot, then the costs on the first.
 
     The best of a column is bold, what ties with it is marked "≈"; absent methods follow with their reason.
     Points of a sweep are left out.
     """
-    methods = [r for r in results if not r.sweep]
-    columns = [m for m in present_metrics(methods, metrics) if m.key in CHART_METRICS]
-    verdicts = {m.key: best_and_ties(methods, m) for m in columns}
-    titles = ["method", *(column_title(m) for m in columns), "s / megapixel", "peak memory", "worth in samples"]
-    lines = [titles, ["---", *("---:" for _ in titles[1:])]]
-    for r in methods:
-        cells = [r.label]
-        if r.absent_reason is not None:
-            lines.append([r.label, f"absent: {r.absent_reason}", *("" for _ in titles[2:])])
+    columns = [m for m in metrics if m.key in MARKDOWN_METRICS]
+    tables = [{r.name: r for r in c.results if not r.sweep} for c in comparisons]
+    shown = [present_metrics(list(table.values()), columns) for table in tables]
+    verdicts = [
+        {m.key: best_and_ties(list(table.values()), m) for m in row} for table, row in zip(tables, shown, strict=True)
+    ]
+    heads = [f"{c.shot}: {' / '.join(map(column_title, row))}" for c, row in zip(comparisons, shown, strict=True)]
+    unit = {"cpu_seconds_per_megapixel": "CPU-s"}.get(cost, "s")
+    titles = ["method", *heads, f"{unit} per megapixel-frame", "peak memory", "worth in samples"]
+    lines = [titles, ["---", *("---" for _ in titles[1:])]]
+    missing = []
+    for name in dict.fromkeys(name for table in tables for name in table):
+        first = next(table[name] for table in tables if name in table)
+        if all(table[name].absent_reason is not None for table in tables if name in table):
+            missing.append([first.label, f"absent: {first.absent_reason}", *("" for _ in titles[2:])])
             continue
-        for m in columns:
-            text = format_value(r.metrics[m.key].mean, m) if m.key in r.metrics else "–"
-            best, ties = verdicts[m.key]
-            cells.append(f"**{text}**" if r.name == best else f"≈ {text}" if r.name in ties else text)
-        cells += [format_seconds(r.seconds_per_megapixel), format_bytes(r.peak_bytes), format_worth(r.worth)]
-        lines.append(cells)
-    return "".join(f"| {' | '.join(_markdown_cell(c) for c in line)} |\n" for line in lines)
+        cells = [first.label]
+        for table, row, verdict in zip(tables, shown, verdicts, strict=True):
+            figures = []
+            for m in row:
+                statistic = table[name].metrics.get(m.key) if name in table else None
+                text = "–" if statistic is None else format_value(statistic.mean, m)
+                best, ties = verdict[m.key]
+                figures.append(f"**{text}**" if name == best else f"≈ {text}" if name in ties else text)
+            cells.append(" / ".join(figures))
+        spent = first.cpu_seconds_per_megapixel if unit == "CPU-s" else first.seconds_per_megapixel
+        cells += [format_seconds(spent), format_bytes(first.peak_bytes)]
+        lines.append([*cells, format_worth(first.worth)])
+    return "".join(f"| {' | '.join(_markdown_cell(c) for c in line)} |\n" for line in [*lines, *missing])
+
+
+@dataclass(frozen=True)
+class StageValue:
+    """What one stage changes: figures with it minus figures without it."""
+
+    stage: str
+    base: str
+    on: bool  # in the plan
+    gains: Mapping[str, float]  # of PSNR and temporal PSNR
+    told: tuple[str, ...]  # those whose change is no tie
+    seconds: float | None
+    cpu_seconds: float | None
+
+
+def stage_values(results: Sequence[MethodResult], metrics: Sequence[Metric] = METRICS) -> list[StageValue]:
+    """What each stage buys and costs by the sweep named "Stages"; empty without one."""
+    by_name = {r.name: r for r in results if r.absent_reason is None}
+    values = []
+    for variant in by_name.values():
+        base = by_name.get(variant.base)
+        if variant.sweep != "Stages" or base is None:
+            continue
+        ((stage, state),) = variant.settings.items()
+        ways = (base, variant) if state == "off" else (variant, base)
+        gains, told = {}, []
+        for m in metrics:
+            if m.key in MARKDOWN_METRICS and m.key in base.metrics and m.key in variant.metrics:
+                gains[m.key] = ways[0].metrics[m.key].mean - ways[1].metrics[m.key].mean
+                if not _tied(ways[0].metrics[m.key], ways[1].metrics[m.key]):
+                    told.append(m.key)
+        seconds, cpu = (
+            None if ends[0] is None or ends[1] is None else ends[0] - ends[1]
+            for ends in (
+                [way.seconds_per_megapixel for way in ways],
+                [way.cpu_seconds_per_megapixel for way in ways],
+            )
+        )
+        values.append(StageValue(stage, base.label, state == "off", gains, tuple(told), seconds, cpu))
+    return values
 
 
 def _goodness(value: float, metric: Metric) -> float:
@@ -218,10 +337,10 @@ def _goodness(value: float, metric: Metric) -> float:
 
 
 def _tied(a: Statistic, b: Statistic) -> bool:
-    if a.values and len(a.values) == len(b.values):
+    if a.values and len(a.values) == len(b.values) and a.shots == b.shots:
         with np.errstate(invalid="ignore"):  # two perfect scores: inf − inf
             difference = np.subtract(a.values, b.values)
-        low, high = bootstrap_interval(np.where(np.equal(a.values, b.values), 0.0, difference))
+        low, high = bootstrap_interval(np.where(np.equal(a.values, b.values), 0.0, difference), shots=a.shots)
         return low <= 0 <= high
     return a.low <= b.high and b.low <= a.high
 
@@ -304,14 +423,41 @@ def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     parts = ("mean", "minimum", "maximum", "low", "high")
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    facts = ["name", "label", "family", "sweep", "absent_reason", "settings"]
-    costs = ["seconds_per_megapixel", "seconds_low", "seconds_high", "peak_bytes", "worth"]
+    facts = ["name", "label", "family", "sweep", "base", "absent_reason", "settings"]
+    costs = ["seconds_per_megapixel", "seconds_low", "seconds_high", "cpu_seconds_per_megapixel", "peak_bytes", "worth"]
     writer.writerow([*facts, *costs, *(f"{m.key}_{part}" for m in metrics for part in parts)])
     for r in results:
-        row: list[object] = [r.name, r.label, r.family, int(r.sweep), r.absent_reason]
+        row: list[object] = [r.name, r.label, r.family, r.sweep, r.base, r.absent_reason]
         row += [to_json(settings_as_text(r)).strip(), r.seconds_per_megapixel]
-        row += [*(r.spread or (None, None)), r.peak_bytes, r.worth]
+        row += [*(r.spread or (None, None)), r.cpu_seconds_per_megapixel, r.peak_bytes, r.worth]
         for m in metrics:
             row += [getattr(r.metrics[m.key], p) if m.key in r.metrics else None for p in parts]
         writer.writerow(row)
     return out.getvalue()
+
+
+def read_comparison(path: Path) -> Comparison:
+    """Read the ``results.json`` that `hybrid.report.write_report` has left.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    """
+    document = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        results = []
+        for entry in document["results"]:
+            statistics = {}
+            for key, s in entry["metrics"].items():
+                mean, minimum, maximum, low, high = (
+                    float(s[end]) for end in ("mean", "minimum", "maximum", "low", "high")
+                )
+                values = tuple(map(float, s["values"]))
+                statistics[key] = Statistic(mean, minimum, maximum, low, high, values, tuple(s["shots"]))
+            spread = None if entry["spread"] is None else tuple(map(float, entry["spread"]))
+            worth = None if entry["worth"] is None else float(entry["worth"])
+            results.append(MethodResult(**{**entry, "metrics": statistics, "spread": spread, "worth": worth}))
+        return Comparison(document["shot"], tuple(results), document["facts"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is no result of a comparison: expected {error}") from None

@@ -15,20 +15,31 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from hybrid import compare
-from hybrid.compare import METHODS, compare_shot, load_frame, motion_between, noisy, result_table, run_method
+from hybrid.compare import (
+    Run,
+    compare_shot,
+    load_frame,
+    map_titles,
+    motion_between,
+    result_table,
+    run_method,
+    spread_seconds,
+)
 from hybrid.frames import Frame
+from hybrid.methods import METHODS, AbsentError, Frames, Method, external, noisy
 from hybrid.metrics import mean_bias, psnr, relmse
 from hybrid.oidn import denoise_oidn
 
 Array = NDArray[np.float32]
 SIZE = (24, 32)
+QUICK = ("psnr", "relmse", "mean_bias")
 needs_oidn = [
     pytest.mark.oidn,
     pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed"),
 ]
 
 
-@dataclass
+@dataclass(eq=False)
 class MemoryShot:
     """What a method uses of a `Shot`, without files."""
 
@@ -37,6 +48,11 @@ class MemoryShot:
     @property
     def numbers(self) -> tuple[int, ...]:
         return tuple(self.frames)
+
+    def has(self, number: int) -> bool:
+        return number in self.frames
+
+    step = 1
 
     def read(self, number: int) -> Frame:
         return self.frames[number]
@@ -80,14 +96,31 @@ def hungry(shot: MemoryShot, *, megabytes: int) -> Iterator[tuple[int, Array]]:
         yield number, shot.read(number).color + 0 * np.ones(megabytes * 2**18, np.float32)[0]
 
 
+def without_weights(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
+    raise AbsentError("no weights are shipped")
+    yield
+
+
+def with_maps(shot: MemoryShot) -> Iterator[tuple[int, dict[str, Array]]]:
+    for number in shot.numbers:
+        yield number, {"Confidence": np.full(SIZE, 0.5, np.float32)}
+
+
 def lazy(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
     yield shot.numbers[0], shot.read(shot.numbers[0]).color
 
 
+def ways(**runs: Frames) -> dict[str, Method]:
+    return {name: Method(run, "Tests") for name, run in runs.items()}
+
+
+NOISY = {"noisy": METHODS["noisy"]}
+
+
 def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
     shot, reference = make_shots()
-    methods = {"noisy": noisy, "perfect": perfect, "gone": not_installed, "dead": killed, "again": noisy}
-    results = {r.name: r for r in compare_shot(shot, reference, methods, folder=tmp_path)}
+    methods = NOISY | ways(perfect=perfect, gone=not_installed, weightless=without_weights, dead=killed, again=noisy)
+    results = {r.name: r for r in compare_shot(shot, reference, methods, measures=QUICK, folder=tmp_path).results}
     assert list(results) == list(methods)
 
     measured = results["noisy"].metrics
@@ -98,6 +131,7 @@ def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
     assert results["again"].metrics == measured
     assert results["perfect"].metrics["psnr"].mean == results["perfect"].metrics["temporal_psnr"].mean == np.inf
     assert results["gone"].absent_reason == "needs the package unheard-of"
+    assert results["weightless"].absent_reason == "no weights are shipped"
     assert "died" in (results["dead"].absent_reason or "")
     assert not results["gone"].metrics
     np.testing.assert_array_equal(load_frame(tmp_path, "noisy", 5), shot.read(5).color)
@@ -116,8 +150,8 @@ def test_peak_memory_is_the_methods_own() -> None:
     """Neither the comparing process's memory nor that of the method before counts."""
     shot, reference = make_shots()
     ballast = np.ones(300 * 2**18, np.float32)  # 300 MiB in this process
-    methods = {"hungry": partial(hungry, megabytes=200), "modest": partial(hungry, megabytes=1)}
-    large, small = compare_shot(shot, reference, methods)
+    methods = ways(hungry=partial(hungry, megabytes=200), modest=partial(hungry, megabytes=1))
+    large, small = compare_shot(shot, reference, methods, measures=QUICK).results
     assert ballast.nbytes == 300 * 2**20
     assert large.peak_bytes is not None
     assert small.peak_bytes is not None
@@ -125,7 +159,7 @@ def test_peak_memory_is_the_methods_own() -> None:
     assert 180 < (large.peak_bytes - small.peak_bytes) / 2**20 < 220
 
 
-def test_reading_and_warming_up_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_and_warming_up_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     class Clock:
         now = 0.0
         compiled = False
@@ -155,15 +189,105 @@ def test_reading_and_warming_up_are_not_counted(tmp_path: Path, monkeypatch: pyt
             clock.now += 3
             yield number, color
 
-    run = run_method(method, SlowShot(shot.frames), tmp_path, "method")
+    run = run_method(Method(method, "Tests"), SlowShot(shot.frames))
     assert run.seconds == run.cpu_seconds == 9
     assert run.megapixels == pytest.approx(3 * SIZE[0] * SIZE[1] / 1e6)
+
+
+def test_the_load_of_a_round_is_divided_out() -> None:
+    """Four methods whose costs are known, on a machine that is twice and four times as slow in the later rounds."""
+    costs = {"a": 1.0, "b": 2.0, "c": 4.0, "d": 8.0}
+    loads = (1.0, 2.0, 4.0)
+    runs = {name: [Run(0.5, s * load, s * load / 2, 0) for load in loads] for name, s in costs.items()}
+    runs["d"][1] = Run(0.5, 100.0, 1.0, 0)  # one run that something else hit
+    times = spread_seconds(runs)
+    for name in "abc":
+        # 2 × 2 s per megapixel in the middle round; no spread is left.
+        assert times[name] == pytest.approx((4 * costs[name], 4 * costs[name], 4 * costs[name], 2 * costs[name]))
+    assert times["d"][0] / times["a"][0] == pytest.approx(8)
+    assert times["d"][2] > 2 * times["d"][0]
+    # Two methods tell nothing of the machine.
+    alone = spread_seconds({"a": runs["a"]})["a"]
+    assert alone == pytest.approx((4.0, 2.0, 8.0, 2.0))
+
+
+def test_rounds_take_turns_and_what_is_there_already_runs_once() -> None:
+    shot, reference = make_shots()
+    asked: list[str] = []
+    methods = NOISY | ways(a=perfect, b=perfect, c=perfect)
+    comparison = compare_shot(
+        shot, reference, methods, measures=QUICK, rounds=2, progress=lambda what, done, total: asked.append(what)
+    )
+    assert asked[:8] == ["noisy", "a", "b", "c", "b", "c", "noisy", "a"]
+    noisy_result, a, *_ = comparison.results
+    assert (noisy_result.seconds_per_megapixel, noisy_result.spread) == (0, None)
+    assert a.spread is not None
+    assert a.spread[0] <= (a.seconds_per_megapixel or 0) <= a.spread[1]
+
+
+def test_a_finished_sequence_is_judged_and_not_timed() -> None:
+    shot, reference = make_shots()
+    other = MemoryShot({n: Frame(n, f.color * np.float32(1.1)) for n, f in reference.frames.items()})
+    (result,) = compare_shot(shot, reference, {"theirs": external(other)}, measures=QUICK).results
+    assert result.metrics["mean_bias"].mean == pytest.approx(0.1, abs=1e-6)
+    assert result.seconds_per_megapixel is None
+    assert result.peak_bytes is None
+    del other.frames[5]
+    with pytest.raises(ValueError, match="'theirs' gave no frame 5"):
+        compare_shot(shot, reference, {"theirs": external(other)}, measures=QUICK)
+
+
+def test_worth_in_samples_follows_the_levels() -> None:
+    """Gamma noise at 4, 8 and 16 samples, a method whose error is that of 16: worth twice the shot's 8."""
+
+    def render(samples: int, seed: int) -> MemoryShot:
+        rng = np.random.default_rng(seed)
+        _, clean = make_shots()
+        grain = {n: 1 + 0.4 / np.sqrt(samples) * rng.normal(size=(*SIZE, 3)) for n in clean.numbers}
+        return MemoryShot({n: Frame(n, (f.color * grain[n]).astype(np.float32)) for n, f in clean.frames.items()})
+
+    _, reference = make_shots()
+    methods = NOISY | {"better": external(render(16, 1))}
+    comparison = compare_shot(
+        render(8, 2), reference, methods, measures=QUICK, samples=8, levels=[(render(4, 3), 4), (render(64, 4), 64)]
+    )
+    # 6912 squared errors: 1.7 % each of method and level, doubled by the reading between levels.
+    assert comparison.results[1].worth == pytest.approx(2, rel=0.07)
+    assert "as 1/n asks" in comparison.facts["Worth in samples"]
+    # A clean reference: what is left for its noise is far below the least error that was measured.
+    assert "measured levels" in comparison.facts["Reference"]
+
+
+def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
+    shot, reference = make_shots()
+    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
+    compare_shot(shot, reference, methods, measures=("psnr",), maps=True, folder=tmp_path)
+    assert map_titles(tmp_path, "noisy", 5) == []
+    assert map_titles(tmp_path, "mapped", 5) == ["Confidence"]
+    assert load_frame(tmp_path, "mapped map Confidence", 5).shape == SIZE
+
+
+def test_static_pixels_flicker_by_what_was_put_in() -> None:
+    """A still shot whose reference stands still: the deviation over time is that of the noise put in."""
+    _, clean = make_shots(tuple(range(1, 9)))
+    sigma = 0.02
+    rng = np.random.default_rng(3)
+    frames = {}
+    for number, frame in clean.frames.items():
+        tone = frame.color / (1 + frame.color) + sigma * rng.normal(size=frame.color.shape)
+        vectors = np.zeros((*SIZE, 4), np.float32)
+        color = (tone / (1 - tone)).astype(np.float32)
+        frames[number] = Frame(number, color, motion=vectors, motion_convention="cycles")
+    comparison = compare_shot(MemoryShot(frames), clean, NOISY, measures=QUICK)
+    assert comparison.facts["Pixels that stand still"] == "100.0%"
+    # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
+    assert comparison.results[0].metrics["static_std"].mean == pytest.approx(sigma, rel=0.03)
 
 
 def test_only_frames_and_neighbours_that_are_there_are_judged() -> None:
     shot, _ = make_shots((1, 2, 4, 5, 6))
     _, reference = make_shots((1, 2, 4, 6))
-    (result,) = compare_shot(shot, reference, {"noisy": noisy})
+    (result,) = compare_shot(shot, reference, NOISY, measures=QUICK).results
     assert len(result.metrics["psnr"].values) == 4
     assert len(result.metrics["temporal_psnr"].values) == 1
 
@@ -179,8 +303,9 @@ def test_reference_in_halves_loses_its_noise() -> None:
         return MemoryShot(frames)
 
     halves = render(1), render(2)
-    (judged,) = compare_shot(shot, halves, {"perfect": perfect}, measures=("psnr", "ssim", "mean_bias"))
-    (fooled,) = compare_shot(shot, halves[0], {"perfect": perfect})
+    comparison = compare_shot(shot, halves, ways(perfect=perfect), measures=("psnr", "ssim", "mean_bias"))
+    (judged,) = comparison.results
+    (fooled,) = compare_shot(shot, halves[0], ways(perfect=perfect), measures=QUICK).results
     # 2304 values a frame: what is left of the product of two errors is about 1/50 of their square, 17 dB.
     for key in ("psnr", "temporal_psnr"):
         assert judged.metrics[key].mean > fooled.metrics[key].mean + 8
@@ -191,16 +316,21 @@ def test_reference_in_halves_loses_its_noise() -> None:
 def test_without_vectors_there_is_no_temporal_figure() -> None:
     shot, reference = make_shots()
     still = {n: replace(f, motion=None, motion_convention=None) for n, f in shot.frames.items()}
-    (result,) = compare_shot(MemoryShot(still), reference, {"noisy": noisy})
-    assert set(result.metrics) == {"psnr", "relmse", "mean_bias"}
+    comparison = compare_shot(MemoryShot(still), reference, NOISY, measures=QUICK)
+    assert set(comparison.results[0].metrics) == {"psnr", "relmse", "mean_bias"}
+    assert comparison.facts["Pixels that stand still"] == "0.0%"
 
 
 def test_wrong_input_is_an_error() -> None:
     shot, reference = make_shots()
     with pytest.raises(ValueError, match="none in common"):
-        compare_shot(shot, make_shots((8, 9))[1], {"noisy": noisy})
+        compare_shot(shot, make_shots((8, 9))[1], NOISY)
     with pytest.raises(ValueError, match="'lazy' gave no frame 5"):
-        compare_shot(shot, reference, {"lazy": lazy})
+        compare_shot(shot, reference, ways(lazy=lazy))
+    with pytest.raises(ValueError, match="levels need the samples per pixel of the shot"):
+        compare_shot(shot, reference, NOISY, measures=QUICK, levels=[(shot, 4)])
+    with pytest.raises(ValueError, match="level of 4 samples has frames 8–9, expected some of 4–6"):
+        compare_shot(shot, reference, NOISY, measures=QUICK, samples=8, levels=[(make_shots((8, 9))[0], 4)])
 
 
 class TestMotionBetween:
@@ -244,17 +374,20 @@ class TestMotionBetween:
 def test_non_finite_pixels_of_the_render_are_nobodys_fault(tmp_path: Path) -> None:
     shot, _ = make_shots()
     shot.frames[5].color[3, 3] = np.inf
-    run_method(noisy, shot, tmp_path, "noisy")
+    run_method(METHODS["noisy"], shot, "noisy", tmp_path)
     assert np.isfinite(load_frame(tmp_path, "noisy", 5)).all()
 
 
 class TestOidn:
     pytestmark = needs_oidn
 
-    @pytest.mark.parametrize(("name", "prefilter"), [("OIDN high", False), ("OIDN best", True)])
+    @pytest.mark.parametrize(
+        ("name", "prefilter"), [("OIDN high", False), ("OIDN best", True), ("OIDN balanced", False)]
+    )
     def test_is_a_method(self, tmp_path: Path, name: str, prefilter: bool) -> None:
         shot, _ = make_shots((7,))
-        run_method(METHODS[name], shot, tmp_path, name)
+        run_method(METHODS[name], shot, name, tmp_path)
         frame = shot.read(7)
-        expected = denoise_oidn(frame.color, frame.albedo, frame.normal, prefilter=prefilter)
+        quality = "balanced" if "balanced" in name else "high"
+        expected = denoise_oidn(frame.color, frame.albedo, frame.normal, quality=quality, prefilter=prefilter)
         np.testing.assert_array_equal(load_frame(tmp_path, name, 7), expected)

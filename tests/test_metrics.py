@@ -17,6 +17,7 @@ from hybrid.metrics import (
     bootstrap_interval,
     flip,
     mean_bias,
+    mean_over_shots,
     psnr,
     relmse,
     smape,
@@ -200,7 +201,7 @@ def still(count: int) -> tuple[list[NDArray[np.float32]], list[NDArray[np.bool_]
 def test_still_perfect_shot_is_perfect(rng: np.random.Generator) -> None:
     shot = [texture(rng)] * 4
     assert (temporal_psnr(shot, shot, *still(4)) == np.full(3, np.inf)).all()
-    assert static_std(shot, np.ones(SIZE, bool)) == 0
+    assert (static_std(shot, np.ones(SIZE, bool)) == np.zeros(4)).all()
 
 
 def test_error_that_stays_is_no_flicker(rng: np.random.Generator) -> None:
@@ -216,7 +217,7 @@ def test_flicker_of_known_size_is_recovered(size: float, rng: np.random.Generato
     # float32 radiance behind the curve is exact to 1e-7, 1e-4 of the smaller flicker.
     np.testing.assert_allclose(scores, -20 * np.log10(size), atol=2e-3)
     # Half the steps up, half down: s/2 about the mean, and 6/5 for the unbiased variance of six frames.
-    assert static_std(shot, np.ones(SIZE, bool)) == pytest.approx(size / 2 * np.sqrt(6 / 5), rel=2e-3)
+    np.testing.assert_allclose(static_std(shot, np.ones(SIZE, bool)), size / 2 * np.sqrt(6 / 5), rtol=2e-3)
 
 
 def test_static_std_counts_static_pixels_only(rng: np.random.Generator) -> None:
@@ -227,7 +228,8 @@ def test_static_std_counts_static_pixels_only(rng: np.random.Generator) -> None:
     for t, frame in enumerate(shot):
         frame[:, 20:] = 0.04 * t  # moves, and is masked out
     # 2400 values × 19 degrees of freedom: a standard error of 0.3 %, five of them allowed.
-    assert static_std((expand(f) for f in shot), mask) == pytest.approx(sigma, rel=0.016)
+    found = static_std((expand(f) for f in shot), mask)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(sigma, rel=0.016)
 
 
 def test_flow_leads_back_to_the_previous_frame(rng: np.random.Generator) -> None:
@@ -288,9 +290,9 @@ def test_temporal_measures_are_nan_where_a_frame_is(rng: np.random.Generator) ->
     scores = temporal_psnr(shot, [reference] * 4, *still(4))
     assert np.isnan(scores[:2]).all()
     assert scores[2] == np.inf
-    assert np.isnan(static_std(shot, np.ones(SIZE, bool)))
+    assert np.isnan(static_std(shot, np.ones(SIZE, bool))).all()
     empty = np.zeros(SIZE, bool)
-    assert np.isnan(static_std([reference] * 3, empty))
+    assert np.isnan(static_std([reference] * 3, empty)).all()
     assert np.isnan(temporal_psnr([reference] * 2, [reference] * 2, still(2)[0], [empty])).all()
 
 
@@ -327,3 +329,18 @@ def test_bootstrap_interval_of_special_values() -> None:
     assert np.isnan(bootstrap_interval([1.0, np.nan])).all()
     with pytest.raises(ValueError, match="not empty"):
         bootstrap_interval([])
+    with pytest.raises(ValueError, match="shots must add up to the 3 values"):
+        bootstrap_interval([1.0, 2.0, 3.0], shots=(2, 2))
+
+
+def test_bootstrap_over_shots_is_as_wide_as_they_differ(rng: np.random.Generator) -> None:
+    """Many frames of three shots that differ tell the mean of shots no better than three figures do."""
+    shots = (200, 100, 50)
+    values = np.concatenate([mean + 0.1 * rng.normal(size=n) for mean, n in zip((1.0, 2.0, 6.0), shots, strict=True)])
+    assert mean_over_shots(values, shots) == pytest.approx(3.0, abs=0.03)  # 0.1/√50 of the shortest, a third of it
+    low, high = bootstrap_interval(values, shots=shots)
+    # One resample in 27 takes the same shot three times: the ends are the shots themselves, a hundredth about them.
+    assert low == pytest.approx(1.0, abs=0.05)
+    assert high == pytest.approx(6.0, abs=0.05)
+    narrow = bootstrap_interval(values)
+    assert narrow[1] - narrow[0] < 0.5  # frames alone would claim to know it

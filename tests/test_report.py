@@ -23,6 +23,7 @@ from hybrid import chart, report
 from hybrid.report import ReportImages, write_report
 from hybrid.results import (
     METRICS,
+    Comparison,
     MethodResult,
     Metric,
     Statistic,
@@ -43,14 +44,14 @@ def result(name: str, psnr: float | list[float], seconds: float | None, **more: 
     return MethodResult(name, **settings)
 
 
-RESULTS = [
+RESULTS = (
     result("noisy", 22.0, 0.0, family="Input"),
     result("average", 28.0, 0.2, peak_bytes=200 << 20),
     result("slow", 27.0, 2.0, peak_bytes=400 << 20),
     result("final", 34.0, 4.0, peak_bytes=600 << 20, worth=14.2, spread=(3.8, 4.3), settings={"window": 5}),
     result("other", 33.0, None, family="External"),
     MethodResult("gone", "Gone", absent_reason="torch is not installed"),
-]
+)
 
 
 # --- who is best ---------------------------------------------------------------------------------------
@@ -93,13 +94,17 @@ def test_the_front_holds_what_nothing_cheaper_beats() -> None:
 
 
 def test_markdown_marks_the_best_and_keeps_a_name_in_its_cell() -> None:
-    rows = markdown_table([*RESULTS, replace(RESULTS[1], name="evil", label=EVIL)]).splitlines()
-    assert "**34.00**" in rows[5]
+    evil = replace(RESULTS[1], name="evil", label=EVIL)
+    other = Comparison("Other", (result("final", 30.0, 1.0), result("average", 31.0, 1.0)))
+    rows = markdown_table([Comparison("Hall", (*RESULTS, evil)), other]).splitlines()
+    assert "| **34.00** | **" not in rows[5]
+    assert "| **34.00** | 30.00 | 4 |" in rows[5]  # the costs are the first shot's
     assert "14×" in rows[5]
-    assert "absent: torch is not installed" in rows[7]
+    assert "| 28.00 | **31.00** |" in rows[3]
+    assert "<" not in rows[7]
+    assert "absent: torch is not installed" in rows[8]
     bars = {row.replace("\\|", "").count("|") for row in rows}
     assert len(bars) == 1  # every row has as many cells as the head
-    assert "<" not in rows[-1]
 
 
 # --- the chart -----------------------------------------------------------------------------------------
@@ -215,7 +220,7 @@ def scene(level: float, shape: tuple[int, int] = (18, 32)) -> Callable[[int], np
 
 
 def test_every_file_is_written_and_readable(tmp_path: Path) -> None:
-    page = write_report(tmp_path / "a" / "b", "Hall", RESULTS, facts={"Machine": "two cores"})
+    page = write_report(tmp_path / "a" / "b", Comparison("Hall", RESULTS, {"Machine": "two cores"}))
     folder = page.parent
     names = {p.name for p in folder.iterdir()}
     assert names == {"report.html", "results.json", "results.csv", "results.md", "chart.png"}
@@ -234,7 +239,7 @@ def test_every_file_is_written_and_readable(tmp_path: Path) -> None:
 
 
 def test_numbers_that_are_not_finite_survive_json(tmp_path: Path) -> None:
-    write_report(tmp_path, "x", [result("a", [math.inf, math.nan], 1.0)])
+    write_report(tmp_path, Comparison("x", (result("a", [math.inf, math.nan], 1.0),)))
     statistic = json.loads((tmp_path / "results.json").read_text())["results"][0]["metrics"]["psnr"]
     assert [float(v) for v in statistic["values"]] == pytest.approx([math.inf, math.nan], nan_ok=True)
 
@@ -243,7 +248,7 @@ def test_nothing_from_a_name_becomes_markup(tmp_path: Path) -> None:
     evil = replace(RESULTS[3], name=EVIL, label=EVIL, family=EVIL, settings={EVIL: EVIL})
     gone = MethodResult("gone", EVIL, absent_reason=EVIL)
     images = [ReportImages(EVIL, scene(1.0), {EVIL: lambda n: np.zeros((18, 32), np.float32)})]
-    page = write_report(tmp_path, EVIL, [evil, gone], images, scene(1.0), [8], facts={EVIL: EVIL})
+    page = write_report(tmp_path, Comparison(EVIL, (evil, gone), {EVIL: EVIL}), images, scene(1.0), [8])
     text = page.read_text(encoding="utf-8")
     assert "<img" not in text
     assert text.count("</script>") == 2 + 3  # data, program; two pictures and a map
@@ -256,14 +261,14 @@ def test_what_is_left_out_is_said_and_the_limit_kept(tmp_path: Path) -> None:
     noise = {n: rng.exponential(1.0, (270, 480, 3)).astype(np.float32) for n in (8, 9, 10)}
     still = np.ones((270, 480, 3), np.float32)
     images = [ReportImages("average", lambda n: noise[n])]
-    page = write_report(tmp_path, "x", RESULTS, images, lambda n: still, [8, 9, 10], megabytes=0.4)
+    page = write_report(tmp_path, Comparison("x", RESULTS), images, lambda n: still, [8, 9, 10], megabytes=0.4)
     info = json.loads(page.read_text().split('id="data">')[1].split("</script>")[0])["pictures"]
     assert info["width"] < 480
     assert "of 480 × 270" in info["extent"]
     assert "left out" in info["extent"]
     # The page's own text and program take about a tenth of a megabyte.
     assert page.stat().st_size < 0.4e6 + 0.2e6
-    tiny = write_report(tmp_path, "x", RESULTS, images, lambda n: still, [8, 9, 10], megabytes=0.12)
+    tiny = write_report(tmp_path, Comparison("x", RESULTS), images, lambda n: still, [8, 9, 10], megabytes=0.12)
     info = json.loads(tiny.read_text().split('id="data">')[1].split("</script>")[0])["pictures"]
     assert len(info["frames"]) < 3
     assert "of 8 to 10" in info["extent"]
@@ -272,15 +277,15 @@ def test_what_is_left_out_is_said_and_the_limit_kept(tmp_path: Path) -> None:
 def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
     picture = [ReportImages("average", scene(1.0))]
     with pytest.raises(ValueError, match="'noisy' appears 2 times"):
-        write_report(tmp_path, "x", [RESULTS[0], RESULTS[0]])
+        write_report(tmp_path, Comparison("x", (RESULTS[0], RESULTS[0])))
     with pytest.raises(ValueError, match="'nobody' belong to no result"):
-        write_report(tmp_path, "x", RESULTS, [ReportImages("nobody", scene(1.0))], scene(1.0), [8])
+        write_report(tmp_path, Comparison("x", RESULTS), [ReportImages("nobody", scene(1.0))], scene(1.0), [8])
     with pytest.raises(ValueError, match="need a reference"):
-        write_report(tmp_path, "x", RESULTS, picture)
+        write_report(tmp_path, Comparison("x", RESULTS), picture)
     with pytest.raises(ValueError, match=r"average has the shape \(18, 32, 3\), expected \(18, 30, 3\)"):
-        write_report(tmp_path, "x", RESULTS, picture, scene(1.0, (18, 30)), [8])
+        write_report(tmp_path, Comparison("x", RESULTS), picture, scene(1.0, (18, 30)), [8])
     with pytest.raises(ValueError, match="crop must lie inside the picture of 32x18"):
-        write_report(tmp_path, "x", RESULTS, picture, scene(1.0), [8], crop=(0, 0, 33, 18))
+        write_report(tmp_path, Comparison("x", RESULTS), picture, scene(1.0), [8], crop=(0, 0, 33, 18))
     assert not any(tmp_path.iterdir())  # refused before anything was written
 
 
@@ -317,9 +322,11 @@ def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ReportImages("average", scene(LEVELS["average"])),
         ReportImages("final", scene(LEVELS["final"]), {"Confidence": lambda n: half}),
     ]
-    results = [replace(r, label=EVIL) if r.name == "other" else r for r in RESULTS]
+    results = tuple(replace(r, label=EVIL) if r.name == "other" else r for r in RESULTS)
     folder = tmp_path_factory.mktemp("report")
-    return write_report(folder, "Hall", results, images, scene(LEVELS["reference"]), [8, 9, 10], exposure=EXPOSURE)
+    return write_report(
+        folder, Comparison("Hall", results), images, scene(LEVELS["reference"]), [8, 9, 10], exposure=EXPOSURE
+    )
 
 
 @pytest.fixture

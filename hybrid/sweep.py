@@ -1,0 +1,96 @@
+"""The sweep of a comparison: one setting varied at a time, to see what accuracy costs and which stage buys it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from typing import Any
+
+from hybrid.methods import METHODS, Frames, Method
+from hybrid.plan import Plan
+from hybrid.pseudo_reference import BALANCED, estimate
+
+# What is varied around: the middle of the classical presets, and the network.
+CLASSICAL, NETWORK = "balanced", "network fast"
+
+RADII = (0, 1, 2, 3)  # windows of 1, 3, 5 and 7 frames
+SCALES, WARPS, ITERATIONS = (1, 3), (1, 3), (10, 30)  # of TV-L1
+NLM_RADII, PATCH_RADII = (1, 2, 3, 5, 7), (1, 2, 3)
+THRESHOLDS = (0.0, 0.25, 0.5, 0.75)  # of the kernels, in units of 1/K
+PRECISIONS = ("float32", "bfloat16")
+TILES = (64, 128, 256, 512)
+THREADS = tuple(n for n in (1, 2, 4, 8, 16) if n <= (os.cpu_count() or 1))
+
+
+def sweep_methods(plan: Plan) -> dict[str, Method]:
+    """Name the variants that are worth comparing on a shot with this plan.
+
+    Returns
+    -------
+    dict of str to Method
+        By a name that tells what is varied. Each stage of the plan is switched to what the plan did not choose;
+        the presets are among `METHODS` already.
+    """
+    return dict([*_stages(plan), *_windows(), *_tvl1(), *_nlm(), *_network(), *_threads()])
+
+
+def _variant(run: Frames, sweep: str, base: str, **settings: object) -> tuple[str, Method]:
+    words = " ".join(f"{key} {value}" for key, value in settings.items())
+    return f"{base}, {words}", Method(run, METHODS[base].family, settings=settings, sweep=sweep, base=base)
+
+
+def _classical(sweep: str, settings: Mapping[str, object], **options: Any) -> tuple[str, Method]:
+    return _variant(partial(METHODS[CLASSICAL].run, **options), sweep, CLASSICAL, **settings)
+
+
+def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
+    for decision in plan.decisions:
+        settings = {decision.effect: "off" if decision.on else "on"}
+        if decision.effect == "dense-flow":
+            if not decision.on:  # there are vectors; without them this is what has to be run
+                yield _classical("Stages", settings, vectors=False)
+        elif decision.effect == "skip":
+            yield _variant(partial(METHODS[NETWORK].run, flip="skip"), "Stages", NETWORK, **settings)
+        elif decision.effect != "alpha":  # which has no part in the color
+            yield _classical("Stages", settings, flip=decision.effect)
+    without = {"guided filter": replace(BALANCED, guided_radius=0), "NLM": replace(BALANCED, nlm_radius=0)}
+    for stage, preset in without.items():
+        yield _classical("Stages", {stage: "off"}, estimator=partial(estimate, preset=preset))
+
+
+def _windows() -> Iterator[tuple[str, Method]]:
+    for radius in RADII:
+        yield _classical("Window", {"window": 2 * radius + 1}, radius=radius)
+
+
+def _tvl1() -> Iterator[tuple[str, Method]]:
+    for scales, warps, iterations in product(SCALES, WARPS, ITERATIONS):
+        solver = {"scales": scales, "warps": warps, "iterations": iterations}
+        yield _classical("TV-L1", solver, solver=solver)
+
+
+def _nlm() -> Iterator[tuple[str, Method]]:
+    for radius, patch in product(NLM_RADII, PATCH_RADII):
+        preset = replace(BALANCED, nlm_radius=radius, nlm_patch_radius=patch)
+        settings = {"radius": radius, "patch": patch}
+        yield _classical("NLM", settings, estimator=partial(estimate, preset=preset))
+
+
+def _network() -> Iterator[tuple[str, Method]]:
+    for sweep, option, values in (
+        ("Kernel threshold", "threshold", THRESHOLDS),
+        ("Precision", "precision", PRECISIONS),
+        ("Tile", "tile", TILES),
+    ):
+        for value in values:
+            options: dict[str, Any] = {option: value}
+            yield _variant(partial(METHODS[NETWORK].run, **options), sweep, NETWORK, **options)
+
+
+def _threads() -> Iterator[tuple[str, Method]]:
+    for base, threads in product((CLASSICAL, NETWORK), THREADS):
+        name, method = _variant(METHODS[base].run, "Threads", base, threads=threads)
+        yield name, replace(method, threads=threads)
