@@ -9,7 +9,7 @@ from functools import partial
 from itertools import product
 from typing import Any
 
-from hybrid.methods import METHODS, Frames, Method
+from hybrid.methods import METHODS, Method
 from hybrid.plan import Plan
 from hybrid.pseudo_reference import BALANCED, estimate
 
@@ -37,13 +37,12 @@ def sweep_methods(plan: Plan) -> dict[str, Method]:
     return dict([*_stages(plan), *_windows(), *_tvl1(), *_nlm(), *_network(), *_threads()])
 
 
-def _variant(run: Frames, sweep: str, base: str, **settings: object) -> tuple[str, Method]:
+def _variant(sweep: str, base: str, settings: Mapping[str, object], **options: Any) -> tuple[str, Method]:
+    """The method `base` with other options, by a name that tells the settings."""
     words = " ".join(f"{key} {value}" for key, value in settings.items())
-    return f"{base}, {words}", Method(run, METHODS[base].family, settings=settings, sweep=sweep, base=base)
-
-
-def _classical(sweep: str, settings: Mapping[str, object], **options: Any) -> tuple[str, Method]:
-    return _variant(partial(METHODS[CLASSICAL].run, **options), sweep, CLASSICAL, **settings)
+    method = METHODS[base]
+    run = partial(method.run, **options)
+    return f"{base}, {words}", Method(run, method.family, settings=settings, sweep=sweep, base=base)
 
 
 def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
@@ -51,32 +50,32 @@ def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
         settings = {decision.effect: "off" if decision.on else "on"}
         if decision.effect == "dense-flow":
             if not decision.on:  # there are vectors; without them this is what has to be run
-                yield _classical("Stages", settings, vectors=False)
-        elif decision.effect == "skip":
-            yield _variant(partial(METHODS[NETWORK].run, flip="skip"), "Stages", NETWORK, **settings)
+                yield _variant("Stages", CLASSICAL, settings, vectors=False)
+        elif decision.effect == "skip":  # tiles are the network's
+            yield _variant("Stages", NETWORK, settings, flip="skip")
         elif decision.effect != "alpha":  # which has no part in the color
-            yield _classical("Stages", settings, flip=decision.effect)
+            yield _variant("Stages", CLASSICAL, settings, flip=decision.effect)
     without = {"guided filter": replace(BALANCED, guided_radius=0), "NLM": replace(BALANCED, nlm_radius=0)}
     for stage, preset in without.items():
-        yield _classical("Stages", {stage: "off"}, estimator=partial(estimate, preset=preset))
+        yield _variant("Stages", CLASSICAL, {stage: "off"}, estimator=partial(estimate, preset=preset))
 
 
 def _windows() -> Iterator[tuple[str, Method]]:
     for radius in RADII:
-        yield _classical("Window", {"window": 2 * radius + 1}, radius=radius)
+        yield _variant("Window", CLASSICAL, {"window": 2 * radius + 1}, radius=radius)
 
 
 def _tvl1() -> Iterator[tuple[str, Method]]:
     for scales, warps, iterations in product(SCALES, WARPS, ITERATIONS):
         solver = {"scales": scales, "warps": warps, "iterations": iterations}
-        yield _classical("TV-L1", solver, solver=solver)
+        yield _variant("TV-L1", CLASSICAL, solver, solver=solver)
 
 
 def _nlm() -> Iterator[tuple[str, Method]]:
     for radius, patch in product(NLM_RADII, PATCH_RADII):
         preset = replace(BALANCED, nlm_radius=radius, nlm_patch_radius=patch)
         settings = {"radius": radius, "patch": patch}
-        yield _classical("NLM", settings, estimator=partial(estimate, preset=preset))
+        yield _variant("NLM", CLASSICAL, settings, estimator=partial(estimate, preset=preset))
 
 
 def _network() -> Iterator[tuple[str, Method]]:
@@ -86,11 +85,10 @@ def _network() -> Iterator[tuple[str, Method]]:
         ("Tile", "tile", TILES),
     ):
         for value in values:
-            options: dict[str, Any] = {option: value}
-            yield _variant(partial(METHODS[NETWORK].run, **options), sweep, NETWORK, **options)
+            yield _variant(sweep, NETWORK, {option: value}, **{option: value})
 
 
 def _threads() -> Iterator[tuple[str, Method]]:
     for base, threads in product((CLASSICAL, NETWORK), THREADS):
-        name, method = _variant(METHODS[base].run, "Threads", base, threads=threads)
+        name, method = _variant("Threads", base, {"threads": threads})
         yield name, replace(method, threads=threads)
