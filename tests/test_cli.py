@@ -147,3 +147,58 @@ def test_bad_usage_is_two(arguments, shot_folder, tmp_path, capsys):
 def test_a_file_without_color_is_refused(tmp_path, capsys):
     write_layers(tmp_path / "depth.exr", {"depth": np.ones((8, 8), np.float32)})
     assert "color" in one_line_error(capsys, "inspect", tmp_path / "depth.exr")
+
+
+@pytest.fixture
+def compared(tmp_path):
+    """A noisy shot, its clean frames, and a folder for the report."""
+    scene = Scene()
+    return scene.write(tmp_path / "hall"), scene.write(tmp_path / "clean", clean=True), tmp_path / "report"
+
+
+def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, capsys):
+    noisy, clean, out = compared
+    arguments = [noisy, "--reference", clean, "--methods", "noisy,draft,tKPCN", "--rounds", 1]
+    code, table, err = run(
+        capsys, "compare", *arguments, "-o", out, "--external", f"theirs={clean}", "--samples", 8, "--markdown"
+    )
+    assert code == 0, err
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert rows[0][:2] == ["method", "hall: PSNR (dB) / Temporal PSNR (dB)"]
+    assert [row[0] for row in rows[2:]] == ["noisy", "draft", "theirs", "tKPCN"]
+    assert rows[4][1] == "**∞** / **∞**"
+    assert rows[4][2] == "–"  # nobody knows its time
+    assert rows[5][1].startswith("absent: ")
+    assert (out / "results.md").read_text() == table
+    assert {"report.html", "results.json", "results.csv", "chart.png"} <= {path.name for path in out.iterdir()}
+    document = json.loads((out / "results.json").read_text())
+    assert set(document["results"][1]["metrics"]) >= {"ssim", "smape", "relmse_trimmed", "mean_bias"}
+
+    # A finished report stands beside another shot, and two of them can be put together without running anything.
+    _, table, _ = run(capsys, "compare", "--beside", out, "--beside", out, "-o", out / "both", "--markdown")
+    assert table.splitlines()[0].count("hall: PSNR") == 2
+    assert "All shots" in (out / "both" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("extra", "complaint"),
+    [
+        (["--methods", "noisy,unheard-of"], "expected one of noisy"),
+        (["--external", "nameless"], "expected NAME=PATTERN"),
+        (["--external", "noisy=x.exr"], "a name that no other method has"),
+        (["--level", "x.####.exr"], "expected PATTERN=SPP"),
+        (["--clock", "sun"], "expected one of wall, cpu"),
+    ],
+)
+def test_compare_refuses_what_it_cannot_do(compared, capsys, extra, complaint):
+    noisy, clean, _ = compared
+    code, _, err = run(capsys, "compare", noisy, "--reference", clean, *extra)
+    assert code == 2
+    assert complaint in " ".join(err.replace("│", " ").split())
+
+
+def test_compare_wants_something_to_compare(capsys, tmp_path):
+    assert run(capsys, "compare")[0] == 2
+    code, _, err = run(capsys, "compare", "--beside", tmp_path)
+    assert code == 1
+    assert "results.json" in err

@@ -22,14 +22,18 @@ import pytest
 from hybrid import chart, report
 from hybrid.report import ReportImages, write_report
 from hybrid.results import (
+    COSTS,
     METRICS,
     Comparison,
     MethodResult,
     Metric,
     Statistic,
     best_and_ties,
+    join,
     markdown_table,
     pareto_front,
+    read_comparison,
+    stage_values,
     summarize,
 )
 
@@ -107,6 +111,58 @@ def test_markdown_marks_the_best_and_keeps_a_name_in_its_cell() -> None:
     assert len(bars) == 1  # every row has as many cells as the head
 
 
+def swept(name: str, psnr: list[float], seconds: float, **settings: Any) -> MethodResult:
+    sweep = "Stages" if next(iter(settings.values())) in ("on", "off") else "Window"
+    return result(name, psnr, seconds, family="Methods", settings=settings, sweep=sweep, base="final")
+
+
+SWEPT = (
+    *RESULTS,
+    swept("without gate", [32.5, 33.0, 33.5], 3.5, gate="off"),  # steadily a decibel less, for half a second less
+    swept("with refine", [33.4, 34.1, 34.4], 9.0, refine="on"),  # scattered about the same
+    swept("window 3", [32.0, 32.5, 33.0], 3.0, window=3),
+    swept("window 1", [29.0, 29.5, 30.0], 2.5, window=1),
+)
+
+
+def test_stages_are_worth_what_switching_them_changes() -> None:
+    gate, refine = stage_values(SWEPT)
+    assert (gate.stage, gate.on, refine.on) == ("gate", True, False)
+    assert gate.gains["psnr"] == pytest.approx(1.0)  # 34 with it, 33 without
+    assert gate.seconds == pytest.approx(0.5)
+    assert gate.told == ("psnr",)
+    assert refine.gains["psnr"] == pytest.approx(-1 / 30)  # what it would change if it were on
+    assert refine.seconds == pytest.approx(5.0)
+    assert refine.told == ()  # a tie
+
+
+def test_several_shots_are_put_together_over_those_that_all_have() -> None:
+    a = Comparison("A", (result("x", [30.0, 31.0], 1.0, peak_bytes=5, worth=4.0), result("y", [20.0, 21.0], 2.0)))
+    b = Comparison("B", (result("x", [40.0, 41.0, 42.0, 43.0], 3.0, peak_bytes=9, worth=16.0),))
+    (joined,) = join([a, b])
+    assert joined.metrics["psnr"].mean == pytest.approx((30.5 + 41.5) / 2)  # of the shots, however long they are
+    assert joined.metrics["psnr"].shots == (2, 4)
+    assert (joined.seconds_per_megapixel, joined.peak_bytes, joined.worth) == (2.0, 9, pytest.approx(8.0))
+    # On one shot x is better by 1, on the other y is: nothing is known of a third shot.
+    c = Comparison("C", (result("x", [30.0, 30.1], 1.0), result("y", [29.0, 29.1], 1.0)))
+    d = Comparison("D", (result("x", [39.5, 39.6], 1.0), result("y", [40.0, 40.1], 1.0)))
+    assert best_and_ties(c.results, PSNR) == ("x", set())
+    assert best_and_ties(join([c, d]), PSNR) == ("x", {"y"})
+
+
+def test_results_are_read_back_as_they_were(tmp_path: Path) -> None:
+    perfect = result("perfect", [math.inf, math.inf], 1.0)
+    comparison = Comparison("Hall", (*RESULTS, perfect), {"Machine": "two cores"})
+    write_report(tmp_path, comparison)
+    again = read_comparison(tmp_path / "results.json")
+    assert again.facts == comparison.facts
+    for before, after in zip(comparison.results, again.results, strict=True):
+        assert replace(before, settings={}) == replace(after, settings={})
+    (tmp_path / "results.json").write_text('{"shot": "x"}')
+    with pytest.raises(ValueError, match="is no result of a comparison"):
+        read_comparison(tmp_path / "results.json")
+
+
 # --- the chart -----------------------------------------------------------------------------------------
 
 
@@ -156,6 +212,25 @@ def test_families_differ_in_shape_and_colour_and_dominated_points_are_hollow() -
         expected = chart._bgr(chart.COLORS[p.family]) if filled else (255, 255, 255)
         # The neighbours under a marker's middle have its colour: no anti-aliasing there.
         assert np.abs(color.astype(int) - expected).max() <= 2
+
+
+def test_a_line_joins_what_varies_one_number_in_its_order() -> None:
+    layout = chart.lay_out([*SWEPT, swept("window 5", [33.0, 33.1, 33.2], 3.6, window=5)], PSNR, chart_cost)
+    assert layout is not None
+    ((family, line),) = layout.series  # stages are no numbers
+    assert chart.families(SWEPT)[family] == "Methods"
+    assert line == [(at(layout, n).x, at(layout, n).y) for n in ("window 1", "window 3", "window 5")]
+
+
+def test_every_resource_has_a_front_of_its_own() -> None:
+    a = result("a", 30.0, 1.0, cpu_seconds_per_megapixel=4.0, peak_bytes=100)
+    b = result("b", 29.0, 2.0, cpu_seconds_per_megapixel=2.0, peak_bytes=200)
+    fronts = {cost: pareto_front([a, b], PSNR, cost) for cost in COSTS}
+    assert fronts == {
+        "seconds_per_megapixel": ["a"],
+        "cpu_seconds_per_megapixel": ["b", "a"],
+        "peak_bytes": ["a"],
+    }
 
 
 def test_svg_is_well_formed_whatever_the_names_are() -> None:
@@ -242,6 +317,21 @@ def test_numbers_that_are_not_finite_survive_json(tmp_path: Path) -> None:
     write_report(tmp_path, Comparison("x", (result("a", [math.inf, math.nan], 1.0),)))
     statistic = json.loads((tmp_path / "results.json").read_text())["results"][0]["metrics"]["psnr"]
     assert [float(v) for v in statistic["values"]] == pytest.approx([math.inf, math.nan], nan_ok=True)
+
+
+def test_the_page_shows_stages_sweeps_and_other_shots(tmp_path: Path) -> None:
+    other = Comparison("Yard", (result("final", 30.0, 1.0), result("average", 31.0, 1.0)))
+    page = write_report(tmp_path, Comparison("Hall", SWEPT), others=[other])
+    text = page.read_text(encoding="utf-8")
+    assert "What each stage buys" in text
+    assert "+1.00" in text
+    assert "Sweep of Window: 2 settings" in text
+    assert "All shots" in text
+    assert "Yard" in text
+    assert "Yard: PSNR" in (tmp_path / "results.md").read_text(encoding="utf-8")
+    alone = write_report(tmp_path, Comparison("Hall", RESULTS)).read_text(encoding="utf-8")
+    assert "What each stage buys" not in alone
+    assert "All shots" not in alone
 
 
 def test_nothing_from_a_name_becomes_markup(tmp_path: Path) -> None:
@@ -347,6 +437,12 @@ def page(browser: Any, report_file: Path) -> Iterator[Any]:
     context.close()
 
 
+def arrange(page: Any, layout: str) -> None:
+    """Choose an arrangement by its label; the radio button itself lies under it."""
+    page.locator(f".segments label:has(input[value={layout}])").click()
+    until(page, f"document.querySelector('[name=layout][value={layout}]').checked")
+
+
 def until(page: Any, condition: str) -> None:
     """Wait for a JavaScript expression to become true; Playwright's own way needs eval, which the page forbids."""
     for _ in range(200):
@@ -444,7 +540,7 @@ def test_exposure_moves_both_pictures_as_the_curve_says(page: Any) -> None:
 
 def test_zoom_and_pan_are_the_same_in_both_panes(page: Any) -> None:
     page.select_option("#right", label="Noisy")
-    page.check("[name=layout][value=pair]", force=True)
+    arrange(page, "pair")
     page.locator("#canvas").focus()
     for _ in range(4):
         page.keyboard.press("+")
@@ -492,7 +588,7 @@ def test_errors_and_maps_are_drawn_on_a_scale(page: Any) -> None:
     page.keyboard.press("Home")
     see(page, [0x44, 0x01, 0x54], 0.01, 0.9)  # viridis from end to end
     see(page, [0xFD, 0xE7, 0x25], 0.99, 0.9)
-    page.check("[name=layout][value=all]", force=True)
+    arrange(page, "all")
     until(page, "document.querySelectorAll('#labels div').length === 4")
 
 
