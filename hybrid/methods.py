@@ -309,16 +309,30 @@ def _changed(shot: Shot, change: Callable[[Frame], Frame]) -> Shot:
     return other
 
 
-def _aligned(family: str, estimator: Estimator, **window: Any) -> Method:
+def _aligned(family: str, estimator: Estimator, *, radius: int = 2, source: str = "none", **told: object) -> Method:
     """An estimator of aligned windows as a method, with its maps where the window has neighbours."""
+    window: dict[str, Any] = {"radius": radius, "source": source}
     run = partial(classical, estimator=estimator, **window)
     maps = partial(classical_maps, estimator=estimator, **window)
-    return Method(run, family, maps if window.get("radius") != 0 else None)
+    settings = {"window": 2 * radius + 1, **({} if source == "none" else {"estimates": source}), **told}
+    return Method(run, family, maps if radius else None, settings=settings)
+
+
+def _preset(family: str, preset: Preset, radius: int = 2) -> Method:
+    told = {key.replace("_", " "): value for key, value in vars(preset).items() if key != "name"}
+    return _aligned(family, partial(estimate, preset=preset), radius=radius, **told)
 
 
 def _network(preset: str, source: str) -> Method:
     run = partial(network, preset=preset, source=source)
-    return Method(run, "Networks", partial(network_maps, preset=preset, source=source))
+    maps = partial(network_maps, preset=preset, source=source)
+    return Method(run, "Networks", maps, settings={"weights": preset, "estimates": source})
+
+
+def _oidn(quality: Quality, prefilter: bool) -> Method:
+    guides = "prefiltered, cleanAux" if prefilter else "as given"
+    run = partial(oidn, quality=quality, prefilter=prefilter)
+    return Method(run, "OIDN", settings={"quality": quality, "guides": guides})
 
 
 METHODS: dict[str, Method] = {
@@ -326,18 +340,18 @@ METHODS: dict[str, Method] = {
     "aligned average": _aligned("Averages", aligned_average),
     "aligned robust average": _aligned("Averages", aligned_robust_average),
     # One frame, one filter: what the stages are worth without time.
-    "NLM alone": _aligned("Stages alone", partial(estimate, preset=Preset("NLM", 5, 2, 0, 0)), radius=0),
-    "guided alone": _aligned("Stages alone", partial(estimate, preset=Preset("guided", 0, 0, 5, 1e-2)), radius=0),
-    **{name: _aligned("Pseudo-references", partial(estimate, preset=preset)) for name, preset in PRESETS.items()},
+    "NLM alone": _preset("Stages alone", Preset("NLM", 5, 2, 0, 0), radius=0),
+    "guided alone": _preset("Stages alone", Preset("guided", 0, 0, 5, 1e-2), radius=0),
+    **{name: _preset("Pseudo-references", preset) for name, preset in PRESETS.items()},
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "network fast": _network("fast", "nlm"),
     "network fast + OIDN": _network("fast", "oidn"),
     "tKPCN": _network("tkpcn", "none"),
-    "OIDN high": Method(partial(oidn, quality="high"), "OIDN"),
-    "OIDN balanced": Method(partial(oidn, quality="balanced"), "OIDN"),
-    "OIDN best": Method(partial(oidn, quality="high", prefilter=True), "OIDN"),
-    "OIDN balanced + clean guides": Method(partial(oidn, quality="balanced", prefilter=True), "OIDN"),
+    "OIDN high": _oidn("high", prefilter=False),
+    "OIDN balanced": _oidn("balanced", prefilter=False),
+    "OIDN best": _oidn("high", prefilter=True),
+    "OIDN balanced + clean guides": _oidn("balanced", prefilter=True),
     "OIDN best + robust average": Method(partial(oidn_then_average, prefilter=True), "OIDN"),
     "scikit-image NLM": Method(skimage_nlm, "Libraries"),
     "OpenCV temporal NLM": Method(opencv_nlm, "Libraries"),
