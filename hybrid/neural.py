@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,7 @@ def write_clips(
     tile: int = 128,
     tiles: int = 4,
     estimate: str = "auto",
+    reference: Shot | None = None,
     seed: int = 0,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Path]:
@@ -221,6 +223,8 @@ def write_clips(
         Clips of each frame, placed by `network.clips.importance`.
     estimate : str
         Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
+    reference : Shot, optional
+        The same frames clean, or some of them: clips are made of these alone, and trained towards them.
     seed : int
         Of the places.
     advance : callable
@@ -241,9 +245,11 @@ def write_clips(
     Kalojanov and Thurston 2023, section 6, "Training Data".
     """
     shots = list(levels.values())
-    numbers = [number for number in shots[0].numbers if all(shot.has(number) for shot in shots)]
+    every = shots if reference is None else [*shots, reference]
+    numbers = [number for number in shots[0].numbers if all(shot.has(number) for shot in every)]
     if not numbers:
-        raise ValueError(f"levels: expected frames in common, got none in {', '.join(levels)} of {name}")
+        what = ", ".join(levels) + ("" if reference is None else " and the reference")
+        raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
     aligners = [
         Aligner(shot, plan_shot(shot).effects, radius=radius, estimate=choose_estimate(estimate, shot).estimate)
         for shot in shots
@@ -253,6 +259,9 @@ def write_clips(
         rng = np.random.default_rng(seed)
         for number in numbers:
             whole = _clip([_level(shot, aligner, number) for shot, aligner in zip(shots, aligners, strict=True)])
+            if reference is not None:
+                clean = _tensor(replace_nonfinite(reference.read(number).color)[0][None])[:, 0]
+                whole = replace(whole, reference=clean.expand_as(whole.noisy))
             if tile == 0:
                 yield whole
             else:

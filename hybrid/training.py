@@ -86,6 +86,9 @@ def prepare_command(
     tiles: Annotated[int, typer.Option(help="clips of each frame, placed where noise, detail and motion are")] = 4,
     window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7")] = 5,
     estimate: Annotated[str, typer.Option(help="first estimates, as for denoise; clips hold them")] = "auto",
+    reference: Annotated[
+        bool, typer.Option("--reference", help="only the frames that SHOT/reference.####.exr has, trained towards it")
+    ] = False,
     seed: Annotated[int, typer.Option(help="of the places")] = 0,
     frames: Annotated[str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2")] = None,
     layer: Annotated[list[str] | None, typer.Option("--layer", metavar="ROLE=LAYER", help="as for denoise")] = None,
@@ -96,6 +99,8 @@ def prepare_command(
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from hybrid.frames import open_shot
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -112,7 +117,7 @@ def prepare_command(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         task = progress.add_task("prepare", total=sum(len(next(iter(shot.values()))) for _, shot, _ in found))
-        for name, shot, counts in found:
+        for spec, (name, shot, counts) in zip(shots, found, strict=True):
             first = next(iter(shot.values()))
             progress.update(task, description=f"prepare {name}")
             if any(output.glob(f"{name}.*.safetensors")):
@@ -127,6 +132,7 @@ def prepare_command(
                 tile=tile,
                 tiles=tiles,
                 estimate=estimate,
+                reference=open_shot(str(Path(spec) / "reference.####.exr"), keep=1) if reference else None,
                 seed=seed,
                 advance=lambda: progress.advance(task),
             )

@@ -52,6 +52,8 @@ class Clip:
         ``(L, 3, H, W)`` radiance of the centre, as rendered and as estimated from the level's own window.
     exposure : Tensor
         ``(L,)``, of the windows of whole frames.
+    reference : Tensor, optional
+        ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
 
     Raises
     ------
@@ -68,6 +70,7 @@ class Clip:
     noisy: Tensor
     pseudo_reference: Tensor
     exposure: Tensor
+    reference: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.color.shape)
@@ -79,9 +82,10 @@ class Clip:
             **dict.fromkeys(("modulation", "noisy", "pseudo_reference"), image),
             "confidence": (*shape[:2], 1, *shape[3:]),
             "exposure": shape[:1],
+            "reference": image,
         }
-        for name, wanted in expected.items():
-            value = getattr(self, name)
+        for name, value in _values(self).items():
+            wanted = expected[name]
             if tuple(value.shape) != wanted:
                 raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
             if not bool(torch.isfinite(value).all()):
@@ -94,7 +98,8 @@ class Clip:
 
 
 def _values(clip: Clip) -> dict[str, Tensor]:
-    return {item.name: getattr(clip, item.name) for item in fields(clip)}
+    values = {item.name: getattr(clip, item.name) for item in fields(clip)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
@@ -242,7 +247,7 @@ def _pack(clip: Clip) -> dict[str, Tensor]:
     scale = clip.exposure[-1]
     packed = {"exposure": (clip.exposure / scale).float()}
     for name, value in _values(clip).items():
-        if name in ("color", "estimate", "noisy", "pseudo_reference"):
+        if name in ("color", "estimate", "noisy", "pseudo_reference", "reference"):
             value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
         if name != "exposure":
             packed[name] = value.to(torch.float16).contiguous()
@@ -257,6 +262,7 @@ class _Shard:
     shot: str
     samples: tuple[float, ...]
     shape: tuple[int, ...]  # of color: clips, levels, frames, 3, height, width
+    clean: bool  # whether it has references
 
 
 class Clips:
@@ -295,8 +301,11 @@ class Clips:
         return Clips([shard for shard in self._shards if shard.shot in shots])
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
-        """`noise_pairs` of a clip."""
-        return noise_pairs(self._find(index)[0].samples)
+        """For each noise level of a clip its targets: the reference where there is one, else its `noise_pairs`."""
+        shard = self._find(index)[0]
+        if shard.clean:
+            return [[(level, "reference")] for level in range(len(shard.samples))]
+        return noise_pairs(shard.samples)
 
     def read(self, index: int, level: int, target: tuple[int, str]) -> dict[str, Tensor]:
         """One level of a clip with a target of `pairs`: `Clip`'s fields without L, ``target``, and float32 exposure."""
@@ -316,7 +325,7 @@ class Clips:
 
 
 def open_clips(folder: str | os.PathLike[str]) -> Clips:
-    """Open all shards of a folder.
+    """Open all shards of a folder and of those in it.
 
     Raises
     ------
@@ -325,7 +334,7 @@ def open_clips(folder: str | os.PathLike[str]) -> Clips:
     ValueError
         If one is no shard of clips, or of another version, or their windows differ in length.
     """
-    paths = sorted(Path(folder).glob("*.safetensors"))
+    paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:
         raise FileNotFoundError(f"clips: no *.safetensors in {os.fspath(folder)!r}; expected what ravg prepare writes")
     shards = []
@@ -334,13 +343,16 @@ def open_clips(folder: str | os.PathLike[str]) -> Clips:
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
-                shape = tuple(file.get_slice("color").get_shape()) if "color" in file.keys() else ()  # noqa: SIM118
+                names = set(file.keys())
+                shape = tuple(file.get_slice("color").get_shape()) if "color" in names else ()
         except SafetensorError as error:
             raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
         for key, wanted in (("format", FORMAT), ("version", VERSION)):
             if metadata.get(key) != wanted:
                 raise ValueError(f"{where}: expected {key} {wanted!r}, got {metadata.get(key)!r}")
-        shards.append(_Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape))
+        shards.append(
+            _Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape, "reference" in names)
+        )
         if shards[-1].shape[2] != shards[0].shape[2]:
             raise ValueError(f"{where}: expected windows of {shards[0].shape[2]} frames, got {shards[-1].shape[2]}")
     return Clips(shards)

@@ -65,6 +65,28 @@ def folder_of(path: Path, shots: dict[str, int], **options: object) -> Clips:
 # Pairs
 
 
+def test_where_there_is_a_reference_it_is_the_only_target(tmp_path: Path) -> None:
+    clean = torch.rand(3, 3, 16, 16) + 0.5
+    write_shards(tmp_path, "clean", SPP, [replace(make_clip(), reference=clean)])
+    write_shards(tmp_path, "noisy", SPP, [make_clip(1)])
+    clips = open_clips(tmp_path)
+    assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")], [(2, "reference")]]
+    assert clips.pairs(1) == noise_pairs(SPP)
+    target = clips.read(0, 2, (2, "reference"))["target"].float()
+    torch.testing.assert_close(target, clean[2] / 2, rtol=2**-10, atol=0)  # over the last level's exposure, in half
+    with pytest.raises(ValueError, match="reference: expected shape"):
+        replace(make_clip(), reference=clean[:2])
+
+
+def test_the_error_is_that_of_the_clips_better_input(tmp_path: Path) -> None:
+    clip = make_clip()
+    bright = 1.1 * clip.noisy[:, None] / clip.modulation[:, None]
+    write_shards(tmp_path, "a", SPP, [replace(clip, estimate=bright.expand_as(clip.estimate), reference=clip.noisy)])
+    sample = Samples(open_clips(tmp_path), PLAIN, 0)[0]
+    # Ten per cent too bright; relmse divides by the mean of the channels and a floor of a third of the exposure.
+    assert 0.1 * 0.1**2 < float(sample["error"]) < 1.2 * 0.1**2
+
+
 def test_targets_are_never_noisier_than_the_input_and_always_independent() -> None:
     pairs = noise_pairs((8, 8, 2))
     assert pairs[0] == [(1, "noisy"), (1, "pseudo_reference")]

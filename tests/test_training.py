@@ -50,6 +50,21 @@ def run(*arguments):
     return main([str(argument) for argument in arguments])
 
 
+def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
+    kept = tmp_path / "wall"
+    shutil.copytree(shot, kept)
+    (kept / f"reference.{SCENE.first}.exr").unlink()
+    levels = ("--levels", "a=24,c=8", "--tile", 0, "--estimate", "nlm", "--window", 3)
+    assert run("prepare", kept, "-o", tmp_path / "clips", *levels, "--reference") == 0
+    clips = open_clips(tmp_path / "clips")
+    assert len(clips) == SCENE.frames - 1  # those that have one
+    assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]
+    values = clips.read(0, 0, (0, "reference"))
+    wanted = open_shot(str(kept / "reference.####.exr")).read(SCENE.first + 1).color
+    ratio = values["target"].float().permute(1, 2, 0).numpy() / wanted
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
+
+
 def test_levels_of_a_shot_are_found_without_its_references(shot):
     name, levels, samples = open_levels(str(shot), {"a": 24, "c": 8})
     assert (name, list(levels), samples) == ("wall", ["a", "c"], [24, 8])
