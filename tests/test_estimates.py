@@ -2,6 +2,7 @@
 
 import importlib.util
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hybrid.cli import main
 from hybrid.estimates import choose_estimate
 from hybrid.frames import open_shot
 from hybrid.metrics import psnr
+from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import BALANCED, DRAFT, Aligner, gated_average
 
 EFFECTS = {"demodulate", "outliers", "warp", "gate"}
@@ -201,3 +203,24 @@ def test_the_command_says_what_was_taken(tmp_path, capfd):
     assert open_shot(out).numbers == open_shot(folder).numbers
     assert '"estimate": "file"' in (out / "ravg.json").read_text(encoding="utf-8")
     assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", str(tmp_path / "no.####.exr")]) == 1
+
+
+def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
+    """Cycles with OIDN and its passes stored, adaptive sampling, one seed for all frames (examples/render_shot.py)."""
+    folder = Path(__file__).parent / "data" / "defaults"
+    out = tmp_path / "stable.####.exr"
+    assert main(["pseudoref", str(folder / "noisy.####.exr"), "-o", str(out), "--estimate", "auto"]) == 0
+    said = capfd.readouterr().err
+    assert "estimates: file" in said
+    assert "fixed-noise" in said
+    before, after = open_shot(folder), open_shot(str(out))
+    pictures = [before.read(10).estimate, after.read(10).estimate]  # Combined is replaced, the Noisy Image stays
+    np.testing.assert_array_equal(after.read(10).color, before.read(10).color)
+    assert 30 < psnr(pictures[1], pictures[0]) < 60  # changed, and not by much
+
+
+def test_the_plan_sees_the_one_seed_of_blenders_defaults():
+    plan = plan_shot(open_shot(Path(__file__).parent / "data" / "defaults"))
+    decision = next(d for d in plan.decisions if d.effect == "fixed-noise")
+    assert decision.on
+    assert "Animate Seed" in decision.reason
