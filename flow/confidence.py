@@ -10,9 +10,9 @@ import numpy as np
 from flow.motion import forward_backward_error
 
 
-def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
+def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray, first_row: int) -> np.ndarray:
     """Sundaram's test: 1 where going there and back ends near the start."""
-    error = forward_backward_error(flow, reverse)
+    error = forward_backward_error(flow, reverse, first_row=first_row)
     # The loop is f + r, so r at the arrival is about -f within the error: |r| is taken as |f| + error at most.
     length = np.hypot(flow[..., 0], flow[..., 1])
     return error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5
@@ -59,6 +59,7 @@ def estimate_confidence(
     albedo_noise: np.ndarray | float = 0.0,
     normal_noise: np.ndarray | float = 0.0,
     albedo_sigma: float = 0.1,
+    first_row: int = 0,
 ) -> np.ndarray:
     """Estimate how far each pixel of a warped neighbour shows what the centre shows.
 
@@ -69,7 +70,7 @@ def estimate_confidence(
     inside
         (H, W) bool, as `flow.warp.warp` gives it.
     reverse
-        (H, W, 2) float, neighbour to centre, or None.
+        (H, W, 2) float, neighbour to centre, or None. Of the whole frame, also where all else is of some of its rows.
     albedo, warped_albedo
         (H, W) or (H, W, C) float, of the centre and of the warped neighbour. One may come with the other only; so
         for the next two pairs.
@@ -84,6 +85,8 @@ def estimate_confidence(
         without being wrong. `flow.guide.estimate_noise` gives it.
     albedo_sigma
         Difference (norm over channels) at which the confidence falls to 1/e.
+    first_row
+        The frame's row that the first row of `flow` belongs to.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def estimate_confidence(
     if valid is not None:
         confidence *= valid
     if reverse is not None:
-        confidence *= _agree_forward_backward(flow, reverse)
+        confidence *= _agree_forward_backward(flow, reverse, first_row)
     with np.errstate(invalid="ignore"):
         if albedo is not None and warped_albedo is not None:
             confidence *= _agree_albedo(albedo, warped_albedo, albedo_sigma, albedo_noise)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import warp
+from flow.warp import check_rows, warp
 
 # Longer than any frame is wide: renderers write 1e9, 1e10 or similar where they know no motion.
 ABSURD_LENGTH = 1e4
@@ -73,15 +73,19 @@ def compose_flow(
     *,
     first_valid: np.ndarray | None = None,
     second_valid: np.ndarray | None = None,
+    first_row: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chain the flow from t to t' with that from t' to t'', giving the flow from t to t''.
 
     Parameters
     ----------
     first, second
-        (H, W, 2) float, finite, pixels; `second` belongs to the frame that `first` points to.
+        (H, W, 2) float, finite, pixels; `second` belongs to the frame that `first` points to. `first` may be of some
+        of the rows only.
     first_valid, second_valid
         (H, W) bool; missing: all True.
+    first_row
+        The frame's row that the first row of `first` belongs to.
 
     Returns
     -------
@@ -94,10 +98,9 @@ def compose_flow(
     -----
     f₂(x) = f₁(x) + f₁'(x + f₁(x)), f₁' sampled bilinearly, with its edge value outside the frame.
     """
-    if first.shape != second.shape:
-        raise ValueError(f"second has shape {second.shape}, expected that of first, {first.shape}")
+    check_rows(first, second.shape, first_row)
     known = np.ones(first.shape[:2], bool) if second_valid is None else second_valid
-    sampled, inside = warp(np.dstack([second, ~known]), first)
+    sampled, inside = warp(np.dstack([second, ~known]), first, first_row=first_row)
     # The last channel is the share of invalid vectors in the bilinear mix: any at all is too much.
     valid = inside & (sampled[..., 2] == 0)
     if first_valid is not None:
@@ -186,18 +189,22 @@ def invert_flow(
     return inverse, arrived
 
 
-def forward_backward_error(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
+def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: int = 0) -> np.ndarray:
     """Measure how far from its start a pixel ends when it goes there and back.
 
     Parameters
     ----------
     flow, reverse
-        (H, W, 2) float, pixels, finite: centre to neighbour, and neighbour to centre.
+        (H, W, 2) float, pixels, finite: centre to neighbour, and neighbour to centre. `flow` may be of some of the
+        rows only.
+    first_row
+        The frame's row that the first row of `flow` belongs to.
 
     Returns
     -------
     numpy.ndarray
         (H, W) float32, pixels: |f(x) + r(x + f(x))|; outside the frame r has its edge value.
     """
-    loop, _ = compose_flow(flow, reverse)
+    loop, _ = warp(reverse, flow, first_row=first_row)
+    loop += flow
     return np.hypot(loop[..., 0], loop[..., 1])

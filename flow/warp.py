@@ -30,13 +30,13 @@ def locate(
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
-def _bilinear(image: np.ndarray, flow: np.ndarray, out: np.ndarray, inside: np.ndarray) -> None:
+def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
     one = np.float32(1)
-    for y in prange(height):
+    for y in prange(flow.shape[0]):
         for x in range(width):
             inside[y, x], x0, y0, x1, y1, fx, fy = locate(
-                np.float32(x) + flow[y, x, 0], np.float32(y) + flow[y, x, 1], width, height
+                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
             )
             w00, w01, w10, w11 = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
             for c in range(channels):
@@ -61,14 +61,14 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
-def _bicubic(image: np.ndarray, flow: np.ndarray, out: np.ndarray, inside: np.ndarray) -> None:
+def _bicubic(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
-    for y in prange(height):
+    for y in prange(flow.shape[0]):
         columns = np.empty(4, np.int64)
         rows = np.empty(4, np.int64)
         for x in range(width):
             inside[y, x], x0, y0, x1, y1, fx, fy = locate(
-                np.float32(x) + flow[y, x, 0], np.float32(y) + flow[y, x, 1], width, height
+                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
             )
             for i in range(4):
                 # A fraction of 0 has the weights (0, 1, 0, 0): read the one sample that counts.
@@ -92,7 +92,9 @@ def _bicubic(image: np.ndarray, flow: np.ndarray, out: np.ndarray, inside: np.nd
 _KERNELS: dict[str, Callable] = {"bilinear": _bilinear, "bicubic": _bicubic}
 
 
-def warp(image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear") -> tuple[np.ndarray, np.ndarray]:
+def warp(
+    image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear", first_row: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Sample an image, or a stack of any number of AOV channels, where a flow points.
 
     Parameters
@@ -101,18 +103,21 @@ def warp(image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear"
         (H, W) or (H, W, C) float; taken as float32. NaN and Inf are the caller's to remove: one spreads to
         every pixel that samples it.
     flow
-        (H, W, 2) float, pixels, x right then y down.
+        (H, W, 2) float, pixels, x right then y down; or (h, W, 2), of some of the rows.
     interpolation
         "bilinear", or "bicubic": Catmull-Rom clamped to the range of the four pixels around the position,
         so that it never rings (nor goes below zero) beside a firefly.
+    first_row
+        The image's row that the first row of `flow` belongs to.
 
     Returns
     -------
     warped
-        float32, the shape of `image`: `image[y + v, x + u]`; outside the frame the edge value.
+        float32, the shape of `image`, less the rows without flow: `image[y + v, x + u]`; outside the frame the edge
+        value.
     inside
-        (H, W) bool: the position lies on a pixel of the frame, x + u in [-0.5, W - 0.5] and y + v alike.
-        False where the flow is not finite.
+        (H, W) bool, of the same rows: the position lies on a pixel of the frame, x + u in [-0.5, W - 0.5] and y + v
+        alike. False where the flow is not finite.
 
     Raises
     ------
@@ -133,10 +138,17 @@ def warp(image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear"
         raise ValueError(f"interpolation is {interpolation!r}, expected one of {', '.join(_KERNELS)}")
     if image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"image has shape {image.shape}, expected a non-empty (H, W) or (H, W, C)")
-    if flow.shape != (*image.shape[:2], 2):
-        raise ValueError(f"flow has shape {flow.shape}, expected {(*image.shape[:2], 2)}")
+    check_rows(flow, image.shape[:2], first_row)
     source = np.ascontiguousarray(image, np.float32).reshape(*image.shape[:2], -1)
-    warped = np.empty_like(source)
-    inside = np.empty(image.shape[:2], np.bool_)
-    _KERNELS[interpolation](source, np.ascontiguousarray(flow, np.float32), warped, inside)
-    return warped.reshape(image.shape), inside
+    shape = flow.shape[:2]
+    warped = np.empty((*shape, source.shape[2]), np.float32)
+    inside = np.empty(shape, np.bool_)
+    _KERNELS[interpolation](source, np.ascontiguousarray(flow, np.float32), first_row, warped, inside)
+    return warped.reshape(*shape, *image.shape[2:]), inside
+
+
+def check_rows(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> None:
+    """Raise ValueError unless `flow` has the width of a frame of this shape, and rows that the frame has too."""
+    rows = shape[0] - first_row
+    if flow.ndim != 3 or flow.shape[1:] != (shape[1], 2) or not 0 < flow.shape[0] <= rows <= shape[0]:
+        raise ValueError(f"flow has shape {flow.shape}, expected {(rows, shape[1], 2)}")

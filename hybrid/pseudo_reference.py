@@ -22,7 +22,7 @@ from hybrid.timing import Timings
 from hybrid.transfer import compress, demodulate, measure_exposure, remodulate
 from nlm.average import average, reject_outliers, replace_nonfinite, robust_average
 from nlm.gate import color_gate
-from nlm.guided import guided_filter
+from nlm.guided import guided_filter, measure_guide
 from nlm.nonlocal_means import joint_nlm
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
@@ -38,6 +38,9 @@ DISTRUSTED = 0.1
 SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 # Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
 HIDDEN = 3.0
+# Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, then
+# the network's context. Whole strips of the guided filter (64 rows): it then sums in the order it would in the frame.
+MARGIN = 128
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,10 @@ class PreparedFrame:
         Further layers to be warped along, demodulated like the color.
     demodulated : bool
         Whether the albedo has been divided out.
+    exposure : float
+        Brightness of the irradiance (`hybrid.transfer.measure_exposure`).
+    moments : (2, G + 1) array
+        Mean and deviation over the frame of `guide`'s channels, and of the tone-mapped light.
     """
 
     number: int
@@ -82,6 +89,8 @@ class PreparedFrame:
     variance: Array | None
     aovs: dict[str, Array]
     demodulated: bool
+    exposure: float
+    moments: NDArray[np.float64]
 
     @property
     def guide(self) -> Array | None:
@@ -99,7 +108,10 @@ class PreparedFrame:
 
 @dataclass(frozen=True)
 class AlignedWindow:
-    """A window of 2k + 1 frames, every one warped to the centre.
+    """A window of 2k + 1 frames, every one warped to the centre; or some rows of it.
+
+    What is measured over a whole frame (`exposure`, `moments`) was measured before: all that is done with a window
+    afterwards is local, so that a part of it gives what the whole would have given there.
 
     Attributes
     ----------
@@ -124,7 +136,13 @@ class AlignedWindow:
     repaired : int
         Pixels of the centre frame that were not finite.
     outliers : int
-        Pixels of the window that were rejected as fireflies.
+        Pixels of the window, within `inner`, that were rejected as fireflies.
+    exposure : float
+        Brightness of the centre's irradiance.
+    moments : (2, G + 1) array
+        Mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light.
+    inner : slice
+        The rows that were asked for. Those around them are there because the result depends on them.
     effects : frozenset of str
         The stages that made it.
     """
@@ -141,6 +159,9 @@ class AlignedWindow:
     aovs: dict[str, Array]
     repaired: int
     outliers: int
+    exposure: float
+    moments: NDArray[np.float64]
+    inner: slice
     effects: frozenset[str]
 
     @property
@@ -214,7 +235,10 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
     motion = None
     if frame.motion is not None and frame.motion_convention is not None:
         motion = normalize_motion(frame.motion, frame.motion_convention)
-    aovs = {name: replace_nonfinite(layer)[0] for name, layer in frame.aovs.items()}
+    aovs = {}
+    for name, layer in frame.aovs.items():
+        aovs[name], bad_here = replace_nonfinite(layer)
+        repaired = repaired | bad_here
     demodulated = albedo is not None and "demodulate" in effects
     if albedo is not None and demodulated:
         color = demodulate(color, albedo)
@@ -222,10 +246,15 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
         aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
     if frame.alpha is not None and "alpha" in effects:
         aovs[ALPHA] = replace_nonfinite(frame.alpha[..., None])[0]
+    light = _rough_light(color, albedo, normal) if "gate" in effects else None
+    shown = color if light is None else light
+    exposure = measure_exposure(shown)
+    gray = compress(shown.mean(axis=-1, keepdims=True), exposure)
+    moments = [measure_guide(layer) for layer in (albedo, normal, gray) if layer is not None]
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
-        light=_rough_light(color, albedo, normal) if "gate" in effects else None,
+        light=light,
         albedo=albedo,
         normal=normal,
         valid=~bad,
@@ -235,6 +264,8 @@ def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
         variance=None if variance is None else np.maximum(variance, 0),
         aovs=aovs,
         demodulated=demodulated,
+        exposure=exposure,
+        moments=np.concatenate(moments, axis=1),
     )
 
 
@@ -291,14 +322,17 @@ class Aligner:
         self._frames: dict[int, PreparedFrame] = {}
         self._estimates: dict[int, Array | None] = {}
         self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
+        self._chains: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
 
-    def align(self, number: int) -> AlignedWindow:
+    def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
         """Align the window around frame `number`.
 
         Parameters
         ----------
         number : int
             A frame of the shot.
+        rows : slice, optional
+            Only these rows, and `MARGIN` around them; the whole frame without.
 
         Returns
         -------
@@ -310,7 +344,7 @@ class Aligner:
             self._estimate_window(numbers, self.estimate)
         else:
             self._load(numbers)
-        return self._assemble(number, numbers, given=self.estimate is not None)
+        return self._assemble(number, numbers, rows, given=self.estimate is not None)
 
     def load(self, number: int, radius: int) -> list[int]:
         """Read and prepare the frames around `number`; return the numbers of the window, ascending."""
@@ -344,7 +378,7 @@ class Aligner:
         ahead = [n for n in numbers if self.shot.has(n) and n not in self._estimates]
         self._load(sorted({*numbers, *(m for n in ahead for m in self._around(n, self.radius))}))
         for n in ahead:
-            aligned = self._assemble(n, self._around(n, self.radius), given=False)
+            aligned = self._assemble(n, self._around(n, self.radius), None, given=False)
             self._estimates[n] = estimate(aligned, preset, timings=self.timings)
 
     def frame(self, number: int) -> PreparedFrame | None:
@@ -353,6 +387,11 @@ class Aligner:
 
     def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
         """Flow from frame `start` to frame `end`, chained over the frames between; None where one is missing."""
+        if (start, end) not in self._chains:
+            self._chains[start, end] = self._chain(start, end)
+        return self._chains[start, end]
+
+    def _chain(self, start: int, end: int) -> tuple[Array, Mask] | None:
         step = self.shot.step if end > start else -self.shot.step
         flow: Array | None = None
         valid: Mask | None = None
@@ -397,17 +436,22 @@ class Aligner:
         flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
         return flow, valid
 
-    def _assemble(self, number: int, numbers: list[int], *, given: bool) -> AlignedWindow:
+    def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
+        self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
         centre = self._frames[number]
-        shape = len(numbers), *centre.irradiance.shape[:2]
-        layers = _layers(centre)
+        height, width = centre.irradiance.shape[:2]
+        rows = slice(0, height) if rows is None else rows
+        outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
+        inner = slice(rows.start - outer.start, rows.stop - outer.start)
+        shape = len(numbers), outer.stop - outer.start, width
+        layers = {name: layer[outer] for name, layer in _layers(centre).items()}
         estimates: Array | None = None
         if given:
             layers.pop("light", None)
             alone = self._estimates[number]
             if alone is None:
                 raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
-            estimates = np.repeat(alone[None], len(numbers), axis=0)
+            estimates = np.repeat(alone[None, outer], len(numbers), axis=0)
         window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
         confidence = np.zeros(shape, np.float32)
         for index, neighbour in enumerate(numbers):
@@ -418,13 +462,14 @@ class Aligner:
                 # The centre itself, or a frame that is missing.
                 for name, kept in window.items():
                     kept[index] = layers[name]
-                confidence[index] = centre.valid if neighbour == number else 0
+                confidence[index] = layers["valid"][..., 0] if neighbour == number else 0
                 continue
             with self.timings.stage("warp"):
-                warped, inside = self._warp(there, layers, link[0])
+                flow, known = link[0][outer], link[1][outer]
+                warped, inside = self._warp(there, layers, flow, outer)
                 for name, kept in window.items():
                     kept[index] = warped[name]
-                confidence[index] = self._trust(centre, warped, link, inside, back[0])
+                confidence[index] = self._trust(layers, warped, flow, known & inside, back[0], outer.start)
                 if estimates is not None:
                     neighbours = self._estimates[neighbour]
                     if neighbours is None:
@@ -432,14 +477,16 @@ class Aligner:
                     elif "warp" in self.effects:
                         # Estimates have no noise that interpolation could average, only detail to lose: bicubic is
                         # worth up to 0.5 dB here.
-                        estimates[index] = warp(neighbours, link[0], interpolation="bicubic")[0]
+                        estimates[index] = warp(neighbours, flow, interpolation="bicubic", first_row=outer.start)[0]
                     else:
-                        estimates[index] = neighbours
+                        estimates[index] = neighbours[outer]
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, estimates, confidence)
+            return self._finish(centre, window, estimates, confidence, inner)
 
-    def _warp(self, there: PreparedFrame, wanted: Collection[str], flow: Array) -> tuple[dict[str, Array], Mask]:
-        """Warp a neighbour's layers to the centre, all in one call."""
+    def _warp(
+        self, there: PreparedFrame, wanted: Collection[str], flow: Array, rows: slice
+    ) -> tuple[dict[str, Array], Mask]:
+        """Warp a neighbour's layers to these rows of the centre."""
         layers = _layers(there)
         if "light" not in wanted:
             layers.pop("light", None)
@@ -448,49 +495,62 @@ class Aligner:
                 f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
             )
         if "warp" not in self.effects:
-            return layers, np.ones(flow.shape[:2], bool)
-        stack, inside = warp(np.concatenate(list(layers.values()), axis=-1), flow, interpolation=self.interpolation)
-        warped, start = {}, 0
+            return {name: layer[rows] for name, layer in layers.items()}, np.ones(flow.shape[:2], bool)
+        warped = {}
         for name, layer in layers.items():
-            warped[name] = stack[..., start : start + layer.shape[-1]]
-            start += layer.shape[-1]
+            warped[name], inside = warp(layer, flow, interpolation=self.interpolation, first_row=rows.start)
         return warped, inside
 
     def _trust(
         self,
-        centre: PreparedFrame,
+        centre: dict[str, Array],
         warped: dict[str, Array],
-        link: tuple[Array, Mask],
+        flow: Array,
         inside: Mask,
         back: Array,
+        first_row: int,
     ) -> Array:
         """Confidence in a warped neighbour, from geometry."""
         # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
-        valid = link[1] & (warped["valid"][..., 0] > 0.999)
+        valid = warped["valid"][..., 0] > 0.999
         confidence = estimate_confidence(
-            link[0],
+            flow,
             inside=inside,
             reverse=back if "warp" in self.effects else None,
-            albedo=centre.albedo,
+            albedo=centre.get("albedo"),
             warped_albedo=warped.get("albedo"),
-            normal=centre.normal,
+            normal=centre.get("normal"),
             warped_normal=warped.get("normal"),
             valid=valid,
+            first_row=first_row,
         )
         if "fixed-noise" in self.effects:
-            distance = np.hypot(link[0][..., 0], link[0][..., 1])
+            distance = np.hypot(flow[..., 0], flow[..., 1])
             confidence *= np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
         return confidence
 
     def _finish(
-        self, centre: PreparedFrame, window: dict[str, Array], estimates: Array | None, confidence: Array
+        self,
+        centre: PreparedFrame,
+        window: dict[str, Array],
+        estimates: Array | None,
+        confidence: Array,
+        inner: slice,
     ) -> AlignedWindow:
         color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
         middle = len(color) // 2
+        gone = confidence[middle] == 0
+        if gone.any():
+            # What the neighbours in space made of it is good for a pixel, not for a block: first those in time.
+            pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
+            for layer in (color, *pictures, *([] if estimates is None else [estimates])):
+                layer[middle][gone] = average(layer, confidence)[gone]
+        there = [frame for n in self._around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
+        lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
         outliers = 0
         if "outliers" in self.effects:
             color, rejected = reject_outliers(color, confidence)
-            outliers = int(np.count_nonzero(rejected))
+            outliers = int(np.count_nonzero(rejected[:, inner]))
         guides = [layer for layer in (albedo, normal) if layer is not None]
         noisy = "prefilter" in self.effects
         clean: list[Array] = [prefilter_guide(g, confidence) if noisy else g[middle] for g in guides]
@@ -502,7 +562,7 @@ class Aligner:
             estimates = estimates / modulation
         if "gate" in self.effects:
             light = window.pop("light") if estimates is None else estimates
-            confidence = confidence * color_gate(light, color[middle], measure_exposure(light[middle]))
+            confidence = confidence * color_gate(light, color[middle], lit.exposure)
             del light  # the largest arrays of a film frame are given back as soon as they can be
         if estimates is not None:
             for estimate, trust in zip(estimates, confidence, strict=True):
@@ -521,6 +581,9 @@ class Aligner:
             aovs={name: window[f"aov {name}"] for name in centre.aovs},
             repaired=centre.repaired,
             outliers=outliers,
+            exposure=lit.exposure,
+            moments=lit.moments,
+            inner=inner,
             effects=self.effects,
         )
 
@@ -599,11 +662,17 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
         # Edges of shadows and highlights are in no guide, but in what the non-local means have made of the light.
         # Without this channel the filter lost 2 dB on a sunlit shot.
         light = irradiance.mean(axis=-1, keepdims=True)
-        guides.append(compress(light, measure_exposure(light)))
+        guides.append(compress(light, aligned.exposure))
     if preset.guided_radius and guides:
         with timings.stage("guided"):
             guide = np.concatenate(guides, axis=-1)
-            irradiance = guided_filter(irradiance, guide, radius=preset.guided_radius, eps=preset.guided_eps)
+            irradiance = guided_filter(
+                irradiance,
+                guide,
+                radius=preset.guided_radius,
+                eps=preset.guided_eps,
+                moments=aligned.moments[:, : guide.shape[-1]],
+            )
     return irradiance * aligned.modulation
 
 

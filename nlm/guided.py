@@ -16,7 +16,14 @@ _STRIP = 64
 
 
 def guided_filter(
-    image: Floats, guide: Floats, *, radius: int, eps: float = 1e-2, subsample: int = 1, weight: Floats | None = None
+    image: Floats,
+    guide: Floats,
+    *,
+    radius: int,
+    eps: float = 1e-2,
+    subsample: int = 1,
+    weight: Floats | None = None,
+    moments: Floats | None = None,
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 
@@ -26,7 +33,7 @@ def guided_filter(
         What is filtered, in any unit. Non-finite pixels are left out and filled.
     guide : (H, W, G) float32
         What steers it: albedo, normal, depth … in any units: each channel is brought to mean 0 and
-        variance 1 over the image first.
+        variance 1 over the image first, or by `moments`.
     radius : int
         Of the boxes, in pixels of the image.
     eps : float
@@ -35,6 +42,9 @@ def guided_filter(
         1, 2 or 4: the coefficients are found on an image so many times smaller.
     weight : (H, W) float32, optional
         Trust in each pixel of the image, at least 0.
+    moments : (2, G) float64, optional
+        Means and standard deviations to take for the guide's own, from `measure_guide`: those of the whole frame,
+        where image and guide are a part of it.
 
     Returns
     -------
@@ -72,9 +82,12 @@ def guided_filter(
         raise ValueError(f"eps: expected a positive number, got {eps}")
     if subsample not in (1, 2, 4):
         raise ValueError(f"subsample: expected 1, 2 or 4, got {subsample}")
+    if moments is not None and moments.shape != (2, guide.shape[2]):
+        raise ValueError(f"moments: expected shape {(2, guide.shape[2])}, got {moments.shape}")
     image, missing = replace_nonfinite(image)
     trust = (~missing).astype(np.float32) if weight is None else np.where(missing, np.float32(0), weight)
-    guide = _standardise(np.ascontiguousarray(replace_nonfinite(guide)[0]))
+    guide = np.ascontiguousarray(replace_nonfinite(guide)[0])
+    guide = _standardise(guide, measure_guide(guide) if moments is None else moments)
 
     image, trust = np.ascontiguousarray(image), np.asarray(trust[..., None], np.float32)
     small_image, small_guide, small_trust = image, guide, trust
@@ -90,11 +103,27 @@ def guided_filter(
     return np.asarray(np.clip(output, low, high), np.float32)
 
 
-def _standardise(guide: Floats) -> Floats:
-    """Bring each channel to mean 0 and variance 1; a constant channel becomes 0."""
+def measure_guide(guide: Floats) -> NDArray[np.float64]:
+    """Measure what a guide is brought to a common scale by.
+
+    Parameters
+    ----------
+    guide : (H, W, G) float32
+        Finite, in any units.
+
+    Returns
+    -------
+    (2, G) float64
+        Mean and standard deviation of each channel.
+    """
     pixels = guide.shape[0] * guide.shape[1]
-    first, second = _row_moments(guide).sum(axis=0) / pixels
-    mean, deviation = first, np.sqrt(np.maximum(second - first * first, 0))
+    first, second = _row_moments(np.ascontiguousarray(guide, np.float32)).sum(axis=0) / pixels
+    return np.stack([first, np.sqrt(np.maximum(second - first * first, 0))])
+
+
+def _standardise(guide: Floats, moments: NDArray[np.float64]) -> Floats:
+    """Bring each channel to mean 0 and variance 1; a constant channel becomes 0."""
+    mean, deviation = moments
     # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
     constant = deviation <= 1e-6 * np.abs(mean)
     scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))

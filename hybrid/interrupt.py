@@ -1,0 +1,67 @@
+"""Ctrl-C that is heard at once, also in the middle of a long computation."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from hybrid.files import remove_unfinished
+
+INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
+# How long Python is given to come back from compiled code and to unwind by itself, seconds.
+PATIENCE = 1.0
+
+
+@contextmanager
+def interruptible(report: Callable[[], None]) -> Iterator[None]:
+    """Let Ctrl-C, or SIGTERM, end the process within about a second, whatever it is doing.
+
+    Python sees a signal only when compiled code returns, which may take many seconds for one stage of a large frame.
+    Where no KeyboardInterrupt has left the block in `PATIENCE` seconds, a thread removes what was being written, calls
+    `report` and ends the process.
+
+    Parameters
+    ----------
+    report : callable
+        Says what is finished. Called once, here or by this thread, and then KeyboardInterrupt goes on.
+    """
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield
+        return
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    left = threading.Event()
+
+    def watch() -> None:
+        ours.recv(1)
+        if not left.wait(PATIENCE):
+            remove_unfinished()
+            report()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    # Written to by the handler in C, at once.
+    previous = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    except KeyboardInterrupt:
+        left.set()
+        report()
+        raise
+    finally:
+        left.set()
+        signal.set_wakeup_fd(previous)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        theirs.send(b"\0")  # wakes a watcher that nothing has woken
+        watcher.join()
+        ours.close()
+        theirs.close()
