@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -63,6 +66,15 @@ EstimateOption = Annotated[
 KeepOption = Annotated[
     str | None, typer.Option("--keep-estimates", metavar="OUT", help="keep OIDN's pictures, and take them from there")
 ]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="leave frames alone that an earlier run with these options has finished")
+]
+MemoryOption = Annotated[
+    str | None, typer.Option(metavar="SIZE", help="such as 8G; frames are then worked on a part at a time")
+]
+PixelsOption = Annotated[
+    int | None, typer.Option(metavar="N", help="refuse files that claim more pixels than this; 2^28 without")
+]
 AovOption = Annotated[
     list[str] | None, typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels")
 ]
@@ -75,22 +87,24 @@ def inspect(
     layer: LayerOption = None,
     effects: OnOption = None,
     no_effects: OffOption = None,
+    max_pixels: PixelsOption = None,
 ) -> None:
     """Show which channels are taken for what, and which stages the shot calls for."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from hybrid.exr import describe_layers
     from hybrid.plan import EFFECTS
 
     console = Console()
-    opened = _open(shot, frames, layer)
+    opened = _open(shot, frames, layer, max_pixels=max_pixels)
     first = opened.numbers[0]
-    height, width = opened.read(first).color.shape[:2]
+    height, width = opened.shape
     console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
     table = Table("role", "taken from", "note", title="Layers", title_justify="left")
     for row in describe_layers(opened.layers(first)):
-        table.add_row(*row)
+        table.add_row(*(Text(_printable(words)) for words in row))  # names from a file are no markup
     console.print(table)
     plan = _plan(opened, effects, no_effects)
     table = Table("stage", "", "measured", "threshold", "why", title="Plan", title_justify="left")
@@ -115,6 +129,9 @@ def pseudoref(
     layer: LayerOption = None,
     effects: OnOption = None,
     no_effects: OffOption = None,
+    resume: ResumeOption = False,
+    max_memory: MemoryOption = None,
+    max_pixels: PixelsOption = None,
 ) -> None:
     """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too.
 
@@ -127,8 +144,7 @@ def pseudoref(
     from hybrid.timing import Timings
 
     chosen = _choose(PRESETS, preset, "preset")
-    opened = _open(shot, frames, layer)
-    plan = _plan(opened, effects, no_effects)
+    opened = _open(shot, frames, layer, max_pixels=max_pixels)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     if source.estimate is None:
@@ -136,15 +152,20 @@ def pseudoref(
     else:
         make = partial(gated_average, timings=timings)
     _run(
-        opened,
-        output,
-        lambda aligned: Denoised(make(aligned)),
-        plan,
-        timings,
-        source,
-        command="pseudoref",
-        preset=preset,
-        preview=preview,
+        _Job(
+            opened,
+            output,
+            lambda aligned: Denoised(make(aligned)),
+            timings,
+            source,
+            command="pseudoref",
+            preset=preset,
+            settings={"layer": layer, "estimate": estimate},
+            effects=(effects, no_effects),
+            preview=preview,
+            resume=resume,
+            max_memory=max_memory,
+        )
     )
 
 
@@ -172,6 +193,9 @@ def denoise(
     no_effects: OffOption = None,
     tile: Annotated[int, typer.Option(help="pixels on a side that the network sees at once")] = 256,
     precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+    resume: ResumeOption = False,
+    max_memory: MemoryOption = None,
+    max_pixels: PixelsOption = None,
 ) -> None:
     """Denoise with the Robust Average network."""
     neural = _neural()
@@ -186,12 +210,23 @@ def denoise(
 
     if passes < 1:
         raise typer.BadParameter(f"--passes is {passes}, expected at least 1")
-    opened = _open(shot, frames, layer, aov)
+    if breakdown is not None and max_memory is not None:
+        raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
+    opened = _open(shot, frames, layer, aov, max_pixels=max_pixels)
     timings = Timings()
     path = weights or neural.shipped_weights(preset)
     weighed = None if breakdown is None else Breakdown()
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
     source = choose_estimate(estimate, opened, kept=keep_estimates)
+    settings = {
+        "layer": layer,
+        "estimate": estimate,
+        "aov": aov,
+        "tile": tile,
+        "threshold": threshold,
+        "precision": denoiser.precision,
+        "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+    }
     with contextlib.ExitStack() as stack:
         for number in range(1, passes + 1):
             last = number == passes
@@ -199,16 +234,21 @@ def denoise(
             if last:
                 denoiser.breakdown = weighed
             _run(
-                opened,
-                into,
-                denoiser,
-                _plan(opened, effects, no_effects),
-                timings,
-                source,
-                command="denoise" if passes == 1 else f"denoise, pass {number} of {passes}",
-                preset=preset if weights is None else path.name,
-                preview=preview if last else None,
-                radius=denoiser.radius,
+                _Job(
+                    opened,
+                    into,
+                    denoiser,
+                    timings,
+                    source,
+                    command="denoise" if passes == 1 else f"denoise, pass {number} of {passes}",
+                    preset=preset if weights is None else path.name,
+                    settings=settings,
+                    effects=(effects, no_effects),
+                    preview=preview if last else None,
+                    resume=resume,
+                    max_memory=max_memory,
+                    radius=denoiser.radius,
+                )
             )
             if not last:
                 opened, source = _next_pass(opened, into, layer, aov)
@@ -384,7 +424,15 @@ def _neural():  # type: ignore[no-untyped-def]
     return neural
 
 
-def _open(shot: str, frames: str | None, layer: Sequence[str] | None, aovs: Sequence[str] | None = None) -> Shot:
+def _open(
+    shot: str,
+    frames: str | None,
+    layer: Sequence[str] | None,
+    aovs: Sequence[str] | None = None,
+    *,
+    max_pixels: int | None = None,
+) -> Shot:
+    from hybrid.exr import MAX_PIXELS
     from hybrid.frames import open_shot
 
     overrides = {}
@@ -393,7 +441,15 @@ def _open(shot: str, frames: str | None, layer: Sequence[str] | None, aovs: Sequ
         if not separator:
             raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER")
         overrides[role] = name
-    opened = open_shot(shot, frames=frames, layers=overrides, aovs=tuple(aovs or ()), keep=1)
+    # keep=0: whoever aligns a window keeps what he has made of a frame, not the frame.
+    opened = open_shot(
+        shot,
+        frames=frames,
+        layers=overrides,
+        aovs=tuple(aovs or ()),
+        keep=0,
+        max_pixels=MAX_PIXELS if max_pixels is None else max_pixels,
+    )
     for warning in opened.warnings:
         typer.echo(f"warning: {warning}", err=True)
     return opened
@@ -436,26 +492,63 @@ def _choose(table: dict[str, Thing], name: str, option: str) -> Thing:
     return table[name]
 
 
-def _run(
-    shot: Shot,
-    output: str,
-    estimator: Estimator,
-    plan: Plan,
-    timings: Timings,
-    source: EstimateSource,
-    *,
-    command: str,
-    preset: str,
-    preview: Path | None,
-    radius: int = 2,
-) -> None:
-    """Denoise the shot with a progress bar, say what was met on the way, and leave the timings beside the output."""
+@dataclass(frozen=True)
+class _Job:
+    """What `pseudoref` and `denoise` have to say before frames can be made."""
+
+    shot: Shot
+    output: str
+    estimator: Estimator
+    timings: Timings
+    source: EstimateSource
+    command: str
+    preset: str
+    settings: Mapping[str, object]  # all options that the pixels depend on
+    effects: tuple[Sequence[str] | None, Sequence[str] | None]  # forced on, forced off
+    preview: Path | None
+    resume: bool
+    max_memory: str | None
+    radius: int = 2
+
+
+def _run(job: _Job) -> None:
+    """Denoise the shot; stopped by Ctrl-C, say what is finished."""
+    from hybrid.interrupt import INTERRUPTED, interruptible
+
+    done: list[int] = []
+
+    def report() -> None:
+        count = f"{len(done)} of {len(job.shot)} frames are finished"
+        last = f", the last is {done[-1]}" if done else ""
+        typer.echo(f"\nstopped: {count}{last}; --resume goes on from there", err=True)
+
+    try:
+        with interruptible(report):
+            _denoise(job, done)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _denoise(job: _Job, done: list[int]) -> None:
+    """Denoise with a progress bar, say what was met on the way, and leave the timings beside the output."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Table
 
+    from hybrid.memory import parse_size, plan_rows
     from hybrid.pipeline import denoise_shot, write_preview
 
+    shot, source, timings, preview = job.shot, job.source, job.timings, job.preview
+    if preview is not None and shot.reads(preview):
+        raise ValueError(f"preview {str(preview)!r} would overwrite an input frame")
+    limit = None if job.max_memory is None else parse_size(job.max_memory)
+    plan = _plan(shot, *job.effects)
+    rows = (
+        None
+        if limit is None
+        else plan_rows(limit, shot, plan, source.estimate, radius=job.radius, neural=job.command.startswith("denoise"))
+    )
     console = Console(stderr=True)
     console.print("stages: " + ", ".join(d.effect for d in plan.decisions if d.on), highlight=False)
     for decision in plan.decisions:
@@ -463,27 +556,32 @@ def _run(
             console.print(f"  not run: {decision.effect} ({decision.reason})", highlight=False)
     console.print(f"estimates: {source.name} ({source.reason})", highlight=False)
     attributes = {
-        "ravg/command": command,
-        "ravg/preset": preset,
+        "ravg/command": job.command,
+        "ravg/preset": job.preset,
         "ravg/estimate": source.name,
         "ravg/effects": " ".join(sorted(plan.effects)),
+        "ravg/settings": json.dumps(job.settings, sort_keys=True),
     }
-    pixels, outliers, finished = 0, 0, None
+    pixels, outliers, resumed, finished = 0, 0, 0, None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(command, total=len(shot))
+        task = progress.add_task(job.command, total=len(shot))
         frames = denoise_shot(
             shot,
-            output,
-            estimator,
+            job.output,
+            job.estimator,
             plan,
-            radius=radius,
+            radius=job.radius,
             estimate=source.estimate,
             attributes=attributes,
+            rows=rows,
+            resume=job.resume,
             timings=timings,
         )
         for finished in frames:
             progress.advance(task)
+            done.append(finished.number)
+            resumed += finished.resumed
             pixels += finished.pixels
             outliers += finished.outliers
             if finished.repaired:
@@ -494,25 +592,31 @@ def _run(
                 )
     if finished is None:
         return
+    if resumed:
+        console.print(f"{resumed} of {len(shot)} frames were finished already")
     table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
     for row in timings.rows(pixels):
         table.add_row(*row)
     console.print(table)
     if preview is not None:
-        write_preview(shot, output, preview)
-        console.print(f"wrote {preview}", highlight=False)
-    report = finished.path.parent / "ravg.json"
+        write_preview(shot, job.output, preview)
+        console.print(escape(f"wrote {preview}"), highlight=False)
+    folder = finished.path.parent
     timings.write(
-        report,
-        command=command,
-        preset=preset,
+        folder / "ravg.json",
+        command=job.command,
+        preset=job.preset,
         estimate=source.name,
         frames=len(shot),
+        resumed=resumed,
         pixels=pixels,
         outliers=outliers,
         plan=[vars(decision) for decision in plan.decisions],
     )
-    console.print(f"wrote {len(shot)} frames to {finished.path.parent} and their timings to {report}", highlight=False)
+    console.print(
+        escape(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}"),
+        highlight=False,
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -537,8 +641,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+        return _printable(f"{error.filename}: {error.strerror}")
+    return _printable(" ".join(str(error).split()))
+
+
+def _printable(words: str) -> str:
+    """What a terminal shows as it is: a name from a file may hold sequences that command it."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import cast
 import fileseq
 import numpy as np
 
-from hybrid.exr import ROLES, ExrError, ExrImage, Layer, Layers, Part, find_layers, read_exr, write_exr
+from hybrid.exr import MAX_PIXELS, ROLES, ExrError, ExrImage, Layer, Layers, Part, find_layers, read_exr, write_exr
 from nlm.variance import variance_from_halves
 
 # One "#" or "@" is one digit, as in Nuke, RV and ffmpeg's %04d.
@@ -138,6 +138,7 @@ class Shot:
         layers: Mapping[str, str] | None = None,
         aovs: Sequence[str] = (),
         keep: int = 2,
+        max_pixels: int = MAX_PIXELS,
     ) -> None:
         wanted = sorted(files) if frames is None else _parse_frames(frames)
         # The numbers asked for count as well: --frames 1-5 where 1, 3 and 5 are there has two holes.
@@ -155,6 +156,7 @@ class Shot:
         self._overrides = dict(layers or {})
         self._aovs = tuple(aovs)
         self._keep = keep
+        self._max_pixels = max_pixels
         self._held: OrderedDict[int, Frame] = OrderedDict()
 
     def __len__(self) -> int:
@@ -164,9 +166,28 @@ class Shot:
         """Whether there is a file for this frame, asked for or not."""
         return number in self._files
 
+    @property
+    def aovs(self) -> tuple[str, ...]:
+        """Names of the further layers that are loaded."""
+        return self._aovs
+
+    @property
+    def count(self) -> int:
+        """How many files there are, asked for or not."""
+        return len(self._files)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of every frame, from the headers."""
+        left, top, right, bottom = self._canvas
+        return bottom - top + 1, right - left + 1
+
     def reads(self, path: Path) -> bool:
         """Whether this is one of the shot's files, asked for or not, by whatever name."""
-        return path.resolve() in self._resolved
+        if path.resolve() in self._resolved:
+            return True
+        # Another name for the same file: a hard link, or another case where the disk takes no notice of it.
+        return _identity(path) in self._identities
 
     def path(self, number: int) -> Path:
         """The file of a frame.
@@ -182,11 +203,15 @@ class Shot:
 
     def source(self, number: int) -> ExrImage:
         """Everything in the file of a frame; not kept."""
-        return read_exr(self.path(number))
+        return self._read(self.path(number))
 
     def layers(self, number: int) -> Layers:
         """Which channels of a frame's file are taken for what; reads the header only."""
-        return find_layers(read_exr(self.path(number), pixels=False), self._overrides)
+        return find_layers(self.header(number), self._overrides)
+
+    def header(self, number: int) -> ExrImage:
+        """Parts and channels of a frame's file, without pixels."""
+        return self._read(self.path(number), pixels=False)
 
     def read(self, number: int) -> Frame:
         """A frame, from memory if it was read lately.
@@ -276,6 +301,13 @@ class Shot:
             )
         return _placed(image, (left - x, top - y), part.shape)
 
+    def _read(self, path: Path, *, pixels: bool = True) -> ExrImage:
+        return read_exr(path, pixels=pixels, max_pixels=self._max_pixels)
+
+    @cached_property
+    def _identities(self) -> frozenset[tuple[int, int]]:
+        return frozenset(known for file in self._files.values() if (known := _identity(file)) is not None)
+
     @cached_property
     def _resolved(self) -> frozenset[Path]:
         return frozenset(file.resolve() for file in self._files.values())
@@ -283,7 +315,7 @@ class Shot:
     @cached_property
     def _size(self) -> tuple[int, int]:
         """Width and height of the first frame's display window."""
-        image = read_exr(self.path(self.numbers[0]), pixels=False)
+        image = self._read(self.path(self.numbers[0]), pixels=False)
         return _size(image.parts[find_layers(image, self._overrides).color.part])
 
     @cached_property
@@ -293,7 +325,7 @@ class Shot:
         for path in self._files.values():
             # A file that cannot be read, or is of another size, is an error when its turn comes, not now.
             with suppress(ExrError, OSError):
-                image = read_exr(path, pixels=False)
+                image = self._read(path, pixels=False)
                 home = image.parts[find_layers(image, self._overrides).color.part]
                 if _size(home) == size:
                     boxes.append(_data_window(home))
@@ -308,6 +340,7 @@ def open_shot(
     layers: Mapping[str, str] | None = None,
     aovs: Sequence[str] = (),
     keep: int = 2,
+    max_pixels: int = MAX_PIXELS,
 ) -> Shot:
     """Find the files of a shot. None is opened yet.
 
@@ -323,6 +356,8 @@ def open_shot(
         Names of further layers to load into `Frame.aovs`.
     keep
         How many frames to hold in memory; `Shot.window` holds as many as it needs.
+    max_pixels
+        Of the largest frame that is read, see `hybrid.exr.read_exr`.
 
     Raises
     ------
@@ -331,7 +366,7 @@ def open_shot(
     ValueError
         If the folder has several sequences, or `frames` is not a range.
     """
-    return Shot(_find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep)
+    return Shot(_find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep, max_pixels=max_pixels)
 
 
 def output_path(pattern: str | Path, shot: Shot, number: int) -> Path:
@@ -400,6 +435,15 @@ def _files(sequence: fileseq.FileSequence) -> dict[int, Path]:
     if numbers is None:
         return {1: Path(str(sequence))}
     return {int(number): Path(sequence.frame(number)) for number in numbers}
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What the operating system knows a file by; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _listing(folder: Path) -> str:

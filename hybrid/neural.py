@@ -109,6 +109,7 @@ class Denoiser:
         if threshold is not None and not 0 <= threshold < 1:
             raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
         half = precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+        self.precision = "bfloat16" if half else "float32"
         self.model = for_inference(load_model(weights), half)
         self.tile = tile
         self.threshold = threshold
@@ -137,12 +138,12 @@ class Denoiser:
             layers["estimate"] = aligned.estimate
         if aligned.aovs:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
-        exposure = window_exposure(_tensor(color))
+        exposure = torch.tensor([aligned.exposure], dtype=torch.float32)
         irradiance = np.empty(color.shape[1:], np.float32)
         channels = sum(layer.shape[-1] for layer in aligned.aovs.values())
         filtered = np.empty((height, width, channels), np.float32)
         parts = np.zeros((*color.shape[:3], 4), np.float32) if self.breakdown is not None else None
-        for inner, outer, offset in _tiles(height, width, self.tile, self.model.multiple):
+        for inner, outer, offset in _tiles(aligned.inner, height, width, self.tile, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if "skip" in aligned.effects and not aligned.variance[outer].any():
                 irradiance[inner] = color[aligned.centre][inner]
@@ -407,16 +408,16 @@ def _pad(window: Array, multiple: int) -> Array:
 Block = tuple[slice, slice]
 
 
-def _tiles(height: int, width: int, tile: int, multiple: int) -> Iterator[tuple[Block, Block, Block]]:
-    """Cover the image: where each tile's result goes, what it is computed from, and where in that the result is."""
+def _tiles(rows: slice, height: int, width: int, tile: int, multiple: int) -> Iterator[tuple[Block, Block, Block]]:
+    """Cover some rows: where each tile's result goes, what it is computed from, and where in that the result is."""
     # The halo starts on a multiple, so that every tile samples its coarse scales where the whole image would.
     halo = -(-HALO // multiple) * multiple
     tile = -(-tile // multiple) * multiple
-    for top in range(0, height, tile):
+    for top in range(rows.start, rows.stop, tile):
         for left in range(0, width, tile):
             inner, outer, offset = [], [], []
-            for start, size in ((top, height), (left, width)):
-                stop = min(start + tile, size)
+            for start, end, size in ((top, rows.stop, height), (left, width, width)):
+                stop = min(start + tile, end)
                 first, last = max(start - halo, 0), min(stop + halo, size)
                 inner.append(slice(start, stop))
                 outer.append(slice(first, last))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.files import replace_file
+from hybrid.exr import ExrError, read_exr
+from hybrid.files import remove_leftovers, replace_file
 from hybrid.frames import Shot, open_shot, output_path
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate
+from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate, Preset
 from hybrid.timing import Timings
 from hybrid.transfer import measure_exposure
 from nlm.average import replace_nonfinite
@@ -53,6 +54,7 @@ class Finished:
     repaired: int
     outliers: int
     clamped: int
+    resumed: bool = False  # it was there already
 
 
 def denoise_shot(
@@ -65,6 +67,8 @@ def denoise_shot(
     estimate: Estimate = None,
     interpolation: str = "bilinear",
     attributes: Mapping[str, str] | None = None,
+    rows: int | None = None,
+    resume: bool = False,
     timings: Timings | None = None,
 ) -> Iterator[Finished]:
     """Denoise every frame of a shot and write it, one after the other.
@@ -87,6 +91,10 @@ def denoise_shot(
         Of the warp.
     attributes : mapping of str to str, optional
         Written to the header of each file.
+    rows : int, optional
+        How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); all without. The result is the same.
+    resume : bool
+        Leave frames alone that are there, whole, with these attributes, and no older than what they are made from.
     timings : Timings, optional
         Where to count the stages.
 
@@ -99,6 +107,11 @@ def denoise_shot(
     ------
     ValueError
         If a frame would be written over its own input.
+
+    Notes
+    -----
+    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace_file`). What earlier
+    processes have left half written is removed.
     """
     timings = timings or Timings()
     aligner = Aligner(
@@ -107,15 +120,60 @@ def denoise_shot(
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
+    reach = 2 * radius if isinstance(estimate, Preset) else radius
     for number, path in paths.items():
-        aligned = aligner.align(number)
-        denoised = estimator(aligned)
+        if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
+            yield Finished(number, path, 0, 0, 0, 0, resumed=True)
+            continue
+        denoised, repaired, outliers = _denoise_frame(aligner, number, estimator, rows or shot.shape[0])
         with timings.stage("write"):
             images = {"color": denoised.color, **denoised.aovs}
             clamped = shot.write(path, number, images, denoised.extra, attributes)
-        finished = Finished(number, path, denoised.color[..., 0].size, aligned.repaired, aligned.outliers, clamped)
-        del aligned, denoised  # or they would still be there while the next window is made
+        finished = Finished(number, path, denoised.color[..., 0].size, repaired, outliers, clamped)
+        del denoised  # or it would still be there while the next window is made
         yield finished
+
+
+def _denoise_frame(aligner: Aligner, number: int, estimator: Estimator, rows: int) -> tuple[Denoised, int, int]:
+    """Denoise a frame, so many rows at a time; count the pixels that were repaired, and rejected as fireflies."""
+    height, width = aligner.shot.shape
+    whole: dict[tuple[str, str], Array] = {}
+    outliers = repaired = 0
+    for top in range(0, height, rows):
+        band = slice(top, min(top + rows, height))
+        aligned = aligner.align(number, band)
+        part = estimator(aligned)
+        outliers, repaired = outliers + aligned.outliers, aligned.repaired
+        named = {("color", ""): part.color}
+        named |= {("aovs", name): layer for name, layer in part.aovs.items()}
+        named |= {("extra", name): layer for name, layer in part.extra.items()}
+        for name, layer in named.items():
+            if rows >= height:
+                whole[name] = layer
+                continue
+            if name not in whole:
+                whole[name] = np.empty((height, width, *layer.shape[2:]), np.float32)
+            whole[name][band] = layer[aligned.inner]
+        del aligned, part, named
+    kinds = {kind: {name: layer for (k, name), layer in whole.items() if k == kind} for kind in ("aovs", "extra")}
+    return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), repaired, outliers
+
+
+def _files_around(shot: Shot, number: int, reach: int) -> list[Path]:
+    numbers = range(number - reach * shot.step, number + reach * shot.step + 1, shot.step)
+    return [shot.path(n) for n in numbers if shot.has(n)]
+
+
+def _is_finished(path: Path, attributes: Mapping[str, str], sources: Iterable[Path]) -> bool:
+    """Whether a file is there, whole, with these attributes, and no older than any of its sources."""
+    try:
+        header = read_exr(path).parts[0].header
+        made = path.stat().st_mtime_ns
+        fresh = all(source.stat().st_mtime_ns <= made for source in sources)
+    except (OSError, ExrError):
+        return False
+    return fresh and all(header.get(name) == value for name, value in attributes.items())
 
 
 def write_preview(shot: Shot, output: str | Path, path: Path) -> None:

@@ -6,7 +6,7 @@ figure that was measured, the threshold it was held against, and the reason in w
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -127,6 +127,22 @@ class _Pair:
     there: PreparedFrame
 
 
+@dataclass(frozen=True)
+class _Figures:
+    """What was measured on one pair, so that the frames need not be kept."""
+
+    albedo_spread: float | None
+    has_guide: bool
+    has_vectors: bool
+    speed: float
+    still: float
+    unexplained: float
+    outliers: float
+    noise_correlation: float
+    guide_noise: float
+    noise_free: float
+
+
 def plan_shot(shot: Shot) -> Plan:
     """Measure a shot on a few pairs of frames and decide which stages it calls for.
 
@@ -140,54 +156,50 @@ def plan_shot(shot: Shot) -> Plan:
     Plan
         One decision for each of `EFFECTS`.
     """
-    pairs = _sample_pairs(shot)
-    if not pairs:
+    figures = [_measure(pair) for pair in _sample_pairs(shot)]
+    single = not figures
+    if single:
         only = prepare(shot.read(shot.numbers[0]), MEASURED)
-        pairs, single = [_Pair(only, only)], True
-    else:
-        single = False
-    first = pairs[0].here
-    has_vectors = rendered_flow(first, pairs[0].there) is not None
-    still = [_unexplained(pair, None) for pair in pairs]
-    if has_vectors:
-        speed = max(_speed(pair) for pair in pairs)
-        unexplained = max(_unexplained(pair, rendered_flow(pair.here, pair.there)) for pair in pairs)
-    else:
-        speed, unexplained = float("nan"), max(still)
-    moves = not single and (speed > STILL if has_vectors else unexplained > GATE_ABOVE)
+        figures = [_measure(_Pair(only, only))]
+    first = figures[0]
+    still = max(pair.still for pair in figures)
+    speed = max(pair.speed for pair in figures) if first.has_vectors else float("nan")
+    unexplained = max(pair.unexplained for pair in figures) if first.has_vectors else still
+    moves = not single and (speed > STILL if first.has_vectors else unexplained > GATE_ABOVE)
     decisions = [
-        _decide_demodulate(first),
+        _decide_demodulate(first.albedo_spread),
         _decide(
             "outliers",
-            max(_outlier_share(pair.here) for pair in pairs),
+            max(pair.outliers for pair in figures),
             OUTLIERS_ABOVE,
             "{:.2g} of the pixels stand alone far above their neighbours",
         ),
-        _decide_warp(single, has_vectors, moves, speed, max(still)),
+        _decide_warp(single, first.has_vectors, moves, speed, still),
         Decision(
             "dense-flow",
-            moves and not has_vectors,
+            moves and not first.has_vectors,
             None,
             0,
             "no motion vectors in the file: the motion has to be found in the pictures"
-            if moves and not has_vectors
+            if moves and not first.has_vectors
             else "motion vectors are there"
-            if has_vectors
+            if first.has_vectors
             else "nothing moves",
         ),
-        _decide_refine(moves, has_vectors, unexplained),
+        _decide_refine(moves, first.has_vectors, unexplained),
         _decide(
             "gate",
             0.0 if single else unexplained,
             GATE_ABOVE,
-            "{:.2%} of the picture changes its light between frames" + ("" if has_vectors else " (motion included)"),
+            "{:.2%} of the picture changes its light between frames"
+            + ("" if first.has_vectors else " (motion included)"),
         ),
-        _decide_fixed_noise(pairs, single),
-        _decide_prefilter(pairs),
+        _decide_fixed_noise([pair.noise_correlation for pair in figures], single),
+        _decide_prefilter(first.has_guide, max(pair.guide_noise for pair in figures)),
         _decide_alpha(shot),
         _decide(
             "skip",
-            min(_noise_free_share(pair.here) for pair in pairs),
+            min(pair.noise_free for pair in figures),
             0.0,
             "{:.1%} of the tiles hold no noise",
         ),
@@ -195,29 +207,46 @@ def plan_shot(shot: Shot) -> Plan:
     return Plan(tuple(decisions))
 
 
-def _sample_pairs(shot: Shot) -> list[_Pair]:
+def _sample_pairs(shot: Shot) -> Iterator[_Pair]:
+    """Pairs spread over the shot, one at a time."""
     numbers = list(shot.numbers)
     count = min(SAMPLES, len(numbers))
     picked = sorted({numbers[(2 * i + 1) * len(numbers) // (2 * count)] for i in range(count)})
     aligner = Aligner(shot, MEASURED, radius=1)
-    pairs = []
     for number in picked:
-        previous, _, following = aligner.load(number, 1)
-        here = aligner.frame(number)
-        there = aligner.frame(following) or aligner.frame(previous)
-        if here is not None and there is not None:
-            pairs.append(_Pair(here, there))
-    return pairs
+        previous, _, following = aligner.around(number, 1)
+        other = following if shot.has(following) else previous
+        if shot.has(other):
+            aligner.load([number, other])
+            here, there = aligner.frame(number), aligner.frame(other)
+            if here is not None and there is not None:
+                yield _Pair(here, there)
+
+
+def _measure(pair: _Pair) -> _Figures:
+    vectors = rendered_flow(pair.here, pair.there)
+    still = _unexplained(pair, None)
+    return _Figures(
+        albedo_spread=None if pair.here.albedo is None else float(pair.here.albedo.std()),
+        has_guide=pair.here.albedo is not None or pair.here.normal is not None,
+        has_vectors=vectors is not None,
+        speed=_speed(pair),
+        still=still,
+        unexplained=still if vectors is None else _unexplained(pair, vectors),
+        outliers=_outlier_share(pair.here),
+        noise_correlation=noise_correlation(pair.here, pair.there),
+        guide_noise=_guide_noise(pair),
+        noise_free=_noise_free_share(pair.here),
+    )
 
 
 def _decide(effect: str, figure: float, threshold: float, words: str) -> Decision:
     return Decision(effect, figure > threshold, figure, threshold, words.format(figure))
 
 
-def _decide_demodulate(frame: PreparedFrame) -> Decision:
-    if frame.albedo is None:
+def _decide_demodulate(spread: float | None) -> Decision:
+    if spread is None:
         return Decision("demodulate", False, None, 0, "no albedo in the file")
-    spread = float(frame.albedo.std())
     words = "the albedo varies by {:.3g}" if spread > 0 else "the albedo is the same everywhere"
     return _decide("demodulate", spread, 0, words)
 
@@ -240,10 +269,10 @@ def _decide_refine(moves: bool, has_vectors: bool, unexplained: float) -> Decisi
     return _decide("refine", unexplained, REFINE_ABOVE, "the vectors leave {:.2%} of the picture unexplained")
 
 
-def _decide_fixed_noise(pairs: list[_Pair], single: bool) -> Decision:
+def _decide_fixed_noise(correlations: list[float], single: bool) -> Decision:
     if single:
         return Decision("fixed-noise", False, None, FIXED_NOISE_ABOVE, "no two neighbouring frames")
-    figure = float(np.median([noise_correlation(pair.here, pair.there) for pair in pairs]))
+    figure = float(np.median(correlations))
     words = "the noise of neighbouring frames correlates {:.2f} at equal pixels"
     if figure > FIXED_NOISE_ABOVE:
         words += ": the render has one seed for all frames, and time adds little where nothing moves; in Blender, "
@@ -251,10 +280,9 @@ def _decide_fixed_noise(pairs: list[_Pair], single: bool) -> Decision:
     return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, words)
 
 
-def _decide_prefilter(pairs: list[_Pair]) -> Decision:
-    if pairs[0].here.guide is None:
+def _decide_prefilter(has_guide: bool, noise: float) -> Decision:
+    if not has_guide:
         return Decision("prefilter", False, None, GUIDE_NOISE_ABOVE, "no guides in the file")
-    noise = max(_guide_noise(pair) for pair in pairs)
     return _decide("prefilter", noise, GUIDE_NOISE_ABOVE, "the guides differ by {:.3f} between frames")
 
 

@@ -339,24 +339,20 @@ class Aligner:
         AlignedWindow
             The first and the last frames of a shot have neighbours of confidence 0.
         """
-        numbers = self._around(number, self.radius)
+        numbers = self.around(number, self.radius)
         if isinstance(self.estimate, Preset):
             self._estimate_window(numbers, self.estimate)
         else:
-            self._load(numbers)
+            self.load(numbers)
         return self._assemble(number, numbers, rows, given=self.estimate is not None)
 
-    def load(self, number: int, radius: int) -> list[int]:
-        """Read and prepare the frames around `number`; return the numbers of the window, ascending."""
-        numbers = self._around(number, radius)
-        self._load(numbers)
-        return numbers
-
-    def _around(self, number: int, radius: int) -> list[int]:
+    def around(self, number: int, radius: int) -> list[int]:
+        """Numbers of the window around a frame, ascending, whether or not these frames are there."""
         step = self.shot.step
         return list(range(number - radius * step, number + radius * step + 1, step))
 
-    def _load(self, numbers: Collection[int]) -> None:
+    def load(self, numbers: Collection[int]) -> None:
+        """Read and prepare these frames, where they are there, and forget all others."""
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
         self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
@@ -376,9 +372,9 @@ class Aligner:
     def _estimate_window(self, numbers: list[int], preset: Preset) -> None:
         """Estimate each frame of a window from a window of its own, once while windows slide over it."""
         ahead = [n for n in numbers if self.shot.has(n) and n not in self._estimates]
-        self._load(sorted({*numbers, *(m for n in ahead for m in self._around(n, self.radius))}))
+        self.load(sorted({*numbers, *(m for n in ahead for m in self.around(n, self.radius))}))
         for n in ahead:
-            aligned = self._assemble(n, self._around(n, self.radius), None, given=False)
+            aligned = self._assemble(n, self.around(n, self.radius), None, given=False)
             self._estimates[n] = estimate(aligned, preset, timings=self.timings)
 
     def frame(self, number: int) -> PreparedFrame | None:
@@ -545,7 +541,7 @@ class Aligner:
             pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
             for layer in (color, *pictures, *([] if estimates is None else [estimates])):
                 layer[middle][gone] = average(layer, confidence)[gone]
-        there = [frame for n in self._around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
+        there = [frame for n in self.around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
         lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
         outliers = 0
         if "outliers" in self.effects:
@@ -598,14 +594,18 @@ def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mas
     if here.motion is not None:
         motion = here.motion
         if not forward:
-            return motion.to_previous * step, motion.previous_valid
+            return _times(motion.to_previous, step), motion.previous_valid
         if motion.to_next is not None and motion.next_valid is not None:
-            return motion.to_next * step, motion.next_valid
+            return _times(motion.to_next, step), motion.next_valid
     if forward and there.motion is not None:
         # Only backward vectors: the next frame knows where each of its pixels was here.
-        previous = there.motion.to_previous * step
+        previous = _times(there.motion.to_previous, step)
         return invert_flow(previous, valid=there.motion.previous_valid, depth=there.depth)
     return None
+
+
+def _times(flow: Array, step: int) -> Array:
+    return flow if step == 1 else flow * step
 
 
 def _layers(frame: PreparedFrame) -> dict[str, Array]:

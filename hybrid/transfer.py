@@ -11,6 +11,8 @@ Array = NDArray[np.float32]
 # specular surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a
 # neighbour's light can get by crossing an edge between materials; KPCN's 0.00316 allows a factor of 300.
 ALBEDO_FLOOR = 0.1
+# Mean radiance that counts as none: far below any render's, and a spark of 1e8 over it is still a float32.
+NO_LIGHT = 1e-30
 
 
 def demodulate(radiance: Array, albedo: Array) -> Array:
@@ -48,8 +50,9 @@ def _divisor(albedo: Array, channels: int) -> Array:
 
 def compress(radiance: Array, exposure: float) -> Array:
     """Map [0, inf) to [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure`` (Reinhard et al. 2002, eq. 3)."""
-    scaled = np.asarray(np.maximum(radiance, 0) / np.float32(exposure), np.float32)
-    return scaled / (1 + scaled)
+    light = np.asarray(np.maximum(radiance, 0), np.float32)
+    # Not x / (1 + x): a spark over next to no exposure would be infinite.
+    return light / (light + np.float32(exposure))
 
 
 def expand(compressed: Array, exposure: float) -> Array:
@@ -69,7 +72,7 @@ def measure_exposure(radiance: Array) -> float:
     -------
     float
         Positive, and proportional to the image, so that what is divided by it does not depend on the image's
-        scale. 1 for an image without light.
+        scale. 1 for an image without light, or with less than `NO_LIGHT`.
     """
     level = np.einsum("...c->...", radiance).ravel() / np.float32(radiance.shape[-1])
     level = level[np.isfinite(level)]
@@ -78,4 +81,4 @@ def measure_exposure(radiance: Array) -> float:
     # Lamps, sky seen through a window and fireflies are few and bright; they must not decide the exposure.
     bright = np.partition(level, -1 - level.size // 100)[-1 - level.size // 100]
     mean = float(np.minimum(level, bright).mean(dtype=np.float64))
-    return mean if mean > 0 else 1.0
+    return mean if mean > NO_LIGHT else 1.0

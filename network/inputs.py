@@ -34,7 +34,8 @@ def window_exposure(color: Tensor) -> Tensor:
     mean = brightness.mean(1, keepdim=True)
     for _ in range(3):
         mean = torch.minimum(brightness, 4 * mean).mean(1, keepdim=True)
-    return torch.where(mean > 0, mean, torch.ones_like(mean)).squeeze(1)
+    # 1e-30: next to no light; the reciprocal of a denormal would be infinite.
+    return torch.where(mean > 1e-30, mean, torch.ones_like(mean)).squeeze(1)
 
 
 def network_inputs(

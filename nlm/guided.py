@@ -23,7 +23,7 @@ def guided_filter(
     eps: float = 1e-2,
     subsample: int = 1,
     weight: Floats | None = None,
-    moments: Floats | None = None,
+    moments: NDArray[np.float64] | None = None,
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 

@@ -1,0 +1,118 @@
+"""How much of a frame may be worked on at a time, for a given amount of memory.
+
+The frames of a window are held as a whole; what is made of them while they are aligned and filtered, which is several
+times as much, only for some rows. So memory has a lower bound, and what is asked for below it is refused.
+"""
+
+from __future__ import annotations
+
+import re
+
+from hybrid.frames import Shot
+from hybrid.plan import Plan
+from hybrid.pseudo_reference import MARGIN, Estimate, Preset
+
+# Rows are taken in whole strips of the guided filter.
+STRIP = 64
+# What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
+BASE, BASE_NEURAL = 230 * 2**20, 560 * 2**20
+# Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
+SHARE = 0.92
+_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+
+def parse_size(words: str) -> int:
+    """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``; units are powers of 1024.
+
+    Raises
+    ------
+    ValueError
+        If it is no size.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", words, re.IGNORECASE)
+    if match is None:
+        raise ValueError(f"max-memory is {words!r}, expected a size such as 8G or 500M")
+    return int(float(match[1]) * _UNITS[match[2].upper()])
+
+
+def plan_rows(limit: int, shot: Shot, plan: Plan, estimate: Estimate, *, radius: int = 2, neural: bool) -> int | None:
+    """Find how many rows of a frame may be worked on at a time.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes.
+    shot : Shot
+        Its headers are read.
+    plan : Plan
+        Which stages run.
+    estimate : function or Preset, optional
+        Where the estimates of single frames come from.
+    radius : int
+        Frames on each side of the centre.
+    neural : bool
+        Whether the network runs.
+
+    Returns
+    -------
+    int or None
+        Rows, a multiple of 64; None for all. The same for the same arguments, on every machine.
+
+    Raises
+    ------
+    ValueError
+        If not even the fewest rows fit; says how much is needed.
+
+    Notes
+    -----
+    Counted in planes, one float32 for each pixel: what is kept of each frame, and what there is at once while a frame
+    is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
+    """
+    height, width = shot.shape
+    kept, passing, worked = _planes(shot, plan, estimate, radius, neural)
+    plane = 4 * height * width
+    base = BASE_NEURAL if neural else BASE
+
+    def needed(rows: int) -> int:
+        return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))
+
+    budget = round(SHARE * limit)
+    if needed(height) <= budget:
+        return None
+    if needed(STRIP) > budget:
+        least = needed(STRIP) / SHARE / 2**30
+        raise ValueError(
+            f"max-memory is {limit / 2**30:.1f} GiB, expected at least {least:.1f} GiB for {width}x{height} pixels"
+        )
+    rows = STRIP
+    while needed(rows + STRIP) <= budget:
+        rows += STRIP
+    return rows
+
+
+def _planes(shot: Shot, plan: Plan, estimate: Estimate, radius: int, neural: bool) -> tuple[float, float, float]:
+    """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
+    header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
+    aovs = sum(len(header.layer(name).channels) for name in shot.aovs)
+    if layers.alpha is not None and "alpha" in plan.effects:
+        aovs += 1
+    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
+    light = 3 if "gate" in plan.effects or estimate is not None else 0
+    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
+    frame = 3 + light + guides + motion + (layers.depth is not None) + 3 * (layers.variance is not None) + aovs + 0.25
+    reach = 2 * radius if isinstance(estimate, Preset) else radius
+    frames = min(2 * reach + 1, shot.count)
+    kept = frames * frame + 3 + aovs  # and the result
+    if "warp" in plan.effects:
+        kept += 2.25 * 4 * max(radius - 1, 0)
+        if plan.effects & {"refine", "dense-flow"} or layers.motion_convention == "backward":
+            kept += 2.25 * 2 * (frames - 1)
+    # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
+    passing = len(header.channel_names) + frame + 14
+    if plan.effects & {"refine", "dense-flow"}:
+        passing = max(passing, 45)
+    window = (2 * radius + 1) * (3 + light + guides + aovs + 1)
+    worked = 2.0 * window + 40
+    if neural:
+        worked += window
+    return kept, passing, worked

@@ -1,0 +1,242 @@
+"""Radiance at its extremes: any exposure, none at all, fireflies, cuts; variance and guides that tell nothing."""
+
+import cv2
+import numpy as np
+import pytest
+from conftest import Scene
+from hard import EFFECTS, MIDDLE, align, constant, denoise, frame, shot, spoil, truth, within_range
+
+from hybrid.metrics import psnr
+from hybrid.pseudo_reference import BALANCED, PRESETS
+
+SCALES = [1e-6, 1e-3, 1e3, 1e6]
+
+
+@pytest.fixture(scope="module")
+def network():
+    pytest.importorskip("torch")
+    from hybrid.neural import Denoiser, shipped_weights
+
+    return {p: Denoiser(shipped_weights("fast"), precision=p) for p in ("float32", "bfloat16")}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_estimate_scales_with_the_light(preset, record_property):
+    _, plain = denoise(shot(), preset)
+    for scale in SCALES:
+        _, image = denoise(shot(scale=scale), preset)
+        # float32 through the chain; relative to the picture, for nearly black pixels have few digits
+        assert np.abs(image / np.float32(scale) - plain).max() < 1e-3 * plain.mean()
+    record_property("cases", len(SCALES))
+
+
+@pytest.mark.neural
+def test_the_network_scales_with_the_light(network, record_property):
+    plain = network["float32"](align(shot(), estimate=BALANCED)).color
+    for scale in SCALES:
+        image = network["float32"](align(shot(scale=scale), estimate=BALANCED)).color
+        assert np.abs(image / np.float32(scale) - plain).max() < 1e-3 * plain.mean()
+    record_property("cases", len(SCALES))
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("scale", [0, 1e-42, 1e-38, 1e-30])
+def test_next_to_no_light_is_finite(network, precision, scale):
+    """The reciprocal of a denormal exposure was infinite, and the picture NaN."""
+    frames = shot(scale=scale)
+    for image in (denoise(frames)[1], network[precision](align(frames, estimate=BALANCED)).color):
+        assert np.isfinite(image).all()
+        assert (image >= 0).all()
+        assert image.max() <= 10 * max(f.color.max() for f in frames)
+        if scale == 0:
+            assert (image == 0).all()
+
+
+def test_a_spark_in_next_to_no_light_is_finite():
+    """A light of 1e6 over an exposure of 1e-42 is infinite, and its tone-mapped value was NaN."""
+    frames = shot(scale=1e-42)
+    for f in frames:
+        f.color[20, 28] = 1e6
+    window, image = denoise(frames)
+    assert np.isfinite(image).all()
+    assert within_range(window, image)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("value", [1e-6, 0.7, 1e4])
+def test_a_constant_picture_is_kept(preset, value):
+    _, image = denoise(constant(value), preset)
+    np.testing.assert_allclose(image, value, rtol=1e-6)
+
+
+@pytest.mark.neural
+def test_the_network_keeps_a_constant_picture(network):
+    for precision, model in network.items():
+        image = model(align(constant(0.7), estimate=BALANCED)).color
+        # Kernels are float32 and sum to one in either precision; 125 taps of rounding.
+        np.testing.assert_allclose(image, 0.7, rtol=1e-6 if precision == "float32" else 1e-5)
+
+
+def test_identical_frames_are_one_frame():
+    one = frame(MIDDLE)
+    still = spoil(one, motion=np.zeros_like(one.motion))
+    window, image = denoise([spoil(still, number=n) for n in range(5)])
+    assert (window.confidence == 1).all()
+    assert within_range(window, image)
+
+
+def test_one_frame_alone():
+    window, image = denoise([spoil(frame(MIDDLE), number=MIDDLE)])
+    assert (window.confidence[[0, 1, 3, 4]] == 0).all()
+    assert psnr(image, truth()) > psnr(frame(MIDDLE).color, truth()) + 2
+
+
+def test_a_black_frame_between_bright_ones_stays_black():
+    frames = shot()
+    frames[MIDDLE] = spoil(frames[MIDDLE], color=np.zeros_like(frames[MIDDLE].color))
+    _, image = denoise(frames)
+    assert image.max() < 1e-3 * frames[0].color.mean()
+
+
+def test_black_frames_beside_a_bright_one_do_not_darken_it():
+    frames = [spoil(f, color=f.color * (f.number == MIDDLE)) for f in shot()]
+    _, image = denoise(frames)
+    alone = denoise([frame(MIDDLE)])[1]
+    assert image.mean() == pytest.approx(alone.mean(), rel=0.02)  # the noise of 30 % over 2240 pixels: 0.6 %
+
+
+def test_a_cut_inside_the_window_mixes_no_scenes():
+    """Other walls, other light: what came before the cut must not show through."""
+    after = Scene(frames=5, step=(-3, 2))
+    frames = [frame(n) if n < MIDDLE else spoil(frame(n, after), albedo=1 - frame(n, after).albedo) for n in range(5)]
+    frames = [f if f.number < MIDDLE else spoil(f, color=f.color[::-1].copy()) for f in frames]
+    image = denoise(frames)[1]
+    alone = denoise(frames[MIDDLE:])[1]
+    assert np.sqrt(np.mean((image - alone) ** 2)) < 0.05 * alone.mean()
+
+
+# --- fireflies
+
+
+def burn(frames, value, size, which):
+    for index in which:
+        frames[index].color[20 : 20 + size, 28 : 28 + size] = value
+    return frames
+
+
+@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@pytest.mark.parametrize("which", [(MIDDLE,), (MIDDLE - 1,), (MIDDLE - 1, MIDDLE)], ids=["centre", "side", "both"])
+def test_a_firefly_leaves_neither_hole_nor_halo(value, which, record_property):
+    for preset in PRESETS:
+        plain = denoise(shot(), preset)[1]
+        image = denoise(burn(shot(), value, 1, which), preset)[1]
+        clean = truth()
+        for reach in (0, 1, 2, 4):
+            ring = np.zeros(clean.shape[:2], bool)
+            ring[20 - reach : 21 + reach, 28 - reach : 29 + reach] = True
+            if reach:
+                ring[21 - reach : 20 + reach, 29 - reach : 28 + reach] = False
+            # What the picture without the firefly is off by, and four deviations of a ring's mean beside: noise of
+            # 0.3 averaged over the window (5) and the ring.
+            noise = 4 * 0.3 / np.sqrt(5 * ring.sum())
+            error = abs(image[ring].mean() / clean[ring].mean() - 1)
+            assert error < abs(plain[ring].mean() / clean[ring].mean() - 1) + noise
+    record_property("cases", 4 * len(PRESETS))
+
+
+@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@pytest.mark.parametrize("size", [2, 3])
+def test_a_cluster_of_fireflies_does_not_leak(value, size, record_property):
+    """Larger than a pixel it may be an object, and stays; its surroundings stay what they were."""
+    for preset in PRESETS:
+        for which in ((MIDDLE,), (MIDDLE - 1,), (MIDDLE, MIDDLE + 1)):
+            plain = denoise(shot(), preset)[1]
+            window, image = denoise(burn(shot(), value, size, which), preset)
+            assert np.isfinite(image).all()
+            assert within_range(window, image)
+            ring = np.zeros(plain.shape[:2], bool)
+            ring[12 : 28 + size, 20 : 36 + size] = True
+            # Side frames arrive moved by up to 4 px; the guided filter of "draft" has a box of 2 around that.
+            ring[14 : 26 + size, 22 : 34 + size] = False
+            assert image[ring].mean() == pytest.approx(plain[ring].mean(), rel=0.05)
+    record_property("cases", 3 * len(PRESETS))
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_the_network_survives_fireflies(network, precision, record_property):
+    for value in (6.5e4, 1e6):
+        for size in (1, 2, 3):
+            frames = burn(shot(), value, size, (MIDDLE - 1, MIDDLE))
+            image = network[precision](align(frames, estimate=BALANCED)).color
+            assert np.isfinite(image).all()
+            assert (image >= 0).all()
+    record_property("cases", 6)
+
+
+def test_negative_radiance_stays_in_its_neighbourhood():
+    frames = shot()
+    frames[MIDDLE].color[10:12, 10:14] *= -1
+    window, image = denoise(frames)
+    assert np.isfinite(image).all()
+    assert within_range(window, image)
+    far = cv2.dilate((frames[MIDDLE].color.min(axis=-1) < 0).astype(np.uint8), np.ones((11, 11), np.uint8)) == 0
+    assert (image[far] >= 0).all()
+
+
+# --- variance and guides
+
+
+@pytest.mark.parametrize("variance", [0.0, 1e-12, 1e3, 1e30, -1.0])
+def test_any_variance_gives_a_picture_in_range(variance):
+    frames = [spoil(f, variance=np.full_like(f.color, variance)) for f in shot()]
+    window, image = denoise(frames)
+    assert np.isfinite(image).all()
+    assert within_range(window, image)
+
+
+def unit(length):
+    return lambda f: np.float32(length) * f.normal
+
+
+GUIDES = {
+    "no albedo": {"albedo": lambda f: np.zeros_like(f.albedo)},
+    "constant albedo": {"albedo": lambda f: np.full_like(f.albedo, 0.5)},
+    "albedo above one": {"albedo": lambda f: np.full_like(f.albedo, 40)},
+    "negative albedo": {"albedo": lambda f: -f.albedo},
+    "huge albedo": {"albedo": lambda f: np.full_like(f.albedo, 1e30)},
+    "normals of length 0": {"normal": unit(0)},
+    "normals of length 2": {"normal": unit(2)},
+    "huge normals": {"normal": unit(1e30)},
+    "noise for normals": {
+        "normal": lambda f: np.random.default_rng(f.number).normal(size=f.normal.shape).astype(np.float32)
+    },
+    "noise for albedo": {"albedo": lambda f: np.random.default_rng(f.number).random(f.albedo.shape, np.float32)},
+    "no guides": {"albedo": lambda f: None, "normal": lambda f: None},
+    "no depth": {"depth": lambda f: np.zeros_like(f.depth)},
+    "negative depth": {"depth": lambda f: -f.depth},
+}
+
+
+@pytest.mark.parametrize("changes", GUIDES.values(), ids=GUIDES)
+@pytest.mark.parametrize("preset", ["draft", "balanced"])
+def test_guides_that_tell_nothing_do_no_harm(changes, preset):
+    frames = [spoil(f, **{name: change(f) for name, change in changes.items()}) for f in shot()]
+    window, image = denoise(frames, preset)
+    assert np.isfinite(image).all()
+    assert (image >= 0).all()
+    assert within_range(window, image)
+
+
+@pytest.mark.neural
+def test_alpha_of_nought_stays_nought(network):
+    frames = [spoil(f, alpha=np.zeros(f.color.shape[:2], np.float32)) for f in shot()]
+    window = align(frames, effects=EFFECTS | {"alpha"}, estimate=BALANCED)
+    done = network["float32"](window)
+    assert (done.aovs["alpha"] == 0).all()
+    assert np.isfinite(done.color).all()
+
+
+def test_the_picture_does_not_depend_on_when_it_is_made():
+    np.testing.assert_array_equal(denoise(shot())[1], denoise(shot())[1])

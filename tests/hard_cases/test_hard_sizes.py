@@ -1,0 +1,68 @@
+"""Frames of every size, from one pixel to more than OpenCV samples."""
+
+import numpy as np
+import pytest
+from hard import EFFECTS, Reel, align, constant, denoise, spoil
+
+from flow.tvl1 import dense_flow, refine_flow
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import BALANCED, PRESETS
+
+SIZES = [(1, 1), (1, 2), (2, 1), (1, 17), (17, 1), (2, 3), (3, 3), (5, 5), (7, 11), (13, 31), (31, 13), (16, 16)]
+
+
+def noisy(size, frames=5):
+    """Constant guides and 30 % of noise."""
+    rng = np.random.default_rng(size)
+    return [
+        spoil(f, color=f.color * rng.gamma(9, 1 / 9, (*size, 1)).astype(np.float32))
+        for f in constant(1.0, size, frames)
+    ]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
+def test_any_size_works(size, record_property):
+    frames = noisy(size)
+    for effects in (EFFECTS, EFFECTS | {"refine"}, EFFECTS - {"warp"}):
+        for preset in PRESETS:
+            window, image = denoise(frames, preset, effects=effects)
+            assert image.shape == (*size, 3)
+            assert np.isfinite(image).all()
+            light = image / window.modulation
+            assert window.color.min() * 0.9999 <= light.min()
+            assert light.max() <= window.color.max() * 1.0001
+    record_property("cases", 3 * len(PRESETS))
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
+def test_the_network_takes_any_size(size):
+    pytest.importorskip("torch")
+    from hybrid.neural import Denoiser, shipped_weights
+
+    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimate=BALANCED)).color
+    assert image.shape == (*size, 3)
+    assert np.isfinite(image).all()
+
+
+@pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
+def test_motion_is_looked_for_in_any_size(size):
+    rng = np.random.default_rng(0)
+    first, second = rng.random((2, *size), np.float32)
+    assert np.isfinite(dense_flow(first, second)).all()
+    assert np.isfinite(refine_flow(first, second, np.zeros((*size, 2), np.float32))).all()
+
+
+@pytest.mark.parametrize("size", [(3, 33_000), (33_000, 3)], ids=["wide", "tall"])
+def test_more_than_32767_pixels_on_a_side(size):
+    window, image = denoise(noisy(size, 3), number=1, effects=EFFECTS | {"refine"})
+    assert image.shape == (*size, 3)
+    assert np.isfinite(image).all()
+    assert (window.confidence[1:4, 1:-1, 1:-1] > 0).any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 5), (13, 31)], ids=["1x1", "1x9", "5x5", "13x31"])
+def test_a_plan_is_made_for_any_size(size):
+    reel = Reel(noisy(size, 3))
+    reel.numbers = (0, 1, 2)
+    assert plan_shot(reel).decisions
