@@ -30,6 +30,8 @@ from network.models import (
 FORMAT = "ravg-network"
 #: Raised when a change makes older weights give other kernels. Files say which one they were written for.
 VERSION = 1
+#: The greatest number in a description that is read: three times the width of any network here.
+LARGEST = 256
 
 
 #: Networks by name, with their configurations.
@@ -67,7 +69,7 @@ def build(description: Mapping[str, Any]) -> Model:
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         values["kernel"] = KernelConfig(**values["kernel"])
         return cast(Model, network(configuration(**values)))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"model description: {error!r}") from error
 
 
@@ -138,16 +140,32 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     metadata, tensors = _read(path)
     where = f"weights {os.fspath(path)!r}"
     try:
-        model = build(json.loads(metadata["description"]))
-    except (KeyError, ValueError) as error:
+        description = json.loads(metadata["description"])
+        _refuse_huge(description)
+        model = build(description)
+    except (KeyError, ValueError, RecursionError) as error:
         raise ValueError(f"{where}: {error}") from error
     wanted = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
     if wanted != found:
         name = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
         raise ValueError(f"{where}: {name}: expected shape {wanted.get(name)}, got {found.get(name)}")
+    for name, value in tensors.items():
+        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{where}: {name}: expected finite numbers, got {value.dtype} with others among them")
     model.load_state_dict({name: value.float() for name, value in tensors.items()})
     return model
+
+
+def _refuse_huge(value: Any) -> None:
+    """Raise ValueError for a description that would take all memory, or for ever, to build."""
+    if isinstance(value, Mapping | list):
+        if len(value) > LARGEST:
+            raise ValueError(f"model description: expected at most {LARGEST} values together, got {len(value)}")
+        for item in value.values() if isinstance(value, Mapping) else value:
+            _refuse_huge(item)
+    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
+        raise ValueError(f"model description: expected numbers up to {LARGEST}, got {value}")
 
 
 def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -155,7 +173,7 @@ def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
     metadata, _ = _read(path)
     try:
         notes: dict[str, Any] = json.loads(metadata["notes"])
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise ValueError(f"weights {os.fspath(path)!r}: {error!r}") from error
     return notes
 

@@ -1,0 +1,187 @@
+"""Files: damaged, enormous, of odd kinds, and with names that were chosen to do harm."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import Scene
+
+import hybrid
+from hybrid.cli import main
+from hybrid.exr import read_exr, write_exr, write_layers
+from hybrid.frames import open_shot, output_path
+
+ROOT = Path(__file__).parents[2]
+
+
+def run_alone(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a script of the project in a process of its own."""
+    # The packages under test, which need not be those beside the tests (`benchmarks/reliability.py --before`).
+    packages = str(Path(hybrid.__file__).parents[1])
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join([packages, *sys.path]), **environment}
+    return subprocess.run([sys.executable, *words], cwd=ROOT, env=variables, capture_output=True, text=True)
+
+
+def save(path: Path, channels: dict, **header) -> Path:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File([OpenEXR.Part(header, dict(channels), "")]).write(str(path))
+    return path
+
+
+def test_damaged_files_end_in_one_line(record_property):
+    """The short form of `benchmarks/fuzz_files.py`, which runs 2,000."""
+    done = run_alone("benchmarks/fuzz_files.py", "--cases", "100", "--seed", "7")
+    assert done.returncode == 0, done.stdout
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["failed"] == 0
+    assert sum(count.get("refused", 0) for count in result["counts"].values()) > 50
+    record_property("cases", result["cases"])
+
+
+def claim(path: Path, width: int, height: int) -> Path:
+    """A small file whose header claims to be this large."""
+    data = save(path, {c: np.zeros((4, 4), np.float16) for c in "RGB"}).read_bytes()
+    for window in (b"dataWindow", b"displayWindow"):
+        at = data.index(window + b"\0box2i\0") + len(window) + 7 + 4
+        box = np.array([0, 0, width - 1, height - 1], "<i4").tobytes()
+        data = data[:at] + box + data[at + 16 :]
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60_000, 60_000), (2**20, 2**20), (65_000, 4_200)])
+def test_enormous_claims_are_refused_before_memory_is_taken(tmp_path, capsys, size):
+    path = claim(tmp_path / "huge.exr", *size)
+    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith(f"error: {path}")
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_the_limit_is_an_option(tmp_path, capsys):
+    folder = Scene(frames=1).write(tmp_path / "in")
+    pixels = Scene.height * Scene.width
+    for command in (
+        ["inspect", str(folder)],
+        ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"],
+    ):
+        assert main([*command, "--max-pixels", str(pixels - 1)]) == 1
+        assert f"56x40 pixels, more than the {pixels - 1} accepted" in capsys.readouterr().err
+        assert main([*command, "--max-pixels", str(pixels)]) == 0
+
+
+HOSTILE = {
+    "markup": "[red]Combined[/blue]",
+    "link": "[link=https://example.org]x",
+    "escape": "\x1b]0;owned\x07\x1b[2J",
+    "path": "../../../tmp/owned",
+    "absolute": "/tmp/owned",
+    "home": "~root/owned",
+    "variable": "$HOME`id`$(id)",
+    "template": "{0.__class__}%s%n",
+    "long": "x" * 250,
+    "newline": "a\nerror: b",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE.values(), ids=HOSTILE)
+def test_names_from_files_are_only_shown(tmp_path, capsys, name):
+    """A channel called [/blue] ended `ravg inspect` with a traceback, and escape sequences reached the terminal."""
+    rng = np.random.default_rng(0)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    layers = {"color": rng.random((12, 16, 3)).astype(np.float32), name: np.ones((12, 16, 3), np.float32)}
+    path = folder / "shot.0001.exr"
+    write_layers(path, layers, attributes={"owner": name, "comments": name})
+    before = sorted(tmp_path.rglob("*"))
+    for words in (["--layer", f"albedo={name}"], ["--layer", "albedo=none such"]):
+        code = main(["inspect", str(path), *words])
+        out, err = capsys.readouterr()
+        assert code == (0 if words[1].endswith(name) else 1)
+        assert "Traceback" not in err
+        assert all(c.isprintable() or c == "\n" for c in out + err)
+    assert sorted(tmp_path.rglob("*")) == before
+    out = tmp_path / "out" / "done.exr"
+    assert main(["pseudoref", str(path), "-o", str(out), "--preset", "draft"]) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["done.exr", "ravg.json"]
+    assert sorted(p for p in tmp_path.rglob("*") if tmp_path / "out" not in [p, *p.parents]) == before
+    kept = read_exr(out)
+    assert kept.parts[0].header["comments"] == name
+    np.testing.assert_array_equal(kept.channel(f"{name}.R"), 1)
+
+
+def test_parts_may_be_called_anything(tmp_path):
+    parts = []
+    for name in ("../../up", "/abs", "[red]"):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        parts.append(OpenEXR.Part(header, {c: np.ones((4, 6), np.float16) for c in "RGB"}, name))
+    folder = tmp_path / "in"
+    folder.mkdir()
+    OpenEXR.File(parts).write(str(folder / "a.exr"))
+    assert main(["inspect", str(folder / "a.exr")]) == 0
+    shot = open_shot(folder / "a.exr")
+    assert output_path(tmp_path / "out", shot, 1) == tmp_path / "out" / "a.exr"
+    write_exr(tmp_path / "b.exr", read_exr(folder / "a.exr"), {})
+    assert (tmp_path / "b.exr").read_bytes() == (folder / "a.exr").read_bytes()
+
+
+def test_the_output_is_never_an_input_by_another_name(tmp_path, capsys):
+    folder = Scene(frames=1).write(tmp_path / "in")
+    source = folder / "shot.1001.exr"
+    before = source.read_bytes()
+    (tmp_path / "link").symlink_to(folder)
+    os.link(source, tmp_path / "hard.exr")
+    (tmp_path / "soft.exr").symlink_to(source)
+    targets = [folder, tmp_path / "link", folder / ".." / "in", tmp_path / "hard.exr", tmp_path / "soft.exr"]
+    for target in targets:
+        assert main(["pseudoref", str(source), "-o", str(target), "--preset", "draft"]) == 1
+        assert "would overwrite an input" in capsys.readouterr().err
+    out = ["-o", str(tmp_path / "out"), "--preset", "draft"]
+    assert main(["pseudoref", str(source), *out, "--preview", str(source)]) == 1
+    assert "preview" in capsys.readouterr().err
+    assert source.read_bytes() == before
+
+
+WINDOWS = {  # data and display window: first column and row, last column and row
+    "overscan": ((-4, -2, 19, 13), (0, 0, 15, 11)),
+    "crop": ((3, 2, 9, 8), (0, 0, 15, 11)),
+    "no overlap": ((100, 100, 115, 111), (0, 0, 15, 11)),
+    "one pixel": ((5, 5, 5, 5), (0, 0, 15, 11)),
+    "negative": ((-20, -20, -5, -9), (-30, -30, 15, 11)),
+}
+
+
+@pytest.mark.parametrize("windows", WINDOWS.values(), ids=WINDOWS)
+def test_every_relation_of_the_windows_is_kept(tmp_path, windows):
+    data, display = ((np.array(box[:2], np.int32), np.array(box[2:], np.int32)) for box in windows)
+    width, height = data[1] - data[0] + 1
+    rng = np.random.default_rng(0)
+    channels = {c: rng.random((height, width)).astype(np.float16) for c in "RGBA"}
+    path = save(tmp_path / "a.exr", channels, dataWindow=data, displayWindow=display)
+    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
+    kept = read_exr(tmp_path / "out" / "a.exr")
+    for name in ("data_window", "display_window"):
+        assert getattr(kept.parts[0], name) == getattr(read_exr(path).parts[0], name)
+    np.testing.assert_array_equal(kept.channel("A"), channels["A"])
+
+
+def test_tiled_files_stay_tiled(tmp_path):
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 8
+    rng = np.random.default_rng(0)
+    path = save(
+        tmp_path / "a.exr",
+        {c: rng.random((20, 28)).astype(np.float16) for c in "RGB"},
+        type=OpenEXR.tiledimage,
+        tiles=tiles,
+    )
+    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
+    header = read_exr(tmp_path / "out" / "a.exr", pixels=False).parts[0].header
+    assert header["type"] == OpenEXR.tiledimage
+    assert header["tiles"].xSize == 8

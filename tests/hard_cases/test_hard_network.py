@@ -1,0 +1,150 @@
+"""Kernels, losses, metrics and the network at their limits: finite, normalised, local."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+torch = pytest.importorskip("torch")
+
+from hybrid import metrics  # noqa: E402
+from network import losses  # noqa: E402
+from network.blocks import ravg  # noqa: E402
+from network.inputs import network_inputs, window_exposure  # noqa: E402
+from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
+from network.models import denoise_tile, fast, for_inference  # noqa: E402
+
+pytestmark = pytest.mark.neural
+EXAMPLES = 40
+anything = settings(max_examples=EXAMPLES, deadline=None)
+
+RAW = {
+    "all below": -1.0,
+    "all nought": 0.0,
+    "denormal": 1e-42,
+    "at the threshold": 0.5 / 125,
+    "equal": 1.0,
+    "half's limit": 6.5e4,
+    "where exp overflows": 89.0,
+    "1e30": 1e30,
+    "-1e30": -1e30,
+}
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+@pytest.mark.parametrize("level", RAW.values(), ids=RAW)
+@pytest.mark.parametrize("activation", [predict_kernel, threshold_kernel])
+def test_kernels_are_convex_whatever_they_are_made_of(activation, level, spread):
+    torch.manual_seed(0)
+    weights = torch.full((1, 125, 3, 4), level) * (1 + spread * torch.rand(1, 125, 3, 4))
+    weights.requires_grad_()
+    kernel = activation(weights, centre=62)
+    assert bool(torch.isfinite(kernel).all())
+    assert float(kernel.detach().min()) >= 0
+    # 125 roundings
+    torch.testing.assert_close(kernel.sum(1), torch.ones(1, 3, 4), rtol=0, atol=2e-5)
+    numerators, denominators = apply_kernels(kernel, torch.rand(1, 5, 3, 3, 4) * 1e6)
+    image = mean_of(numerators, denominators, torch.zeros(1, 3, 3, 4))
+    image.sum().backward()
+    assert bool(torch.isfinite(image).all())
+    assert bool(torch.isfinite(weights.grad).all())
+
+
+@anything
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.sampled_from([1e-42, 1.0, 1e6, 1e30]))
+def test_the_robust_average_is_in_range_in_any_precision(seed, frames, scale):
+    generator = torch.Generator().manual_seed(seed)
+    window = torch.randn(frames, 4, 4, generator=generator) * scale
+    for dtype in (torch.float32, torch.bfloat16):
+        x = window.to(dtype)
+        average = ravg(x.unbind(0))
+        assert bool((average >= x.min(0).values).all())
+        assert bool((average <= x.max(0).values).all())
+
+
+LOSSES = {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse}
+PICTURES = {
+    "nought": (0.0, 0.0),
+    "equal": (1.0, 1.0),
+    "firefly in the target": (1.0, 1e6),
+    "firefly in the prediction": (1e6, 1.0),
+    "negative": (-1.0, 1.0),
+    "denormal": (1e-42, 0.0),
+    "1e18": (1e18, 1.0),
+}
+
+
+@pytest.mark.parametrize("pair", PICTURES.values(), ids=PICTURES)
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_losses_and_their_gradients_are_finite(loss, pair):
+    prediction = torch.full((2, 3, 8, 8), pair[0], requires_grad=True)
+    target = torch.full((2, 3, 8, 8), pair[1])
+    target[:, :, 0, 0] = pair[0]
+    value = loss(prediction, target, torch.tensor([1.0, 1e-3]))
+    value.sum().backward()
+    assert bool(torch.isfinite(value).all())
+    assert bool(torch.isfinite(prediction.grad).all())
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-42, 1e-6, 1.0, 1e6])
+def test_the_gradient_of_the_whole_network_is_finite(level):
+    torch.manual_seed(1)
+    model = fast()
+    color = torch.rand(1, 5, 3, 16, 16) * level
+    color[0, 2, :, 5, 5] = 1e6
+    confidence = torch.randint(0, 2, (1, 5, 1, 16, 16)).float()
+    exposure = window_exposure(color)
+    features = network_inputs(color, None, None, confidence, exposure, takes_estimate=True)
+    kernels = model(features, confidence, torch.zeros(1))
+    numerators, share = apply_kernels(kernels[:, :125], color)
+    image = mean_of(numerators, share, color[:, 2])
+    losses.relmse(image, color[:, 2], exposure).sum().backward()
+    assert bool(torch.isfinite(image).all())
+    assert all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in model.parameters())
+
+
+@pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
+def test_a_pixel_changes_nothing_beyond_the_networks_reach(bfloat16):
+    """The support of the U-Net: 90 pixels in theory; see docs/reliability.md for where the effect ends."""
+    torch.manual_seed(0)
+    model = for_inference(fast(), bfloat16)
+    color = torch.rand(1, 5, 3, 8, 256)
+    confidence = torch.ones(1, 5, 1, 8, 256)
+    exposure = window_exposure(color)
+    plain = denoise_tile(model, color, None, None, confidence, exposure)[0]
+    color[0, 1, :, 4, 20] = 1e4
+    changed = denoise_tile(model, color, None, None, confidence, exposure)[0]
+    differs = (plain != changed).any(1)[0].any(0).nonzero().flatten()
+    assert int(differs.max()) <= 20 + 92
+    assert bool((plain != changed).any())
+
+
+IMAGES = {
+    "nought": np.zeros((16, 16, 3), np.float32),
+    "constant": np.full((16, 16, 3), 0.5, np.float32),
+    "firefly": np.where(np.arange(256).reshape(16, 16, 1) == 7, np.float32(1e6), np.float32(0.5)).repeat(3, -1),
+    "denormal": np.full((16, 16, 3), 1e-42, np.float32),
+    "negative": np.full((16, 16, 3), -1, np.float32),
+}
+
+
+@pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES)
+def test_metrics_are_numbers(image):
+    reference = IMAGES["constant"]
+    assert metrics.psnr(image, reference) > 0
+    assert np.isfinite(metrics.ssim(image, reference))
+    assert metrics.relmse(image, reference) >= 0
+    assert 0 <= metrics.smape(image, reference) <= 1
+    assert metrics.psnr(reference, reference) == np.inf
+    black = np.zeros_like(reference)
+    assert np.isfinite(metrics.relmse(image, black))
+    assert np.isfinite(metrics.smape(image, black))
+
+
+def test_a_lost_pixel_makes_a_metric_nan_and_not_better():
+    image = IMAGES["constant"].copy()
+    image[3, 3, 0] = np.nan
+    for measure in (metrics.psnr, metrics.relmse, metrics.smape):
+        assert np.isnan(measure(image, IMAGES["constant"]))

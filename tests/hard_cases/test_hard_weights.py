@@ -1,0 +1,153 @@
+"""Weights files that are damaged, foreign or hostile: one line that says what, and nothing is run."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from contextlib import suppress
+
+import pytest
+from conftest import Scene
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import save_file  # noqa: E402
+
+from hybrid.cli import main  # noqa: E402
+from hybrid.neural import shipped_weights  # noqa: E402
+from network.checkpoint import describe, load_model, save_model  # noqa: E402
+from network.models import fast, paper  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "good.safetensors"
+    save_model(path, fast())
+    return path.read_bytes()
+
+
+def write(path, model=None, **metadata):
+    """A file with the tensors of a model and any metadata; None leaves an entry out."""
+    model = model or fast()
+    entries = {"format": "ravg-network", "version": "1", "description": json.dumps(describe(model)), "notes": "{}"}
+    entries = {name: value for name, value in (entries | metadata).items() if value is not None}
+    save_file({name: value.half().contiguous() for name, value in model.state_dict().items()}, path, entries)
+    return path
+
+
+def test_cut_anywhere_it_is_refused(tmp_path, good, record_property):
+    path = tmp_path / "cut.safetensors"
+    lengths = [0, 1, 7, 8, 9, 100, len(good) // 2, len(good) - 1]
+    for length in lengths:
+        path.write_bytes(good[:length])
+        with pytest.raises(ValueError, match="cut short"):
+            load_model(path)
+    record_property("cases", len(lengths))
+
+
+def test_a_flipped_bit_is_refused_or_gives_a_finite_model(tmp_path, good, record_property):
+    path = tmp_path / "flipped.safetensors"
+    positions = range(0, 4000, 40)  # the header
+    for position in positions:
+        data = bytearray(good)
+        data[position] ^= 1 << position % 8
+        path.write_bytes(data)
+        with suppress(ValueError):  # and nothing else
+            assert all(bool(torch.isfinite(p).all()) for p in load_model(path).parameters())
+    record_property("cases", len(positions))
+
+
+class Bomb:
+    """Unpickled, it would leave a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (str(self.path), "w"))
+
+
+def test_pickles_are_not_opened(tmp_path):
+    trace = tmp_path / "trace"
+    plain = tmp_path / "model.pkl"
+    plain.write_bytes(pickle.dumps(Bomb(trace)))
+    archive = tmp_path / "model.pt"
+    torch.save({"weights": Bomb(trace)}, archive)
+    renamed = tmp_path / "model.safetensors"
+    renamed.write_bytes(archive.read_bytes())
+    for path in (plain, archive, renamed):
+        with pytest.raises(ValueError, match="no safetensors file"):
+            load_model(path)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    ("metadata", "word"),
+    [
+        ({"format": None}, "format"),
+        ({"format": "somebody-elses"}, "format"),
+        ({"version": "2"}, "version 1, got 2"),
+        ({"version": "one"}, "version"),
+        ({"description": None}, "description"),
+        ({"description": "not json"}, "Expecting value"),
+        ({"description": "[]"}, "description"),
+        ({"description": "null"}, "description"),
+        ({"description": "[" * 100_000}, "recursion|Expecting|nest"),
+        ({"description": json.dumps({"model": "os.system", "config": {}})}, "description"),
+        ({"description": json.dumps(describe(paper()))}, "expected shape"),
+    ],
+    ids=str,
+)
+def test_wrong_metadata_is_named(tmp_path, metadata, word):
+    with pytest.raises(ValueError, match=word):
+        load_model(write(tmp_path / "x.safetensors", **metadata))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"widths": [2**40]},
+        {"widths": [16] * 100_000},
+        {"widths": [-16, 32]},
+        {"widths": []},
+        {"widths": "wide"},
+        {"ra_scales": [7]},
+        {"nonsense": 1},
+        {"kernel": {"frames": 10**9 + 1}},
+        {"kernel": {"size": 10**9 + 1}},
+        {"kernel": {"size": float("nan")}},
+        {"kernel": {"frames": 5.0}},
+        {"kernel": None},
+    ],
+    ids=lambda changes: str(changes)[:40],
+)
+def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
+    """A width of 2^40 asked for a terabyte before its shape was compared with the file's."""
+    described = describe(fast())
+    kernel = changes.get("kernel", {})
+    described["config"] |= {name: value for name, value in changes.items() if name != "kernel"}
+    described["config"]["kernel"] = described["config"]["kernel"] | kernel if kernel is not None else None
+    with pytest.raises(ValueError, match="weights"):
+        load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+    """They made every picture NaN."""
+    model = fast()
+    with torch.no_grad():
+        model.stem.weight[0, 0, 0, 0] = value
+    with pytest.raises(ValueError, match="finite"):
+        load_model(write(tmp_path / "x.safetensors", model))
+
+
+def test_the_command_says_it_in_one_line_and_writes_nothing(tmp_path, capsys):
+    folder = Scene(frames=1).write(tmp_path / "in")
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(shipped_weights("fast").read_bytes()[:1000])
+    assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--weights", str(bad)]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("error: weights")
+    assert not (tmp_path / "out").exists()
