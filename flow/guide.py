@@ -12,7 +12,8 @@ def _luminance(image: np.ndarray) -> np.ndarray:
     """Luminance of (H, W, 3), not negative; NaN is 0."""
     with np.errstate(invalid="ignore", over="ignore"):
         luminance = np.asarray(image, np.float32) @ _REC709
-    return np.maximum(np.nan_to_num(luminance, nan=0.0, posinf=float(np.finfo(np.float32).max)), 0)
+    # No more than 1e30: the median of two of the largest floats is infinite, and so is an exposure made of it.
+    return np.clip(np.nan_to_num(luminance, nan=0.0, posinf=1e30), 0, np.float32(1e30))
 
 
 def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:

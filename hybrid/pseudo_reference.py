@@ -648,14 +648,16 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
         with timings.stage("average"):
             irradiance = robust_average(aligned.color, aligned.confidence)
     else:
+        # A frame of a few pixels is searched as a whole.
+        most = max(aligned.variance.shape[:2])
         with timings.stage("nlm"):
             irradiance = joint_nlm(
                 aligned.color,
                 aligned.variance,
                 aligned.guide,
                 confidence=aligned.confidence,
-                radius=preset.nlm_radius,
-                patch_radius=preset.nlm_patch_radius,
+                radius=min(preset.nlm_radius, most),
+                patch_radius=min(preset.nlm_patch_radius, most),
             )
     guides = [] if aligned.guide is None else [aligned.guide]
     if preset.nlm_radius:

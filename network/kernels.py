@@ -374,7 +374,8 @@ class _Threshold(torch.autograd.Function):
         cut = threshold * buffer.sum(1, keepdim=True) if relative else threshold
         kernel = torch.sub(weights, cut, out=buffer).relu_()
         total = kernel.sum(1, keepdim=True)
-        nothing = total == 0
+        # Also a denormal, whose reciprocal is infinite.
+        nothing = total < 1e-30
         kernel.div_(total.masked_fill_(nothing, torch.inf))
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(weights, kernel, total)

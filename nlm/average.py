@@ -11,6 +11,11 @@ Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
+# How far beyond the limit two or four pixels together are no highlight either. The non-local means would smear them:
+# a 2×2 cluster of 1e6 left 1000 times the light three pixels away.
+_SPARK = np.float32(100)
+
+
 def average(window: Floats, weight: Floats) -> Floats:
     """Average the frames of an aligned window by their weight.
 
@@ -106,7 +111,8 @@ def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) 
     A value is an outlier where it exceeds m + `threshold` · (u − m) and eight times the mean of the others.
     A light that is there in every frame, even one pixel wide, is among the n largest and stays; a firefly is
     in one frame, and warping spreads it over no more than four pixels. In the centre, which is not warped, it is
-    a single pixel: one with two such neighbours is an object, a moving highlight say, and stays too. The spread
+    a single pixel: one with two such neighbours is an object, a moving highlight say, and stays too, unless it is no
+    larger than 2×2 pixels and a hundred times as bright as that. The spread
     (u − m) widens with the skew of the noise, which a median absolute deviation does not; it is further divided by
     the share of values above 0. On black, u = 0, nothing is rejected: there a spark may be all the light there is.
 
@@ -281,12 +287,13 @@ def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
                             values[n] = level[t, ny, nx]
                             n += 1
             ordered = np.sort(values[:n])
-            median, upper = ordered[n // 2], ordered[max(n - max(frames, 2), 0)]
+            # the lower median: of two values the greater one would be its own yardstick
+            median, upper = ordered[(n - 1) // 2], ordered[max(n - max(frames, 2), 0)]
             lit = 0
             for i in range(n):
                 lit += ordered[i] > 0
             # where few pixels have found the light, each of them is far above the others
-            limit = median + threshold * (upper - median) * np.float32(n) / np.float32(max(lit, 1))
+            limit = median + threshold * max(upper - median, np.float32(0)) * np.float32(n) / np.float32(max(lit, 1))
             if not (highest > limit and upper > 0):
                 continue
             mean[:] = 0
@@ -304,7 +311,8 @@ def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
                     for ny in range(top, bottom):
                         for nx in range(left, right):
                             bright += level[t, ny, nx] > limit
-                    if t == T // 2 and bright > 2:
+                    spark = bright <= 4 and level[t, y, x] > _SPARK * max(limit, floor)
+                    if t == T // 2 and bright > 2 and not spark:
                         continue
                     mask[t, y, x] = True
                     for c in range(C):

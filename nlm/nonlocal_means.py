@@ -172,9 +172,10 @@ def _reject_far(d, pu, pa, qu, qa, limit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
-def _accumulate(total, w, values):  # type: ignore[no-untyped-def]
+def _accumulate(total, w, values, centre):  # type: ignore[no-untyped-def]
+    # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
     for x in range(w.size):
-        total[x] += w[x] * values[x]
+        total[x] += w[x] * (values[x] - centre[x])
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -321,12 +322,13 @@ def _filter(window, variance, features, feature_variance, confidence, frames, ra
                         for x in range(tw):
                             weight[oy, x] += wrow[x]
                         for c in range(C):
-                            _accumulate(total[c, oy], wrow, qu[c, qy, qx : qx + tw])
+                            middle = pu[c, oy + margin, margin : margin + tw]
+                            _accumulate(total[c, oy], wrow, qu[c, qy, qx : qx + tw], middle)
         for y in range(th):
             for x in range(tw):
                 for c in range(C):
                     if weight[y, x] > 0:
-                        out[y0 + y, x0 + x, c] = total[c, y, x] / weight[y, x]
+                        out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin] + total[c, y, x] / weight[y, x]
                     else:
                         out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin]
     return out

@@ -131,6 +131,8 @@ def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
     A pixel is cut at 16 times the 5×5 median of the 3×3 means. These keep the level of noise where most
     pixels happen to be 0, and an isolated outlier touches fewer than half of them.
     """
+    # Squares of more than 1e18 overflow, and an infinity would spoil the filters' running sums.
+    variance = np.minimum(variance, np.float32(1e36))
     means = np.asarray(cv2.blur(variance, (3, 3)), np.float32).reshape(variance.shape)
     # plane by plane: medianBlur takes at most four channels
     median = np.stack([cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])], -1)

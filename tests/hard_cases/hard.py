@@ -15,9 +15,9 @@ from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate
 EFFECTS = frozenset({"demodulate", "outliers", "warp", "gate", "prefilter"})
 SCENE = Scene(frames=5)
 MIDDLE = 2
-# Pixels around one whose value depends on it: search of the non-local means (3 in "balanced"), and the guided filter's
-# box of boxes (2).
-REACH = 5
+# Pixels around one whose value depends on it: search of the non-local means (5 in "final"), and the guided filter's box
+# of boxes (2).
+REACH = 7
 # Pixels around one for which anything depends on it, weights too: outliers 1, gate 7, variance 6, patch 2, the above.
 SUPPORT = 1 + 7 + 6 + 2 + REACH
 
@@ -94,6 +94,11 @@ def denoise(
     """The aligned window, and the picture made of it."""
     window = align(frames, number, effects)
     return window, estimate(window, PRESETS[preset])
+
+
+def itself(one: Frame) -> np.ndarray:
+    """An estimate of a frame that costs nothing: the frame as it is, whatever is in it."""
+    return one.color
 
 
 def truth(scene: Scene = SCENE, index: int = MIDDLE) -> np.ndarray:

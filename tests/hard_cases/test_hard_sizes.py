@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from hard import EFFECTS, Reel, align, constant, denoise, spoil
+from hard import EFFECTS, Reel, align, constant, denoise, itself, spoil
 
 from flow.tvl1 import dense_flow, refine_flow
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import BALANCED, PRESETS
+from hybrid.pseudo_reference import PRESETS
 
 SIZES = [(1, 1), (1, 2), (2, 1), (1, 17), (17, 1), (2, 3), (3, 3), (5, 5), (7, 11), (13, 31), (31, 13), (16, 16)]
 
@@ -40,7 +40,7 @@ def test_the_network_takes_any_size(size):
     pytest.importorskip("torch")
     from hybrid.neural import Denoiser, shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimate=BALANCED)).color
+    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimate=itself)).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
 

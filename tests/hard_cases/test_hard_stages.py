@@ -68,7 +68,7 @@ def weights(rng, shape):
 
 def between(image, low, high, slack=1e-5):
     """Whether all of `image` lies between two bounds, rounding aside."""
-    room = slack * np.maximum(np.abs(low), np.abs(high))
+    room = slack * np.maximum(np.abs(low), np.abs(high)) + 1e-37  # denormals have next to no digits
     return bool(np.isfinite(image).all() and (image >= low - room).all() and (image <= high + room).all())
 
 
