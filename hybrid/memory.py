@@ -16,6 +16,8 @@ from hybrid.pseudo_reference import MARGIN, Estimate, Preset
 STRIP = 64
 # What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
 BASE, BASE_NEURAL = 230 * 2**20, 560 * 2**20
+# What OIDN takes for itself, if the estimates are its own.
+OIDN = 1400 * 2**20
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
 SHARE = 0.92
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -71,7 +73,7 @@ def plan_rows(limit: int, shot: Shot, plan: Plan, estimate: Estimate, *, radius:
     height, width = shot.shape
     kept, passing, worked = _planes(shot, plan, estimate, radius, neural)
     plane = 4 * height * width
-    base = BASE_NEURAL if neural else BASE
+    base = (BASE_NEURAL if neural else BASE) + (OIDN if callable(estimate) else 0)
 
     def needed(rows: int) -> int:
         return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))

@@ -12,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Quality = Literal["high", "balanced", "fast"]
+# About what OIDN may take for itself; above about 1000×1000 pixels it works in tiles, which overlap. Always the same,
+# or its pictures would depend on the memory that somebody happens to allow.
+MEMORY_MB = 1024
 
 
 def denoise_oidn(
@@ -84,6 +87,7 @@ def _execute(images: dict[str, NDArray[np.float32]], quality: str, threads: int,
         for flag, value in flags.items():
             rt.set_bool(flag, value)
         rt.set_quality(qualities[quality])
+        rt.set_int("maxMemoryMB", MEMORY_MB)
         rt.commit()
         rt.execute()
         _check(device)

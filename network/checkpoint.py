@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,6 +26,8 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
+
+Config = TypeVar("Config")
 
 FORMAT = "ravg-network"
 #: Raised when a change makes older weights give other kernels. Files say which one they were written for.
@@ -67,10 +69,18 @@ def build(description: Mapping[str, Any]) -> Model:
         network, configuration = CLASSES[name]
         values = dict(description["config"])
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        values["kernel"] = KernelConfig(**values["kernel"])
-        return cast(Model, network(configuration(**values)))
+        values["kernel"] = _configure(KernelConfig, values["kernel"])
+        return cast(Model, network(_configure(configuration, values)))
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"model description: {error!r}") from error
+
+
+def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
+    """A configuration of checked types: 5.0 frames pass every comparison, and fail when they are counted."""
+    for item in fields(kind):  # type: ignore[arg-type]
+        if type(item.default) is int and type(values.get(item.name, 0)) is not int:
+            raise TypeError(f"{item.name}: expected a whole number, got {values[item.name]!r}")
+    return kind(**values)
 
 
 def save_model(

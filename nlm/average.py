@@ -311,7 +311,7 @@ def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
                     for ny in range(top, bottom):
                         for nx in range(left, right):
                             bright += level[t, ny, nx] > limit
-                    spark = bright <= 4 and level[t, y, x] > _SPARK * max(limit, floor)
+                    spark = bright <= 4 and level[t, y, x] > _SPARK * limit
                     if t == T // 2 and bright > 2 and not spark:
                         continue
                     mask[t, y, x] = True
