@@ -631,6 +631,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         app(args=None if argv is None else list(argv), prog_name="ravg")
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        return 130
     except ModuleNotFoundError:
         raise  # a broken installation, not something optional that is missing
     except (ValueError, OSError, ImportError) as error:

@@ -77,6 +77,7 @@ def build(description: Mapping[str, Any]) -> Model:
 
 def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
     """A configuration of checked types: 5.0 frames pass every comparison, and fail when they are counted."""
+    values = dict(values)
     for item in fields(kind):  # type: ignore[arg-type]
         if type(item.default) is int and type(values.get(item.name, 0)) is not int:
             raise TypeError(f"{item.name}: expected a whole number, got {values[item.name]!r}")

@@ -79,7 +79,8 @@ def variance_from_window(window: Floats, confidence: Floats, *, radius: int = 2)
     if trust.min() >= 1:
         return temporal
     spatial = variance_from_residual(window[window.shape[0] // 2], radius=radius)
-    return spatial + trust[..., None] * (temporal - spatial)
+    # Not the sum where trust is 1: it would round otherwise in a part of a frame than in the whole.
+    return np.where(trust[..., None] >= 1, temporal, spatial + trust[..., None] * (temporal - spatial))
 
 
 def variance_from_residual(image: Floats, *, radius: int = 2) -> Floats:
