@@ -108,7 +108,9 @@ def prepare_command(
         raise typer.BadParameter(f"--tile, --tiles: expected 0 or more and 1 or more, got {tile} and {tiles}")
     neural = _neural()
     samples = None if levels is None else parse_samples(levels)
-    roles = dict(item.split("=", 1) for item in layer or () if "=" in item)
+    if wrong := [item for item in layer or () if "=" not in item]:
+        raise typer.BadParameter(f"--layer is {wrong[0]!r}, expected ROLE=LAYER")
+    roles = dict(item.split("=", 1) for item in layer or ())
     found = [open_levels(spec, samples, frames=frames, layers=roles) for spec in shots]
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
