@@ -44,9 +44,9 @@ from network.models import (
 from network.train import TrainConfig, predict, train
 
 
-def networks(frames: int, width: int, blocks: int) -> dict[str, Callable[[], Model]]:
+def networks(frames: int, width: int, blocks: int, activation: str) -> dict[str, Callable[[], Model]]:
     """What is compared: RA and tKPCN have the same residual blocks, and RA blocks or the temporal module."""
-    kernel = KernelConfig(frames=frames)
+    kernel = KernelConfig(frames=frames, activation=activation)
     after = tuple(sorted({max(1, round(blocks * k / 24)) for k in (3, 6, 9, 12, 15, 24)}))  # the paper's places
     widths = (width, 2 * width, 4 * width)
     return {
@@ -123,13 +123,14 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--crop", type=int, default=128)
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--loss", default="relmse", choices=("relmse", "l1", "smape"))
+    parser.add_argument("--activation", default="relu", choices=("relu", "softmax"), help="relu is the paper's")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--only", choices=("paper", "unet"), help="one half of it")
     options = parser.parse_args(argv)
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     training, test = split_by_shot(open_clips(options.clips), options.test)
-    built = networks(training.frames, options.width, options.blocks)
+    built = networks(training.frames, options.width, options.blocks, options.activation)
     base = TrainConfig(
         steps=options.steps,
         batch=options.batch,
@@ -170,12 +171,12 @@ def main(argv: list[str]) -> int:
 def report(results: dict[str, dict[str, list[float]]], frames: int) -> None:
     """Print the tables."""
     print("\nTable 1: weights of the frames")
-    print(f"{'':36s}" + "".join(f"{k:9d}" for k in range(-(frames // 2), frames // 2 + 1)))
+    print(f"{'':38s}" + "".join(f"{k:9d}" for k in range(-(frames // 2), frames // 2 + 1)))
     for name, found in results.items():
         for kind in ("average", "maximum"):
             if kind in found:
                 label = name if kind == "average" else ""
-                print(f"{label:28s}{kind:8s}" + "".join(f"{value:9.4f}" for value in found[kind]))
+                print(f"{label:30s}{kind:8s}" + "".join(f"{value:9.4f}" for value in found[kind]))
     print("\nTable 2 and 3: PSNR, SSIM on x/(1+x); CPU seconds of training")
     print(f"{'':36s}{'min':>8s}{'mean':>8s}{'max':>8s}   {'min':>8s}{'mean':>8s}{'max':>8s}{'steps':>8s}{'CPU s':>8s}")
     for name, found in results.items():
