@@ -111,7 +111,7 @@ def predict(
         present=present,
     )
     with torch.autocast(features.device.type, torch.bfloat16, enabled=bfloat16):
-        kernels = (run or model)(features, batch["confidence"], present)
+        kernels = (model if run is None else run)(features, batch["confidence"], present)
     return Filtered.of(kernels, batch["color"], config.size, estimate, batch["confidence"])
 
 
