@@ -94,12 +94,16 @@ VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", 
 
 @dataclass(frozen=True)
 class Run:
-    """What a method has cost: its frames together, seconds without the reading of files, peak bytes."""
+    """What a method has cost: its frames together, seconds without the reading of files, peak bytes.
+
+    `work` is what the same small piece of work took between the frames, wall and CPU seconds.
+    """
 
     megapixels: float
     seconds: float
     cpu_seconds: float
     peak_bytes: int
+    work: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass
@@ -137,6 +141,7 @@ def run_method(method: Method, shot: Shot, name: str = "", folder: Path | None =
         _limit_threads(method.threads)
     next(method.run(shot), None)
     pixels, wall, cpu = 0, 0.0, 0.0
+    work = []
     with _clock_reading(shot) as reading:
         frames = method.run(shot)
         while True:
@@ -144,13 +149,25 @@ def run_method(method: Method, shot: Shot, name: str = "", folder: Path | None =
             done = next(frames, None)
             wall += time.perf_counter() - wall_start
             cpu += time.process_time() - cpu_start
+            work.append(_time_work())
             if done is None:
                 break
             number, image = done
             pixels += image.shape[0] * image.shape[1]
             if folder is not None:
                 _save(folder, name, number, image)
-    return Run(pixels / 1e6, wall - reading.seconds, cpu - reading.cpu_seconds, peak_memory())
+    mean = np.mean(work, axis=0)
+    seconds, cpu_seconds = wall - reading.seconds, cpu - reading.cpu_seconds
+    return Run(pixels / 1e6, seconds, cpu_seconds, peak_memory(), (float(mean[0]), float(mean[1])))
+
+
+def _time_work() -> tuple[float, float]:
+    """Wall and CPU seconds of a fixed piece of work in one thread, about 50 ms on a quiet core."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    values = np.linspace(0, 1, 3 * 512 * 512, dtype=np.float32)
+    for _ in range(32):
+        values = np.sqrt(values * values[::-1] + np.float32(0.25))
+    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def _limit_threads(count: int) -> None:
@@ -215,25 +232,16 @@ def spread_seconds(runs: Mapping[str, Sequence[Run]]) -> dict[str, tuple[float, 
 
     Notes
     -----
-    Runs of one round shared the machine's load. Where there are at least four methods it is estimated, as the median
-    over the methods of a round's time against the method's own median, and divided out: a busy machine
-    makes all methods slow, and says nothing about any of them.
+    Between the frames of every run the same small piece of work was timed. A run in which that took longer than its
+    median over all runs met a busier machine, and is divided by that factor: load makes all methods slow, and says
+    nothing about any of them.
     """
-    rounds = max(map(len, runs.values()), default=0)
-    complete = [name for name, series in runs.items() if len(series) == rounds]
-    load = np.ones((2, rounds))
-    if len(complete) >= 4 and rounds > 1:
-        table = np.array([[(run.seconds, run.cpu_seconds) for run in runs[name]] for name in complete])
-        middle = np.median(table, axis=1, keepdims=True)
-        load = np.median(table / np.where(middle > 0, middle, 1), axis=0).T
-        load /= np.median(load, axis=1, keepdims=True)
-        load = np.where(load > 0, load, 1)
+    usual = np.median([run.work for series in runs.values() for run in series], axis=0) if runs else np.ones(2)
     out = {}
     for name, series in runs.items():
-        wall, cpu = (
-            np.array([getattr(run, field) / run.megapixels for run in series]) / load[k, : len(series)]
-            for k, field in enumerate(("seconds", "cpu_seconds"))
-        )
+        table = np.array([(run.seconds, run.cpu_seconds) for run in series])
+        table *= usual / np.array([run.work for run in series]) / np.array([[run.megapixels] for run in series])
+        wall, cpu = table.T
         out[name] = float(np.median(wall)), float(wall.min()), float(wall.max()), float(np.median(cpu))
     return out
 
@@ -362,9 +370,9 @@ def compare_shot(
     facts |= {
         "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
         "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, in a "
-        "process of its own, after a first frame that is not counted, as reading files is not. Median; with several "
-        "rounds the load they met, as all methods felt it, is divided out. Peak memory as the operating system counted "
-        "it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
+        "process of its own, after a first frame that is not counted, as reading files is not. Median; the load "
+        "that a run met is divided out, by how long a fixed piece of work took between its frames. Peak memory as the "
+        "operating system counted it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
         "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {busy:.1f} at the start",
         "Versions": ", ".join(_versions()),
     }

@@ -403,19 +403,20 @@ def _table(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
         for r in members:
             cells = "".join(_cell(r, m, scales[m.key], *verdicts[m.key]) for m in metrics)
             settings = ", ".join(f"{k} {v}" for k, v in settings_as_text(r).items())
-            cpu = format_seconds(r.cpu_seconds_per_megapixel)
             spread = f"{format_seconds(r.spread[0])} – {format_seconds(r.spread[1])}" if r.spread else "&nbsp;"
             rows.append(
-                f'<tr><th scope="row">{escape(r.label)}<small>{escape(settings)}</small></th>{cells}'
+                f'<tr><th scope="row">{escape(r.label)}<small>{escape(settings)}</small></th>'
                 f"<td>{format_seconds(r.seconds_per_megapixel)}<small>{spread}</small></td>"
-                f"<td>{cpu}</td><td>{format_bytes(r.peak_bytes)}</td><td>{format_worth(r.worth)}</td></tr>"
+                f"<td>{format_seconds(r.cpu_seconds_per_megapixel)}</td><td>{format_bytes(r.peak_bytes)}</td>"
+                f"<td>{format_worth(r.worth)}</td>{cells}</tr>"
             )
-    return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="Results"><table><thead><tr>'
-        f'<th scope="col">Method</th>{heads}<th scope="col">Time<small>s / megapixel ↓</small></th>'
-        '<th scope="col">CPU<small>s / megapixel ↓</small></th>'
+    costs = (
+        '<th scope="col">Time<small>s / megapixel ↓</small></th><th scope="col">CPU<small>s / megapixel ↓</small></th>'
         '<th scope="col">Peak memory<small>&nbsp;↓</small></th><th scope="col">Worth<small>samples ↑</small></th>'
-        f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+    return (
+        '<div class="scroll" tabindex="0" role="region" aria-label="Results"><table><thead><tr>'
+        f'<th scope="col">Method</th>{costs}{heads}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     )
 
 
