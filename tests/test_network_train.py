@@ -132,6 +132,17 @@ def test_bfloat16_training_stays_near_float32(sets: tuple[Clips, Clips], tmp_pat
     assert half == pytest.approx(full, rel=0.02)  # 8 bits in the features, averaged over all pixels
 
 
+def test_a_compiled_network_trains_alike(
+    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Traced as for a GPU, but run by torch itself: compiling takes minutes and shows no more of our code."""
+    plain = train(sets[0], sets[0].of([]), make_model(), replace(CONFIG, steps=2), tmp_path / "a")
+    compiling = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda model: compiling(model, backend="eager"))
+    traced = train(sets[0], sets[0].of([]), make_model(), replace(CONFIG, steps=2, compile=True), tmp_path / "b")
+    assert traced == pytest.approx(plain, rel=1e-4)  # operations may be grouped otherwise
+
+
 SMALL = KernelConfig(frames=3, size=3)
 MODELS = {
     "resnet": lambda: RAResNet(RAResNetConfig(SMALL, width=4, blocks=2, ra_after=(1, 2), skips=1)),
