@@ -248,6 +248,7 @@ def denoise(
                     resume=resume,
                     max_memory=max_memory,
                     radius=denoiser.radius,
+                    neural=True,
                 )
             )
             if not last:
@@ -509,6 +510,7 @@ class _Job:
     resume: bool
     max_memory: str | None
     radius: int = 2
+    neural: bool = False
 
 
 def _run(job: _Job) -> None:
@@ -538,17 +540,21 @@ def _denoise(job: _Job, done: list[int]) -> None:
 
     from hybrid.memory import parse_size, plan_rows
     from hybrid.pipeline import denoise_shot, write_preview
+    from hybrid.plan import Plan
 
     shot, source, timings, preview = job.shot, job.source, job.timings, job.preview
     if preview is not None and shot.reads(preview):
         raise ValueError(f"preview {str(preview)!r} would overwrite an input frame")
     limit = None if job.max_memory is None else parse_size(job.max_memory)
-    plan = _plan(shot, *job.effects)
-    rows = (
-        None
-        if limit is None
-        else plan_rows(limit, shot, plan, source.estimate, radius=job.radius, neural=job.command.startswith("denoise"))
+    fit = (
+        partial(plan_rows, limit, shot, estimate=source.estimate, radius=job.radius, neural=job.neural)
+        if limit
+        else None
     )
+    if fit is not None:
+        fit(Plan(()))  # refuses what can never be enough before frames are read to make a plan
+    plan = _plan(shot, *job.effects)
+    rows = None if fit is None else fit(plan)
     console = Console(stderr=True)
     console.print("stages: " + ", ".join(d.effect for d in plan.decisions if d.on), highlight=False)
     for decision in plan.decisions:

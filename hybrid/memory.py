@@ -37,7 +37,9 @@ def parse_size(words: str) -> int:
     return int(float(match[1]) * _UNITS[match[2].upper()])
 
 
-def plan_rows(limit: int, shot: Shot, plan: Plan, estimate: Estimate, *, radius: int = 2, neural: bool) -> int | None:
+def plan_rows(
+    limit: int, shot: Shot, plan: Plan, estimate: Estimate = None, *, radius: int = 2, neural: bool
+) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
 
     Parameters
