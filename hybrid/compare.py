@@ -94,16 +94,12 @@ VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", 
 
 @dataclass(frozen=True)
 class Run:
-    """What a method has cost: its frames together, seconds without the reading of files, peak bytes.
-
-    `work` is what the same small piece of work took between the frames, wall and CPU seconds.
-    """
+    """What a method has cost: its frames together, seconds without the reading of files, peak bytes."""
 
     megapixels: float
     seconds: float
     cpu_seconds: float
     peak_bytes: int
-    work: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass
@@ -141,7 +137,6 @@ def run_method(method: Method, shot: Shot, name: str = "", folder: Path | None =
         _limit_threads(method.threads)
     next(method.run(shot), None)
     pixels, wall, cpu = 0, 0.0, 0.0
-    work = []
     with _clock_reading(shot) as reading:
         frames = method.run(shot)
         while True:
@@ -149,25 +144,13 @@ def run_method(method: Method, shot: Shot, name: str = "", folder: Path | None =
             done = next(frames, None)
             wall += time.perf_counter() - wall_start
             cpu += time.process_time() - cpu_start
-            work.append(_time_work())
             if done is None:
                 break
             number, image = done
             pixels += image.shape[0] * image.shape[1]
             if folder is not None:
                 _save(folder, name, number, image)
-    mean = np.mean(work, axis=0)
-    seconds, cpu_seconds = wall - reading.seconds, cpu - reading.cpu_seconds
-    return Run(pixels / 1e6, seconds, cpu_seconds, peak_memory(), (float(mean[0]), float(mean[1])))
-
-
-def _time_work() -> tuple[float, float]:
-    """Wall and CPU seconds of a fixed piece of work in one thread, about 50 ms on a quiet core."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    values = np.linspace(0, 1, 3 * 512 * 512, dtype=np.float32)
-    for _ in range(32):
-        values = np.sqrt(values * values[::-1] + np.float32(0.25))
-    return time.perf_counter() - wall, time.process_time() - cpu
+    return Run(pixels / 1e6, wall - reading.seconds, cpu - reading.cpu_seconds, peak_memory())
 
 
 def _limit_threads(count: int) -> None:
@@ -232,16 +215,14 @@ def spread_seconds(runs: Mapping[str, Sequence[Run]]) -> dict[str, tuple[float, 
 
     Notes
     -----
-    Between the frames of every run the same small piece of work was timed. A run in which that took longer than its
-    median over all runs met a busier machine, and is divided by that factor: load makes all methods slow, and says
-    nothing about any of them.
+    The median alone. Dividing out the load of a round (as all methods felt it), or of a run (by a fixed piece of work
+    between its frames), made ratios repeat no better on a machine with eight busy processes to a core: load changes
+    within seconds. More rounds do help; `benchmarks/bench_compare.py` shows how far the ratios can be trusted.
     """
-    usual = np.median([run.work for series in runs.values() for run in series], axis=0) if runs else np.ones(2)
     out = {}
     for name, series in runs.items():
-        table = np.array([(run.seconds, run.cpu_seconds) for run in series])
-        table *= usual / np.array([run.work for run in series]) / np.array([[run.megapixels] for run in series])
-        wall, cpu = table.T
+        wall = np.array([run.seconds / run.megapixels for run in series])
+        cpu = np.array([run.cpu_seconds / run.megapixels for run in series])
         out[name] = float(np.median(wall)), float(wall.min()), float(wall.max()), float(np.median(cpu))
     return out
 
@@ -370,9 +351,9 @@ def compare_shot(
     facts |= {
         "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
         "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, in a "
-        "process of its own, after a first frame that is not counted, as reading files is not. Median; the load "
-        "that a run met is divided out, by how long a fixed piece of work took between its frames. Peak memory as the "
-        "operating system counted it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
+        "process of its own, after a first frame that is not counted, as reading files is not. Median, and the "
+        "range of the runs. Peak memory as the operating system counted it. Threads that wait sleep "
+        "(OMP_WAIT_POLICY=PASSIVE).",
         "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {busy:.1f} at the start",
         "Versions": ", ".join(_versions()),
     }
