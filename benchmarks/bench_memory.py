@@ -1,6 +1,6 @@
 """Whether --max-memory is kept at 3840×2160, and that the result does not depend on it.
 
-    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--json OUT]
+    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12]
 
 The bundled shot is tiled to 3840×2160, and its third frame is denoised with each limit, and with none, in a process of
 its own. Peak memory is the operating system's count of that process. The exit code is 1 where a limit was broken, or
@@ -22,16 +22,15 @@ from hybrid.exr import read_exr, write_layers
 from hybrid.memory import parse_size
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
-REPEAT = 12
 FRAMES = 5
 
 
-def tile_shot(folder: Path) -> None:
-    """Write five frames of the bundled shot, each tiled 12 × 12."""
+def tile_shot(folder: Path, repeat: int) -> None:
+    """Write five frames of the bundled shot, each tiled, as float32: half would hide or magnify small differences."""
     for number, path in enumerate(sorted(SHOT.glob("noisy.*.exr"))[:FRAMES], start=1):
         image = read_exr(path)
-        layers = {layer.name: np.tile(image.pixels(layer.channels), (REPEAT, REPEAT, 1)) for layer in image.layers}
-        write_layers(folder / f"tiled.{number:04d}.exr", layers)
+        layers = {layer.name: np.tile(image.pixels(layer.channels), (repeat, repeat, 1)) for layer in image.layers}
+        write_layers(folder / f"tiled.{number:04d}.exr", layers, half=False)
 
 
 def run(command: str, folder: Path, out: Path, limit: str | None) -> dict[str, object]:
@@ -63,17 +62,25 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--commands", nargs="+", default=["pseudoref --preset draft", "denoise --estimate none"])
     parser.add_argument("--limits", nargs="+", default=["8G", "6G", "4G"])
+    parser.add_argument(
+        "--repeat", type=int, default=12, help="tiles along each side: 12 for 3840×2160, 6 for 1920×1080"
+    )
     parser.add_argument("--json", type=Path, help="write the result there too")
     options = parser.parse_args(argv)
     results, kept = [], True
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        tile_shot(folder)
+        tile_shot(folder, options.repeat)
         for command in options.commands:
             whole = None
             for limit in (None, *options.limits):
                 out = folder / "out"
-                result = {"command": command, "size": "3840x2160", "limit": limit, **run(command, folder, out, limit)}
+                result = {
+                    "command": command,
+                    "size": f"{320 * options.repeat}x{180 * options.repeat}",
+                    "limit": limit,
+                    **run(command, folder, out, limit),
+                }
                 if "peak_gib" in result:
                     image = read_exr(out / "tiled.0003.exr")
                     color = image.pixels(image.layer("ViewLayer.Combined").channels[:3])
