@@ -345,7 +345,7 @@ def compare(
             noisy,
             clean[0] if len(clean) == 1 else (clean[0], clean[1]),
             chosen,
-            title=name or Path(shot).resolve().parent.name,
+            title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
             exposure=exposure,
             rounds=rounds,
             samples=samples or samples_of(noisy),
