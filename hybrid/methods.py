@@ -213,7 +213,8 @@ def window_maps(aligned: AlignedWindow, estimator: Estimator) -> dict[str, Array
         estimate = estimate * (1 + part * np.minimum(aligned.confidence / DISTRUSTED, 1))[..., None]
     brighter = replace(aligned, color=aligned.color * (1 + part[..., None]), estimate=estimate)
     before, after = (estimator(window).mean(axis=-1) for window in (aligned, brighter))
-    share = np.divide(after - before, step * before, out=np.zeros_like(before), where=before > 0)
+    change = step * before  # which underflows where it is all but black
+    share = np.divide(after - before, change, out=np.zeros_like(before), where=change > 0)
     return {
         "Confidence": aligned.confidence[side].mean(axis=0),
         "Temporal contribution": np.clip(share, 0, 1).astype(np.float32),
