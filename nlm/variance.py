@@ -166,7 +166,8 @@ def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patc
     """
     guides, confidence = check_window(guides, confidence, "confidence")
     between = variance_from_window(guides, confidence)
-    variance = np.minimum(between, variance_from_residual(guides[guides.shape[0] // 2]))
+    # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
+    variance = np.maximum(np.minimum(between, variance_from_residual(guides[guides.shape[0] // 2])), np.float32(1e-8))
     return joint_nlm(guides, variance, confidence=confidence, radius=radius, patch_radius=patch_radius, k=1.0)
 
 
