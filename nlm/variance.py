@@ -138,7 +138,9 @@ def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
     # plane by plane: medianBlur takes at most four channels
     median = np.stack([cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])], -1)
     cut = np.minimum(variance, np.float32(_CAP) * median)
-    return cv2.blur(cut, (2 * radius + 1, 2 * radius + 1)).reshape(variance.shape)
+    # Running sums beside values of 1e24 round to below 0.
+    smooth = np.asarray(cv2.blur(cut, (2 * radius + 1, 2 * radius + 1)), np.float32)
+    return np.maximum(smooth, 0).reshape(variance.shape)
 
 
 def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patch_radius: int = 1) -> Floats:

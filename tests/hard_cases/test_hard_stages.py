@@ -225,8 +225,7 @@ def test_variances_are_finite_and_not_negative(drawn):
     ]
     for variance in found:
         assert np.isfinite(variance).all()
-        # Running sums of a box filter round to a little below 0 beside large values.
-        assert variance.min() >= -1e-6 * max(variance.max(), 1e-30)
+        assert variance.min() >= 0  # the running sums of a box filter rounded to -2e7 beside 1e24
 
 
 @anything
