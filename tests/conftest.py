@@ -1,6 +1,14 @@
 """Made-up shots whose truth is known."""
 
+# ruff: noqa: E402 - the libraries read their numbers of threads when they are imported
+
 from __future__ import annotations
+
+import os
+
+# The pictures are small: threads gain nothing, and on a busy machine they wait for each other, ten times as long.
+for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
