@@ -15,6 +15,7 @@ from network.blocks import ravg  # noqa: E402
 from network.inputs import network_inputs, window_exposure  # noqa: E402
 from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
 from network.models import denoise_tile, fast, for_inference  # noqa: E402
+from network.perceptual import VGG19, Perceptual  # noqa: E402
 
 pytestmark = pytest.mark.neural
 EXAMPLES = 40
@@ -83,6 +84,29 @@ def test_losses_and_their_gradients_are_finite(loss, pair):
     target = torch.full((2, 3, 8, 8), pair[1])
     target[:, :, 0, 0] = pair[0]
     value = loss(prediction, target, torch.tensor([1.0, 1e-3]))
+    value.sum().backward()
+    assert bool(torch.isfinite(value).all())
+    assert bool(torch.isfinite(prediction.grad).all())
+
+
+@pytest.fixture(scope="module")
+def perceptual():
+    """The loss of VGG19 with random weights, which keep the features' size."""
+    generator = torch.Generator().manual_seed(0)
+    vgg = VGG19()
+    with torch.no_grad():
+        for parameter in vgg.parameters():
+            fan = parameter[0].numel() if parameter.ndim == 4 else 100
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * (2 / fan) ** 0.5)
+    return Perceptual(vgg)
+
+
+@pytest.mark.parametrize("pair", PICTURES.values(), ids=PICTURES)
+def test_the_perceptual_loss_and_its_gradient_are_finite(perceptual, pair):
+    prediction = torch.full((1, 3, 32, 32), pair[0], requires_grad=True)
+    target = torch.full((1, 3, 32, 32), pair[1])
+    target[:, :, 0, 0] = pair[0]
+    value = perceptual(prediction, target, torch.tensor([1.0]))
     value.sum().backward()
     assert bool(torch.isfinite(value).all())
     assert bool(torch.isfinite(prediction.grad).all())

@@ -61,8 +61,33 @@ def test_more_than_32767_pixels_on_a_side(size):
     assert (window.confidence[1:4, 1:-1, 1:-1] > 0).any()
 
 
+@pytest.mark.neural
+def test_more_than_32767_pixels_through_the_network():
+    pytest.importorskip("torch")
+    from hybrid.neural import Denoiser, shipped_weights
+
+    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, estimate=itself)).color
+    assert image.shape == (3, 33_000, 3)
+    assert np.isfinite(image).all()
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 5), (13, 31)], ids=["1x1", "1x9", "5x5", "13x31"])
 def test_a_plan_is_made_for_any_size(size):
     reel = Reel(noisy(size, 3))
     reel.numbers = (0, 1, 2)
     assert plan_shot(reel).decisions
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("bfloat16", 1e-3)])
+def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
+    """Relative to the mean. In bfloat16 features have 8 bits, and rounding depends on where a tile begins."""
+    pytest.importorskip("torch")
+    from hybrid.neural import Denoiser, shipped_weights
+
+    window = align(noisy((150, 170)), estimate=itself)
+    whole, *tiled = (
+        Denoiser(shipped_weights("fast"), tile=tile, precision=precision)(window).color for tile in (256, 32, 64, 100)
+    )
+    for image in tiled:
+        np.testing.assert_allclose(image, whole, rtol=0, atol=tolerance * whole.mean())
