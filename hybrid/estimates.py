@@ -99,7 +99,7 @@ def _has_oidn() -> bool:
 
 
 def _oidn(mode: str, shot: Shot, kept: str | None) -> Callable[[Frame], Array]:
-    run = partial(_run_oidn, **OIDN_MODES[mode])
+    run = partial(estimate_oidn, **OIDN_MODES[mode])
     return run if kept is None else partial(_run_or_read, run=run, shot=shot, kept=kept)
 
 
@@ -107,9 +107,10 @@ def _from_file(frame: Frame) -> Array | None:
     return frame.estimate
 
 
-def _run_oidn(frame: Frame, **mode: Any) -> Array:
+def estimate_oidn(frame: Frame, **mode: Any) -> Array:
+    """Run OIDN on a frame with what guides it has, non-finite pixels replaced; `mode` as for `denoise_oidn`."""
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
-    albedo, normal = clean if clean[0] is not None else (None, None)
+    albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
     return denoise_oidn(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
 
 

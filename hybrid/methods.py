@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from skimage.restoration import denoise_nl_means
 
 from flow.tvl1 import refine_flow
-from hybrid.estimates import choose_estimate
+from hybrid.estimates import choose_estimate, estimate_oidn
 from hybrid.frames import Frame, Shot
-from hybrid.oidn import Quality, denoise_oidn
+from hybrid.oidn import Quality
 from hybrid.plan import Plan, plan_shot
 from hybrid.pseudo_reference import (
     DISTRUSTED,
@@ -227,7 +227,7 @@ def window_maps(aligned: AlignedWindow, estimator: Estimator) -> dict[str, Array
 def oidn(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
     """OIDN on each frame by itself."""
     for number in shot.numbers:
-        yield number, _oidn_of(shot.read(number), quality, prefilter)
+        yield number, estimate_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 
 
 def oidn_then_average(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
@@ -238,15 +238,8 @@ def oidn_then_average(shot: Shot, *, quality: Quality = "high", prefilter: bool 
         yield number, aligned_robust_average(aligner.align(number))
 
 
-def _oidn_of(frame: Frame, quality: Quality, prefilter: bool) -> Array:
-    given = (frame.albedo, frame.normal) if frame.albedo is not None else ()  # OIDN takes no normal alone
-    guides = [None if guide is None else _finite(guide) for guide in given]
-    return denoise_oidn(_finite(frame.color), *guides, quality=quality, prefilter=prefilter)
-
-
 def _denoised(frame: Frame, quality: Quality, prefilter: bool) -> Frame:
-    color = _oidn_of(frame, quality, prefilter)
-    return replace(frame, color=color, variance=None)
+    return replace(frame, color=estimate_oidn(frame, quality=quality, prefilter=prefilter), variance=None)
 
 
 def skimage_nlm(shot: Shot) -> Iterator[tuple[int, Array]]:
