@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from hybrid.simulate.command import (
     check_blender,
     missing,
     parse_frames,
+    parse_numbers,
     parse_size,
     shots_of,
     simulate,
@@ -91,8 +93,12 @@ def test_frames_and_sizes():
     assert parse_frames("3") == (1, 2, 3)
     assert parse_frames("8-10") == (8, 9, 10)
     assert parse_size("320x180", "size") == (320, 180)
+    assert parse_numbers("4") == (4,)
+    assert parse_numbers("1,4,7") == (1, 4, 7)
     with pytest.raises(ValueError, match="frames"):
         parse_frames("a-b")
+    with pytest.raises(ValueError, match="reference frames: got '1-4'"):
+        parse_numbers("1-4")
     with pytest.raises(ValueError, match="film: got '320'"):
         parse_size("320", "film")
 
@@ -105,17 +111,26 @@ def test_frames_and_sizes():
         ("levels", {"a": 0}),
         ("size", (4, 4)),
         ("film", (32, 36)),
+        ("reference_frames", (4,)),
         ("motion", "fast"),
         ("effects", "some"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(name, value):
-    with pytest.raises(ValueError, match=name.rstrip("s")):
+    with pytest.raises(ValueError, match=name.rstrip("s").replace("_", " ")):
         ShotSettings(**{**SHOT.to_json(), name: value})
 
 
 def test_settings_survive_json():
-    assert ShotSettings.from_json(json.loads(json.dumps(SHOT.to_json()))) == SHOT
+    shot = replace(SHOT, reference=16, reference_frames=(2,))
+    assert ShotSettings.from_json(json.loads(json.dumps(shot.to_json()))) == shot
+
+
+def test_only_the_frames_that_are_named_get_a_reference():
+    some = replace(SHOT, reference=16, reference_frames=(2,))
+    assert ["reference" in some.pictures(frame) for frame in some.frames] == [False, True, False]
+    assert all("reference" in replace(SHOT, reference=16).pictures(frame) for frame in SHOT.frames)
+    assert SHOT.pictures(1) == SHOT.levels, "no reference was asked for"
 
 
 def test_a_data_set_is_many_seeds_each_in_its_folder(tmp_path):

@@ -64,7 +64,8 @@ def scene(tmp_path_factory):
 def rendered(scene, tmp_path_factory):
     """Render the cube once with two equal levels, one lower, half buffers, and a reference."""
     out = tmp_path_factory.mktemp("shot")
-    shot = ShotSettings(str(scene), 1, (1, 2), SIZE, {"a": 8, "b": 8, "c": 4}, reference=32, halves=True)
+    levels = {"a": 8, "b": 8, "c": 4}
+    shot = ShotSettings(str(scene), 1, (1, 2), SIZE, levels, reference=32, reference_frames=(2,), halves=True)
     simulate([(shot, out)], threads=2)
     return out
 
@@ -80,8 +81,8 @@ def layer(channels, name, parts="RGB"):
 
 def test_every_frame_and_level_has_the_layers_that_a_user_s_own_render_has(rendered):
     names = sorted(path.name for path in rendered.glob("*.exr"))
-    levels = ("a", "b", "c", "reference", "reference_a", "reference_b")
-    assert names == sorted(f"{level}.{frame:04d}.exr" for level in levels for frame in (1, 2))
+    references = [f"{name}.0002.exr" for name in ("reference", "reference_a", "reference_b")]
+    assert names == sorted([f"{level}.{frame:04d}.exr" for level in "abc" for frame in (1, 2)] + references)
     channels = read(rendered / "a.0002.exr")
     for name in ("Combined.R", "Denoising Albedo.R", "Denoising Normal.X", "Depth.Z", "Vector.X", "Vector.W"):
         assert channels[f"ViewLayer.{name}"].shape == SIZE[::-1]

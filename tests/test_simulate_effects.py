@@ -78,6 +78,25 @@ def test_one_light_needs_no_tree_and_a_black_world_is_not_sampled():
     assert settings_of(effects_of(FULL))["cycles.use_light_tree"]
 
 
+def test_lamps_count_as_something_transparent_on_a_path():
+    """Cycles lets an indirect ray that meets a lamp go on as a transparent bounce: depth 0 would end it there."""
+    bare = replace(FULL, transparent=0)
+    assert settings_of(effects_of(replace(bare, lamps=1)))["cycles.transparent_max_bounces"] > 0
+    assert settings_of(effects_of(replace(bare, lamps=0)))["cycles.transparent_max_bounces"] == 0
+
+
+def test_light_too_rare_for_the_pilot_to_have_measured_is_kept():
+    """Missing 0.03 % of the mean is little, but all of it in one pixel says that it may as well be 0.09 %."""
+
+    def render(settings, seed):
+        picture = np.ones((32, 32, 3))
+        if min(settings["cycles.diffuse_bounces"], settings["cycles.max_bounces"]) >= 2:
+            picture[5, 5] += 0.0003 * 32 * 32
+        return picture.astype(np.float32)
+
+    assert depths(needed_bounces(render, EVERYTHING, 8, 8))["cycles.diffuse_bounces"] == 2
+
+
 def test_every_decision_says_its_figure_threshold_and_reason():
     for facts in (SceneFacts(), FULL):
         for decision in effects_of(facts):
@@ -129,7 +148,7 @@ def test_light_that_no_mean_shows_but_the_noise_would_is_kept():
 
     def render(settings, seed):
         picture = np.ones((32, 32, 3)) + np.random.default_rng(seed).normal(0, 0.01, (32, 32, 3))
-        if settings["cycles.glossy_bounces"] >= 3:
+        if min(settings["cycles.glossy_bounces"], settings["cycles.max_bounces"]) >= 3:
             picture[:16] += 0.01
             picture[16:] -= 0.01
         return picture.astype(np.float32)
@@ -163,7 +182,7 @@ def test_a_black_picture_needs_no_paths_and_divides_by_nothing():
 
 
 def test_a_pilot_stays_a_pilot():
-    """Bisection: four or five pictures a kind, not one per depth."""
+    """Bisection: at most four pictures a kind, not one per depth."""
     render = Renderer({kind: [0.9**d for d in range(32)] for kind in ("diffuse", "glossy", "transmission", "volume")})
     needed_bounces(render, EVERYTHING, 8, 8)
     assert render.calls <= 2 + 6 * 4 + 1

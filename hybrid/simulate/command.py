@@ -118,8 +118,7 @@ def simulate(
 
 def missing(shot: ShotSettings, out: Path, frame: int) -> int:
     """Return how many samples per pixel of a frame are still to be rendered."""
-    levels = {**shot.levels, **({"reference": shot.reference} if shot.reference else {})}
-    return sum(spp for name, spp in levels.items() if not (out / f"{name}.{frame:04d}.exr").exists())
+    return sum(spp for name, spp in shot.pictures(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
 
 
 def _read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
@@ -242,6 +241,13 @@ def parse_frames(text: str) -> tuple[int, ...]:
     return tuple(range(int(match[1]), int(match[2]) + 1))
 
 
+def parse_numbers(text: str) -> tuple[int, ...]:
+    """Read `1,4,7`, frames named one by one."""
+    if re.fullmatch(r"\d+(,\d+)*", text) is None:
+        raise ValueError(f"reference frames: got {text!r}, expected numbers with commas between")
+    return tuple(map(int, text.split(",")))
+
+
 def simulate_command(
     scene: Annotated[str, typer.Argument(help="A .blend file, or random.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the frames and meta.json.")],
@@ -252,6 +258,7 @@ def simulate_command(
     spp: Annotated[str, typer.Option(help="Samples per pixel, n; as LOW-HIGH drawn for each shot.")] = "16",
     levels: Annotated[str, typer.Option(help="Noise levels, such as n,n/e,4 or noisy=n.")] = "n,n/e,4",
     reference: Annotated[int, typer.Option(help="Samples per pixel of a reference; 0: none.")] = 0,
+    reference_frames: Annotated[str | None, typer.Option(help="Of these frames only, such as 1,4,7.")] = None,
     seed: Annotated[int, typer.Option(help="All that is random comes from it.")] = 1,
     shots: Annotated[int, typer.Option(help="How many shots, with seeds that count up.")] = 1,
     camera: Annotated[str | None, typer.Option(help="Which of the file's cameras, or random.")] = None,
@@ -280,6 +287,7 @@ def simulate_command(
         size=parse_size(size, "size"),
         levels={"noisy": 1},
         reference=reference,
+        reference_frames=parse_numbers(reference_frames) if reference_frames else None,
         film=parse_size(film, "film") if film else None,
         center=where,
         camera=camera,
@@ -310,7 +318,7 @@ def _run_with_progress(
     console = Console(stderr=True)
     # The bar counts samples, not frames: they tell the time that is left whatever the levels.
     total = sum(missing(shot, out, frame) for shot, out in shots for frame in shot.frames)
-    pictures = sum(len(shot.frames) * (len(shot.levels) + (shot.reference > 0)) for shot, _ in shots)
+    pictures = sum(len(shot.pictures(frame)) for shot, _ in shots for frame in shot.frames)
     if total == 0:
         console.print(f"all {pictures} pictures are there")
         return

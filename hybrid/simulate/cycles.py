@@ -25,7 +25,8 @@ from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, ne
 from hybrid.simulate.shot import ShotSettings, frame_seed
 
 PILOT_SAMPLES = 8
-PILOT_PIXELS = 1200  # of each of two frames: with 8 samples 19 thousand paths, a few tenths of a second
+PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
+PILOT_BOTH_ENDS = 30e6  # samples of a shot above which the pilot may take the time for two frames
 GUIDE_SAMPLES = 16  # of the unblurred pass: edges are antialiased, and nothing is lit
 
 
@@ -157,9 +158,10 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
     else:
         settings = settings_of(decisions)
         apply(scene, {name: value for name, value in settings.items() if name.startswith("camera.")})
-        # The ends, if anything moves: what comes into view may need what the rest does not.
+        # The ends, if anything moves and there is much to render: what comes into view may need what the rest does not.
         moves = facts.motion_pixels > 0 or facts.moving_lights
-        looked_at = sorted({shot.frames[0], shot.frames[-1]}) if moves else [middle]
+        work = shot.size[0] * shot.size[1] * sum(sum(shot.pictures(frame).values()) for frame in shot.frames)
+        looked_at = sorted({shot.frames[0], shot.frames[-1]}) if moves and work > PILOT_BOTH_ENDS else [middle]
         cleanest = max([*shot.levels.values(), shot.reference])
         bounces = needed_bounces(lambda s, seed: pilot(scene, looked_at, s, seed), settings, PILOT_SAMPLES, cleanest)
         decisions += bounces
@@ -252,17 +254,16 @@ def main(job: dict[str, Any]) -> None:
     scene = bpy.context.scene
     for frame in job["frames"]:
         scene.frame_set(frame)
-        for name, samples in shot.levels.items():
+        for name, samples in shot.pictures(frame).items():
             path = out / f"{name}.{frame:04d}.exr"
-            if not path.exists():
-                started = time.perf_counter()
-                render_picture(scene, shot, path, samples, frame_seed(shot.seed, name, frame))
-                answer(file=path.name, samples=samples, seconds=round(time.perf_counter() - started, 3))
-        path = out / f"reference.{frame:04d}.exr"
-        if shot.reference and not path.exists():
+            if path.exists():
+                continue
             started = time.perf_counter()
-            render_reference(scene, shot, out, frame)
-            answer(file=path.name, samples=shot.reference, seconds=round(time.perf_counter() - started, 3))
+            if name == "reference":
+                render_reference(scene, shot, out, frame)
+            else:
+                render_picture(scene, shot, path, samples, frame_seed(shot.seed, name, frame))
+            answer(file=path.name, samples=samples, seconds=round(time.perf_counter() - started, 3))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ EVERYTHING: dict[str, Any] = {
     "cycles.caustics_reflective": True,
     "cycles.caustics_refractive": True,
     "cycles.use_light_tree": True,
-    "world.cycles.sampling_method": "AUTOMATIC",
     "layer.use_pass_position": True,
     "layer.use_pass_normal": True,
     "layer.use_pass_mist": True,
@@ -41,11 +40,11 @@ SMALL_LIGHT = 0.1  # radius over distance to what is seen: below, a reflection o
 MIRROR_ROUGHNESS = 0.2  # at roughness 0.2 the lobe is some 5° wide: light it focuses is still sharp
 TREE_LIGHTS = 2  # with one light there is nothing to choose between
 
-# What a truncated path may cost: each kind of bounce a fifth of the 0.5 % that the whole may change the mean,
-# and a tenth of the noise, which a two-seed test of ten frames cannot tell from nothing.
-MEAN_FRACTION = 0.001
+# What a truncated path may cost: six figures of 0.05 % stay well within the 0.5 % that the whole may change the
+# mean; and a tenth of the noise is what a two-seed test of ten frames cannot tell from nothing.
+MEAN_FRACTION = 0.0005
 NOISE_FRACTION = 0.1
-PROBES = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)  # depths tried, the shallowest that is enough is taken
+PROBES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24)  # depths tried, the shallowest that is enough is taken
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ class SceneFacts:
     subsurface: int = 0
     volumes: int = 0  # materials, and the world
     hair: int = 0  # objects
+    lamps: int = 0  # with a size: an indirect ray that meets one goes on as through something transparent
     lights: int = 0  # lamps, emissive objects, and the world where it shines
     small_lights: int = 0  # smaller than SMALL_LIGHT times their distance
     world: str = "none"  # none, constant, image, sky
@@ -158,10 +158,11 @@ def effects_of(facts: SceneFacts) -> list[Decision]:
                 "cycles.caustics_refractive": facts.transmissive > 0,
             },
         ),
+        # Depth 0 would also end every path that meets a lamp, and lose what is behind it.
         _counted(
             "transparency",
-            facts.transparent,
-            "materials with alpha below one",
+            facts.transparent + facts.lamps,
+            "materials with alpha below one, or lamps that rays pass through",
             {"cycles.transparent_max_bounces": 0},
         ),
         _counted("volumes", facts.volumes, "materials with a volume, or the world", {"cycles.volume_bounces": 0}),
@@ -181,7 +182,7 @@ def effects_of(facts: SceneFacts) -> list[Decision]:
             facts.world,
             "shines",
             "the world is sampled as a light" if facts.world != "none" else "the world is black",
-            {"world.cycles.sampling_method": "NONE" if facts.world == "none" else "AUTOMATIC"},
+            {"world.cycles.sampling_method": "NONE"} if facts.world == "none" else {},
         ),
         Decision(
             "more passes",
@@ -231,13 +232,17 @@ def needed_bounces(
 
     Notes
     -----
-    With one seed, a picture of depth d and one of unlimited depth share all paths up to d, so their difference is
+    With one seed, a picture of depth d and one of unlimited depth share all paths up to d, so their difference Δ is
     the light that comes from deeper, without the noise of the rest. A depth is enough if
 
-        |mean(Δ)| ≤ MEAN_FRACTION · mean(I)   and   mean_b |Δ_b| ≤ NOISE_FRACTION · mean |A − B| / √2 · √(s/n)
+        |mean(Δ)| + 2 s(Δ)/√N ≤ MEAN_FRACTION · mean(I)   and
+        mean_b |Δ_b| ≤ NOISE_FRACTION · mean |A − B| / √2 · √(m/n)
 
-    with Δ_b the means of 8×8 blocks, A and B two seeds, s and n the samples of the pilot and of the picture. First
-    moments, because one firefly would drown the second ones.
+    with s(Δ) the standard deviation over the N pixels, Δ_b the means of 8×8 blocks, A and B two seeds, m and n the
+    samples of the pilot and of the picture. Light from deep paths comes rarely and strongly, so what a few samples
+    saw of it is not enough to go by: the bound includes what they may have missed. The second criterion takes first
+    moments, because one firefly would drown the second ones. Paths as a whole are judged first, which leaves few
+    depths to try for each kind.
     """
     if samples < 1 or target_samples < 1:
         raise ValueError(f"samples: got {samples} and {target_samples}, expected at least 1")
@@ -246,23 +251,26 @@ def needed_bounces(
     mean = float(np.mean(full))
 
     def lost(complete: np.ndarray, trial: dict[str, Any]) -> tuple[float, float]:
-        """Return what the trial's picture misses, as fractions of the mean and of the noise."""
+        """Return what the trial's picture may miss, as fractions of the mean and of the noise."""
         missing = complete - render(trial, 1)
+        pixels = missing.mean(axis=-1)
+        bound = abs(float(pixels.mean())) + 2 * float(pixels.std()) / np.sqrt(pixels.size)
         # A black picture has nothing to lose, and would give 0/0.
         return (
-            abs(float(missing.mean())) / mean if mean > 0 else 0.0,
+            bound / mean if mean > 0 else 0.0,
             float(np.abs(_block_means(missing)).mean()) / noise if noise > 0 else 0.0,
         )
 
     decisions: list[Decision] = []
-    lean = dict(settings)
-    for kind in (*BOUNCE_KINDS, "transparent", "max"):
+    lean, complete = dict(settings), full
+    for kind in ("max", *BOUNCE_KINDS, "transparent"):
         name = "cycles.transparent_max_bounces" if kind == "transparent" else f"cycles.{kind}_bounces"
         if settings[name] == 0:
             continue
-        # The kinds are judged one by one, each against everything; the whole against what the kinds have left.
-        base, complete = (lean, render(lean, 1)) if kind == "max" else (settings, full)
-        depths = [depth for depth in PROBES if depth < settings[name]]
+        # No kind of bounce can happen more often than all together; transparent ones are counted by themselves.
+        deepest = settings[name] if kind in ("max", "transparent") else lean["cycles.max_bounces"]
+        depths = [depth for depth in PROBES if depth < deepest]
+        base = {**settings, "cycles.max_bounces": lean["cycles.max_bounces"]}
         low, high, figures = 0, len(depths), (0.0, 0.0)
         while low < high:  # what is missing falls with the depth: bisection
             middle = (low + high) // 2
@@ -271,15 +279,17 @@ def needed_bounces(
                 high, figures = middle, trial
             else:
                 low = middle + 1
-        enough = depths[high] if high < len(depths) else settings[name]
+        enough = depths[high] if high < len(depths) else deepest
         lean[name] = enough
+        if kind == "max" and enough < deepest:
+            complete = render(lean, 1)
         decisions.append(
             Decision(
                 f"{kind} bounces" if kind != "max" else "all bounces",
                 enough > 0,
                 enough,
                 f"{100 * MEAN_FRACTION:g} % of the mean, {NOISE_FRACTION:g} of the noise",
-                f"deeper paths bring {100 * figures[0]:.2g} % of the mean, {figures[1]:.2g} of the noise",
+                f"deeper paths bring at most {100 * figures[0]:.2g} % of the mean, {figures[1]:.2g} of the noise",
                 {name: enough},
             )
         )
@@ -336,6 +346,7 @@ def facts_of(scene: Any, frames: Iterable[int], blur_asked: bool = False) -> Sce
         shutter=scene.render.motion_blur_shutter,
         aperture_pixels=_circle_of_confusion(scene) if scene.camera.data.dof.use_dof else 0.0,
         hair=sum(o.type == "CURVES" or len(getattr(o, "particle_systems", ())) > 0 for o in objects),
+        lamps=sum(_radius(item) > 0 for item in lamps),
         lights=len(lamps) + len(glowing) + (world != "none"),
         small_lights=small,
         world=world,

@@ -24,6 +24,7 @@ class ShotSettings:
     size: tuple[int, int]
     levels: dict[str, int]  # name → samples per pixel
     reference: int = 0  # samples per pixel in all; 0: none
+    reference_frames: tuple[int, ...] | None = None  # None: all
     film: tuple[int, int] | None = None
     center: tuple[float, float] | None = None
     camera: str | None = None
@@ -49,10 +50,18 @@ class ShotSettings:
             raise ValueError(
                 f"film: got {self.film[0]}x{self.film[1]}, expected at least the size, {self.size[0]}x{self.size[1]}"
             )
+        for frame in self.reference_frames or ():
+            if frame not in self.frames:
+                raise ValueError(f"reference frames: got {frame}, expected one of {self.frames[0]}-{self.frames[-1]}")
         if self.motion not in ("auto", "keep", "add"):
             raise ValueError(f"motion: got {self.motion!r}, expected auto, keep or add")
         if self.effects not in ("auto", "all"):
             raise ValueError(f"effects: got {self.effects!r}, expected auto or all")
+
+    def pictures(self, frame: int) -> dict[str, int]:
+        """Return the pictures of a frame: name of the level, or `reference` → samples per pixel."""
+        referenced = self.reference and (self.reference_frames is None or frame in self.reference_frames)
+        return {**self.levels, **({"reference": self.reference} if referenced else {})}
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings as JSON holds them."""

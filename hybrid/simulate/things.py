@@ -389,6 +389,9 @@ def set_world(rng: Rng, kind: str, strength: float) -> None:
     """Give the scene a world: none, constant, image (Blender's or painted) or sky."""
     scene = bpy.context.scene
     scene.world = bpy.data.worlds.new("world")
+    if kind == "image":
+        # Read for each picture anew; at the size of the image that takes seconds, longer than a few samples.
+        scene.world.cycles.sampling_method, scene.world.cycles.sample_map_resolution = "MANUAL", 1024
     scene.world.use_nodes = True
     tree = scene.world.node_tree
     background = tree.nodes["Background"]
