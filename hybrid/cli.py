@@ -60,7 +60,7 @@ EstimateOption = Annotated[
     typer.Option(
         metavar="SOURCE",
         help="denoised single frames to make stable: auto (in the file, else OIDN if installed, else our own), oidn, "
-        "oidn-fast, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
+        "oidn-fast, oidn-clean, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
     ),
 ]
 KeepOption = Annotated[

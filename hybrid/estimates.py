@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybrid.frames import Frame, Shot, open_shot, output_path
 from hybrid.oidn import denoise_oidn
-from hybrid.pseudo_reference import FINAL, Estimate, Preset
+from hybrid.pseudo_reference import FINAL, CleanGuides, Estimate, Preset
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
@@ -25,6 +25,7 @@ Array = NDArray[np.float32]
 OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn": {"quality": "high"},
     "oidn-fast": {"quality": "fast"},
+    "oidn-clean": {"quality": "high", "clean": True},
     "oidn-best": {"quality": "high", "prefilter": True},
 }
 
@@ -54,9 +55,10 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | N
     Parameters
     ----------
     spec : str
-        "auto": what is in the file, else OIDN where it is installed, else our own. "oidn" (quality high, guides as
-        given), "oidn-fast", "oidn-best" (guides prefiltered), "nlm" (our own, from each frame's window), "none",
-        or the pattern of a finished sequence of the same frames.
+        "auto": what is in the file, else "oidn-clean" where OIDN is installed, else our own. "oidn" (quality high,
+        guides as given), "oidn-fast", "oidn-clean" (guides that hold noise prefiltered by us, with the neighbours'),
+        "oidn-best" (prefiltered by OIDN), "nlm" (our own, from each frame's window), "none", or the pattern of a
+        finished sequence of the same frames.
     shot : Shot
         The noisy shot.
     own : Preset
@@ -77,7 +79,7 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | N
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", _from_file, "the file holds a denoised picture")
         if _has_oidn():
-            return EstimateSource("oidn", _oidn("oidn", shot, kept), "OIDN is installed")
+            return EstimateSource("oidn-clean", _oidn("oidn-clean", shot, kept), "OIDN is installed")
         return EstimateSource("nlm", own, "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
@@ -98,9 +100,11 @@ def _has_oidn() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
-def _oidn(mode: str, shot: Shot, kept: str | None) -> Callable[[Frame], Array]:
-    run = partial(estimate_oidn, **OIDN_MODES[mode])
-    return run if kept is None else partial(_run_or_read, run=run, shot=shot, kept=kept)
+def _oidn(mode: str, shot: Shot, kept: str | None) -> Estimate:
+    run: Callable[[Frame], Array] = partial(estimate_oidn, **OIDN_MODES[mode])
+    if kept is not None:
+        run = partial(_run_or_read, run=run, shot=shot, kept=kept)
+    return CleanGuides(run) if OIDN_MODES[mode].get("clean") else run
 
 
 def _from_file(frame: Frame) -> Array | None:

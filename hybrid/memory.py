@@ -10,7 +10,7 @@ import re
 
 from hybrid.frames import Shot
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import MARGIN, Estimate, Preset
+from hybrid.pseudo_reference import MARGIN, CleanGuides, Estimate, frames_needed
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
@@ -50,7 +50,7 @@ def plan_rows(
         Its headers are read.
     plan : Plan
         Which stages run.
-    estimate : function or Preset, optional
+    estimate : function, CleanGuides or Preset, optional
         Where the estimates of single frames come from.
     radius : int
         Frames on each side of the centre.
@@ -75,7 +75,7 @@ def plan_rows(
     height, width = shot.shape
     kept, passing, worked = _planes(shot, plan, estimate, radius, neural)
     plane = 4 * height * width
-    base = (BASE_NEURAL if neural else BASE) + (OIDN if callable(estimate) else 0)
+    base = (BASE_NEURAL if neural else BASE) + (OIDN if callable(estimate) or isinstance(estimate, CleanGuides) else 0)
 
     def needed(rows: int) -> int:
         return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))
@@ -104,7 +104,7 @@ def _planes(shot: Shot, plan: Plan, estimate: Estimate, radius: int, neural: boo
     light = 3 if "gate" in plan.effects or estimate is not None else 0
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     frame = 3 + light + guides + motion + (layers.depth is not None) + 3 * (layers.variance is not None) + aovs + 0.25
-    reach = 2 * radius if isinstance(estimate, Preset) else radius
+    reach = frames_needed(estimate, radius, plan.effects)
     frames = min(2 * reach + 1, shot.count)
     kept = frames * frame + 3 + aovs  # and the result
     if "warp" in plan.effects:

@@ -340,6 +340,7 @@ METHODS: dict[str, Method] = {
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
+    "gated OIDN clean": _aligned("Gated averages", gated_average, source="oidn-clean"),
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
     "network fast": _network("fast", "nlm"),
     "network fast + OIDN": _network("fast", "oidn"),

@@ -24,6 +24,7 @@ def denoise_oidn(
     *,
     quality: Quality = "high",
     prefilter: bool = False,
+    clean: bool = False,
     threads: int = 0,
 ) -> NDArray[np.float32]:
     """Denoise one frame with OIDN's ray-tracing filter in HDR mode, on the CPU.
@@ -36,6 +37,7 @@ def denoise_oidn(
     quality : "high", "balanced" or "fast".
     prefilter : denoise albedo and normal with filters of their own first and declare them clean
         (``cleanAux``). This is OIDN's best mode and Blender's default, at several times the cost.
+    clean : declare albedo and normal clean as they are.
     threads : 0 leaves the choice to OIDN (all cores).
 
     Returns
@@ -59,7 +61,7 @@ def denoise_oidn(
     if prefilter:
         for name in guides:
             images[name] = _execute({name: images[name]}, quality, threads)
-    return _execute(images, quality, threads, hdr=True, cleanAux=prefilter and bool(guides))
+    return _execute(images, quality, threads, hdr=True, cleanAux=(prefilter or clean) and bool(guides))
 
 
 def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from hybrid.exr import ExrError, read_exr
 from hybrid.files import remove_leftovers, replace_file
 from hybrid.frames import Shot, open_shot, output_path
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate, Preset
+from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate, frames_needed
 from hybrid.timing import Timings
 from hybrid.transfer import measure_exposure
 from nlm.average import replace_nonfinite
@@ -85,7 +85,7 @@ def denoise_shot(
         Which stages to run.
     radius : int
         Frames on each side of the centre.
-    estimate : function or Preset, optional
+    estimate : function, CleanGuides or Preset, optional
         Where the estimates of single frames come from (`hybrid.estimates`).
     interpolation : str
         Of the warp.
@@ -121,7 +121,7 @@ def denoise_shot(
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    reach = 2 * radius if isinstance(estimate, Preset) else radius
+    reach = frames_needed(estimate, radius, plan.effects)
     for number, path in paths.items():
         if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
             yield Finished(number, path, 0, 0, 0, 0, resumed=True)

@@ -41,6 +41,8 @@ HIDDEN = 3.0
 # Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, then
 # the network's context. Whole strips of the guided filter (64 rows): it then sums in the order it would in the frame.
 MARGIN = 128
+# Frames on each side that guides are prefiltered with for an estimate; two on each side gain less than 0.01 dB.
+GUIDE_RADIUS = 1
 
 
 @dataclass(frozen=True)
@@ -206,9 +208,29 @@ FINAL = Preset("final", 5, 2, guided_radius=1, guided_eps=1e-2)
 PRESETS = {preset.name: preset for preset in (DRAFT, BALANCED, FINAL)}
 
 
+@dataclass(frozen=True)
+class CleanGuides:
+    """A denoiser of single frames that can rely on its guides, which are prefiltered for it where they have noise.
+
+    Attributes
+    ----------
+    function : callable
+        From a frame (number, color, albedo and normal alone, all finite) to its denoised radiance (H, W, 3).
+    """
+
+    function: Callable[[Frame], Array]
+
+
 # Where the estimates of single frames come from: a function from a frame to its denoised radiance (H, W, 3), or None
-# where it has none; a preset, for our own, made from each frame's window; or None.
-Estimate = Callable[[Frame], Array | None] | Preset | None
+# where it has none; the same with clean guides; a preset, for our own, made from each frame's window; or None.
+Estimate = Callable[[Frame], Array | None] | CleanGuides | Preset | None
+
+
+def frames_needed(estimate: Estimate, radius: int, effects: Collection[str]) -> int:
+    """How many frames on each side of the centre are read, for windows of `radius` frames on each side."""
+    if isinstance(estimate, Preset):
+        return 2 * radius
+    return radius + GUIDE_RADIUS if isinstance(estimate, CleanGuides) and "prefilter" in effects else radius
 
 
 def prepare(frame: Frame, effects: Collection[str]) -> PreparedFrame:
@@ -292,9 +314,10 @@ class Aligner:
         Frames on each side of the centre; the window has 2 · radius + 1.
     interpolation : str
         Of the warp, "bilinear" or "bicubic".
-    estimate : function or Preset, optional
+    estimate : function, CleanGuides or Preset, optional
         Where the estimates of single frames come from (`hybrid.estimates`). A function is called once per frame. A
-        preset's estimate is made from each frame's own window, so a window of them draws on twice its radius.
+        preset's estimate is made from each frame's own window, so a window of them draws on twice its radius
+        (`frames_needed`).
     refine : callable
         What corrects vectors, `flow.tvl1.refine_flow` with other settings perhaps.
     timings : Timings, optional
@@ -342,6 +365,8 @@ class Aligner:
         numbers = self.around(number, self.radius)
         if isinstance(self.estimate, Preset):
             self._estimate_window(numbers, self.estimate)
+        elif isinstance(self.estimate, CleanGuides):
+            self._estimate_guided(numbers, self.estimate)
         else:
             self.load(numbers)
         return self._assemble(number, numbers, rows, given=self.estimate is not None)
@@ -358,7 +383,8 @@ class Aligner:
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
         self._estimates = {n: estimate for n, estimate in self._estimates.items() if n in numbers}
         # Where estimates of single frames are given, the gate compares those.
-        effects = self.effects - {"gate"} if callable(self.estimate) else self.effects
+        own = self.estimate is None or isinstance(self.estimate, Preset)
+        effects = self.effects if own else self.effects - {"gate"}
         for n in numbers:
             if n not in self._frames and self.shot.has(n):
                 with self.timings.stage("read"):
@@ -376,6 +402,26 @@ class Aligner:
         for n in ahead:
             aligned = self._assemble(n, self.around(n, self.radius), None, given=False)
             self._estimates[n] = estimate(aligned, preset, timings=self.timings)
+
+    def _estimate_guided(self, numbers: list[int], denoiser: CleanGuides) -> None:
+        """Estimate each frame of a window by itself, its guides prefiltered with its neighbours'."""
+        ahead = [n for n in numbers if self.shot.has(n) and n not in self._estimates]
+        noisy = "prefilter" in self.effects
+        reach = GUIDE_RADIUS if noisy else 0
+        self.load(sorted({*numbers, *(m for n in ahead for m in self.around(n, reach))}))
+        for n in ahead:
+            frame = self._frames[n]
+            albedo, normal = frame.albedo, frame.normal
+            if noisy:
+                layers = {
+                    name: layer for name, layer in _layers(frame).items() if name in ("albedo", "normal", "valid")
+                }
+                window, confidence = self._gather(n, self.around(n, reach), layers, slice(0, len(frame.valid)))
+                clean = {name: prefilter_guide(layer, confidence) for name, layer in window.items()}
+                albedo, normal = clean.get("albedo"), clean.get("normal")
+            alone = Frame(n, frame.radiance, albedo, normal)
+            with self.timings.stage("estimate"):
+                self._estimates[n] = _checked(denoiser.function(alone), alone)
 
     def frame(self, number: int) -> PreparedFrame | None:
         """Frame `number` of the window loaded last, or None where the shot has no such frame."""
@@ -435,19 +481,23 @@ class Aligner:
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
         self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
         centre = self._frames[number]
-        height, width = centre.irradiance.shape[:2]
+        height = len(centre.irradiance)
         rows = slice(0, height) if rows is None else rows
         outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
         inner = slice(rows.start - outer.start, rows.stop - outer.start)
-        shape = len(numbers), outer.stop - outer.start, width
         layers = {name: layer[outer] for name, layer in _layers(centre).items()}
-        estimates: Array | None = None
         if given:
             layers.pop("light", None)
-            alone = self._estimates[number]
-            if alone is None:
-                raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
-            estimates = np.repeat(alone[None, outer], len(numbers), axis=0)
+        window, confidence = self._gather(number, numbers, layers, outer)
+        estimates = self._gather_estimates(number, numbers, confidence, outer) if given else None
+        with self.timings.stage("confidence"):
+            return self._finish(centre, window, estimates, confidence, inner)
+
+    def _gather(
+        self, number: int, numbers: list[int], layers: dict[str, Array], rows: slice
+    ) -> tuple[dict[str, Array], Array]:
+        """Warp the neighbours' layers to these rows of the centre, whose own are given; and trust them, by geometry."""
+        shape = len(numbers), *layers["valid"].shape[:2]
         window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
         confidence = np.zeros(shape, np.float32)
         for index, neighbour in enumerate(numbers):
@@ -461,39 +511,49 @@ class Aligner:
                 confidence[index] = layers["valid"][..., 0] if neighbour == number else 0
                 continue
             with self.timings.stage("warp"):
-                flow, known = link[0][outer], link[1][outer]
-                warped, inside = self._warp(there, layers, flow, outer)
+                flow, known = link[0][rows], link[1][rows]
+                warped, inside = self._warp(there, layers, flow, rows)
                 for name, kept in window.items():
                     kept[index] = warped[name]
-                confidence[index] = self._trust(layers, warped, flow, known & inside, back[0], outer.start)
-                if estimates is not None:
-                    neighbours = self._estimates[neighbour]
-                    if neighbours is None:
-                        confidence[index] = 0
-                    elif "warp" in self.effects:
-                        # Estimates have no noise that interpolation could average, only detail to lose: bicubic is
-                        # worth up to 0.5 dB here.
-                        estimates[index] = warp(neighbours, flow, interpolation="bicubic", first_row=outer.start)[0]
-                    else:
-                        estimates[index] = neighbours[outer]
-        with self.timings.stage("confidence"):
-            return self._finish(centre, window, estimates, confidence, inner)
+                confidence[index] = self._trust(layers, warped, flow, known & inside, back[0], rows.start)
+        return window, confidence
+
+    def _gather_estimates(self, number: int, numbers: list[int], confidence: Array, rows: slice) -> Array:
+        """Warp the estimates of a window to these rows; a frame that has none loses its confidence, in place."""
+        alone = self._estimates[number]
+        if alone is None:
+            raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
+        estimates = np.repeat(alone[None, rows], len(numbers), axis=0)
+        for index, neighbour in enumerate(numbers):
+            link = None if neighbour == number else self.flow(number, neighbour)
+            if link is None:
+                continue
+            there = self._estimates.get(neighbour)
+            if there is None:
+                confidence[index] = 0
+            elif "warp" in self.effects:
+                with self.timings.stage("warp"):
+                    # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth
+                    # up to 0.5 dB here.
+                    flow = link[0][rows]
+                    estimates[index] = warp(there, flow, interpolation="bicubic", first_row=rows.start)[0]
+            else:
+                estimates[index] = there[rows]
+        return estimates
 
     def _warp(
         self, there: PreparedFrame, wanted: Collection[str], flow: Array, rows: slice
     ) -> tuple[dict[str, Array], Mask]:
         """Warp a neighbour's layers to these rows of the centre."""
         layers = _layers(there)
-        if "light" not in wanted:
-            layers.pop("light", None)
-        if missing := set(wanted) ^ set(layers):
+        if missing := set(wanted) - set(layers):
             raise ValueError(
                 f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
             )
         if "warp" not in self.effects:
-            return {name: layer[rows] for name, layer in layers.items()}, np.ones(flow.shape[:2], bool)
+            return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
         warped = {}
-        for name, layer in layers.items():
+        for name, layer in ((name, layers[name]) for name in wanted):
             warped[name], inside = warp(layer, flow, interpolation=self.interpolation, first_row=rows.start)
         return warped, inside
 
