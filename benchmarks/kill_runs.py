@@ -92,6 +92,8 @@ class Bench:
                 if before is not None:
                     before()
                 code = ravg(self.arguments(output, *more))
+            except KeyboardInterrupt:  # before the command was there to take it
+                code = 130
             finally:
                 os._exit(code)
         return child

@@ -24,7 +24,6 @@ from hybrid.frames import Frame, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Plan, plan_shot
 from hybrid.pseudo_reference import (
-    DISTRUSTED,
     PRESETS,
     AlignedWindow,
     Aligner,
@@ -209,8 +208,7 @@ def window_maps(aligned: AlignedWindow, estimator: Estimator) -> dict[str, Array
     part = np.where(side, step, 0).astype(np.float32)[:, None, None]
     estimate = aligned.estimate
     if estimate is not None:
-        # Where a frame is not trusted, the centre's estimate stands in its place.
-        estimate = estimate * (1 + part * np.minimum(aligned.confidence / DISTRUSTED, 1))[..., None]
+        estimate = estimate * (1 + part[..., None])
     brighter = replace(aligned, color=aligned.color * (1 + part[..., None]), estimate=estimate)
     before, after = (estimator(window).mean(axis=-1) for window in (aligned, brighter))
     change = step * before  # which underflows where it is all but black

@@ -106,6 +106,26 @@ def test_the_centres_estimate_comes_through_unchanged(tmp_path):
     np.testing.assert_allclose(window.estimate[2] * window.modulation, given, rtol=1e-6)
 
 
+def test_where_colors_agree_geometry_cannot_take_all_trust_away(tmp_path):
+    """An outline's albedo is mixed anew in each frame; here all of it is."""
+
+    def mixed_anew(index, layers):
+        name = "ViewLayer.Denoising Albedo"
+        layers[name] = np.random.default_rng(index).uniform(0.1, 0.9, layers[name].shape).astype(np.float32)
+
+    shot = open_shot(SCENE.write(tmp_path, edit=mixed_anew))
+
+    def truth(frame):
+        return SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
+
+    window = Aligner(shot, EFFECTS - {"demodulate"}, estimate=truth).align(MIDDLE)
+    # The wall passes by whole pixels: warped, the next frame is this one but for the light, which follows the camera.
+    inside = np.s_[4:-4, 4:-4]
+    assert np.median(window.confidence[3][inside]) == pytest.approx(0.3, abs=0.01)
+    other = Aligner(shot, EFFECTS - {"demodulate"}, estimate=lambda f: truth(f) * (1 + (f.number == MIDDLE + 1)))
+    assert other.align(MIDDLE).confidence[3].max() < 0.05
+
+
 def test_flicker_is_averaged_away(tmp_path):
     """Five independent errors: their mean has a fifth of the variance, 7 dB, less where frames lack the pixel."""
     shot = open_shot(SCENE.write(tmp_path))

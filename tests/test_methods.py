@@ -72,11 +72,11 @@ class TestMaps:
         np.testing.assert_allclose(maps["Temporal contribution"], expected, atol=2e-4)
         np.testing.assert_allclose(maps["Confidence"], confidence)
 
-    def test_what_stands_in_for_an_untrusted_estimate_is_the_centres(self, shot: Shot) -> None:
+    def test_estimates_of_side_frames_are_contributions_of_theirs(self, shot: Shot) -> None:
         aligned = self.aligned(shot, 0.0)
         aligned = replace(aligned, estimate=np.repeat(aligned.color[1:2], 3, axis=0))
-        equal = window_maps(aligned, lambda window: average(window.estimate, np.ones_like(window.confidence)))
-        assert equal["Temporal contribution"].max() == 0
+        alone = window_maps(aligned, lambda window: average(window.estimate, window.confidence))
+        assert alone["Temporal contribution"].max() == 0
         trusted = replace(aligned, confidence=np.ones_like(aligned.confidence))
         maps = window_maps(trusted, lambda window: average(window.estimate, window.confidence))
         np.testing.assert_allclose(maps["Temporal contribution"], 2 / 3, atol=2e-4)
