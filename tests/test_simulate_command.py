@@ -140,6 +140,15 @@ def test_a_data_set_is_many_seeds_each_in_its_folder(tmp_path):
     assert shots_of("random", tmp_path, 1, "8", "n", SHOT)[0][1] == tmp_path
 
 
+def test_validation_is_three_fixed_shots(tmp_path):
+    shots = shots_of("validation", tmp_path, 1, "8", "n", SHOT)
+    assert [(shot.scene, folder.name) for shot, folder in shots] == [
+        (f"validation:{name}", name) for name in ("table", "night", "garden")
+    ]
+    with pytest.raises(ValueError, match="shots: got 2"):
+        shots_of("validation", tmp_path, 2, "8", "n", SHOT)
+
+
 def test_a_shot_is_rendered_and_described(tmp_path, stub):
     events = []
     simulate([(SHOT, tmp_path / "s")], python=stub(), on_event=lambda *event: events.append(event))

@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 
 from hybrid.simulate.command import simulate
-from hybrid.simulate.shot import ShotSettings
+from hybrid.simulate.shot import VALIDATION, ShotSettings
 
 pytestmark = pytest.mark.cycles
 pytest.importorskip("bpy", reason="renders with Cycles: pip install ravg[simulate]")
@@ -77,6 +77,22 @@ def read(path):
 
 def layer(channels, name, parts="RGB"):
     return np.stack([channels[f"ViewLayer.{name}.{part}"] for part in parts], axis=-1)
+
+
+@pytest.mark.parametrize("film", [(1920, 1080), (2048, 1152), (2560, 1440), (200, 100)])
+def test_a_crop_has_the_size_that_was_asked_for_wherever_it_is(film):
+    """Blender holds borders as 32-bit floats, and rounds down to whole pixels."""
+    import bpy
+
+    from hybrid.simulate.motion import set_crop
+
+    render, sizes = bpy.context.scene.render, set()
+    for step in range(200):
+        set_crop(render, film, (96, 54), (step / 199, 1 - step / 199))
+        x0, x1 = (int(border * film[0]) for border in (render.border_min_x, render.border_max_x))
+        y0, y1 = (int(border * film[1]) for border in (render.border_min_y, render.border_max_y))
+        sizes.add((x1 - x0, y1 - y0))
+    assert sizes == {(96, 54)}
 
 
 def test_every_frame_and_level_has_the_layers_that_a_user_s_own_render_has(rendered):
@@ -152,6 +168,22 @@ def test_what_is_left_out_does_not_change_the_picture(scene, rendered, tmp_path)
     simulate([(shot, tmp_path)], threads=2)
     lean, full = (layer(read(folder / "a.0001.exr"), "Combined") for folder in (rendered, tmp_path))
     assert lean.mean() == pytest.approx(full.mean(), rel=0.005)
+
+
+def test_the_validation_shots_together_hold_every_effect(tmp_path):
+    """Small and without a pilot: which rules switch what on is a question to the scenes alone."""
+    facts = []
+    for name in VALIDATION:
+        shot = ShotSettings(f"validation:{name}", 1, (1, 2), SIZE, {"noisy": 1}, motion_blur=True, effects="all")
+        simulate([(shot, tmp_path / name)], threads=2)
+        facts.append(json.loads((tmp_path / name / "meta.json").read_text())["plan"]["facts"])
+        assert layer(read(tmp_path / name / "noisy.0002.exr"), "Combined").mean() > 0.01
+    kinds = ("glossy", "mirrors", "transmissive", "transparent", "subsurface", "volumes", "hair", "small_lights")
+    assert all(any(fact[kind] for fact in facts) for kind in kinds)
+    assert any(fact["aperture_pixels"] > 1 for fact in facts)
+    assert all(fact["motion_pixels"] > 0.2 for fact in facts), "something moves while the shutter is open in each"
+    assert any(fact["world"] == "sky" for fact in facts)
+    assert max(fact["lights"] for fact in facts) >= 60
 
 
 def test_a_random_shot_shows_something_and_is_the_same_twice(tmp_path):

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hybrid.simulate.shot import ShotSettings, parse_levels, spp_of
+from hybrid.simulate.shot import VALIDATION, ShotSettings, parse_levels, spp_of
 
 NO_BLENDER = (
     "Blender's Python module (bpy) is not installed in {python}: `pip install ravg[simulate]` with Python 3.11, "
@@ -212,10 +212,16 @@ def shots_of(
 ) -> list[tuple[ShotSettings, Path]]:
     """Return `count` shots with seeds that count up from that of `first`, and their folders.
 
-    One shot goes into `out` itself, several into `out/SCENE_SEED`. Samples given as a range are drawn per shot.
+    One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` into `out/NAME`. Samples
+    given as a range are drawn per shot.
     """
     if count < 1:
         raise ValueError(f"shots: got {count}, expected at least 1")
+    if scene == "validation":
+        if count > 1:
+            raise ValueError(f"shots: got {count}, expected 1, as the validation shots are fixed")
+        chosen = parse_levels(levels, spp_of(spp, first.seed))
+        return [(replace(first, scene=f"validation:{name}", levels=chosen), out / name) for name in VALIDATION]
     shots = []
     for seed in range(first.seed, first.seed + count):
         shot = replace(first, seed=seed, levels=parse_levels(levels, spp_of(spp, seed)))
@@ -249,7 +255,7 @@ def parse_numbers(text: str) -> tuple[int, ...]:
 
 
 def simulate_command(
-    scene: Annotated[str, typer.Argument(help="A .blend file, or random.")],
+    scene: Annotated[str, typer.Argument(help="A .blend file, random, or validation.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the frames and meta.json.")],
     frames: Annotated[str, typer.Option(help="How many, or FIRST-LAST.")] = "7",
     size: Annotated[str, typer.Option(help="Of what is rendered, WxH.")] = "320x180",
@@ -272,8 +278,8 @@ def simulate_command(
     python: Annotated[str | None, typer.Option(help="A Python that has bpy, if this one has not.")] = None,
 ) -> None:
     """Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for."""
-    if scene != "random" and not Path(scene).is_file():
-        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or random")
+    if scene not in ("random", "validation") and not Path(scene).is_file():
+        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file, random or validation")
     if jobs < 1:
         raise ValueError(f"jobs: got {jobs}, expected at least 1")
     where = None
@@ -297,8 +303,8 @@ def simulate_command(
         halves=False,
         effects=effects,
     )
-    asked = shots_of(scene, out, shots, spp, levels, replace(first, halves=False))
-    asked = [(replace(shot, halves=halves), folder) for shot, folder in asked]
+    # Half buffers last: they ask for levels of two samples, and the levels are only now read.
+    asked = [(replace(shot, halves=halves), out) for shot, out in shots_of(scene, out, shots, spp, levels, first)]
     _run_with_progress(asked, jobs, threads, python)
 
 

@@ -20,7 +20,7 @@ import bpy
 import numpy as np
 import OpenEXR
 
-from hybrid.simulate import scenes
+from hybrid.simulate import scenes, validation
 from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
 from hybrid.simulate.shot import ShotSettings, frame_seed
 
@@ -123,7 +123,12 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
     """Make the scene of a shot in Blender, ready to be planned, and return its description."""
-    description = scenes.random_shot(shot, attempt) if shot.scene == "random" else scenes.open_shot(shot)
+    if shot.scene == "random":
+        description = scenes.random_shot(shot, attempt)
+    elif shot.scene.startswith("validation:"):
+        description = validation.validation_shot(shot)
+    else:
+        description = scenes.open_shot(shot)
     settings = EVERYTHING if shot.effects == "all" else {**EVERYTHING, **dict.fromkeys(PASSES, False)}
     configure(bpy.context.scene, settings, threads)
     bpy.context.scene.render.use_persistent_data = not shot.motion_blur

@@ -28,8 +28,10 @@ def set_crop(render: Any, film: tuple[int, int], size: tuple[int, int], center: 
     render.resolution_x, render.resolution_y, render.resolution_percentage = film_w, film_h, 100
     render.pixel_aspect_x = render.pixel_aspect_y = 1
     render.use_border = render.use_crop_to_border = film != size
-    render.border_min_x, render.border_max_x = left / film_w, (left + w) / film_w
-    render.border_min_y, render.border_max_y = 1 - (top + h) / film_h, 1 - top / film_h
+    # Blender holds borders as 32-bit floats and rounds down: without the quarter of a pixel, now and then one less.
+    bottom = film_h - top - h
+    render.border_min_x, render.border_max_x = (left + 0.25) / film_w, min((left + w + 0.25) / film_w, 1)
+    render.border_min_y, render.border_max_y = (bottom + 0.25) / film_h, min((bottom + h + 0.25) / film_h, 1)
 
 
 def aim_crop(rng: Rng, shot: ShotSettings, film: tuple[int, int]) -> tuple[float, float]:

@@ -27,6 +27,7 @@ from hybrid.simulate.things import (
     choose,
     clutter,
     color,
+    fill_with_fog,
     log_uniform,
     material,
     scatter,
@@ -277,7 +278,8 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
         camera.data.dof.use_dof, camera.data.dof.focus_distance = True, focus
         camera.data.dof.aperture_fstop = log_uniform(rng, 0.7, 5.6)
     if rng.random() < 0.04:
-        add_haze(rng, (view.focus - view.eye).length)
+        density = log_uniform(rng, 0.1, 0.6) / (view.focus - view.eye).length  # so deep is the fog up to the focus
+        fill_with_fog((0, 0, 4), (28, 28, 9), density, rng.uniform(0, 0.7))
     motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_things=True)
     return {
         "set": kind,
@@ -293,19 +295,6 @@ def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
     drawn = choose(rng, {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18})
     width, height = map(int, drawn.split("x"))
     return max(width, size[0]), max(height, size[1])
-
-
-def add_haze(rng: Rng, distance: float) -> None:
-    """Fill the space about the camera with a thin scattering volume, optical depth 0.1 to 0.6 to the focus."""
-    surface = bpy.data.materials.new("haze")
-    surface.use_nodes = True
-    tree = surface.node_tree
-    tree.nodes.clear()
-    volume, output = tree.nodes.new("ShaderNodeVolumeScatter"), tree.nodes.new("ShaderNodeOutputMaterial")
-    volume.inputs["Density"].default_value = log_uniform(rng, 0.1, 0.6) / distance
-    volume.inputs["Anisotropy"].default_value = rng.uniform(0, 0.7)
-    tree.links.new(volume.outputs["Volume"], output.inputs["Volume"])
-    add_box((0, 0, 4), (28, 28, 9), surface, "haze").hide_set(True)
 
 
 def open_shot(shot: ShotSettings) -> dict[str, Any]:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 
+VALIDATION = ("table", "night", "garden")  # the shots of `validation`
+
+
 @dataclass(frozen=True)
 class ShotSettings:
     """One shot: everything needed to render it again, given the scene.
@@ -18,7 +21,7 @@ class ShotSettings:
     may be None: drawn from the seed for random shots, else the whole picture of the scene's own camera.
     """
 
-    scene: str  # a .blend file, or "random"
+    scene: str  # a .blend file, "random", or "validation:NAME"
     seed: int
     frames: tuple[int, ...]
     size: tuple[int, int]

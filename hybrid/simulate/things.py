@@ -222,6 +222,18 @@ def add_box(center: Sequence[float], size: Sequence[float], surface: Any, name: 
     return item
 
 
+def fill_with_fog(center: Sequence[float], size: Sequence[float], density: float, forward: float) -> None:
+    """Fill a box with a thin scattering volume, `density` per metre; `forward` is the mean cosine of its phase."""
+    surface = bpy.data.materials.new("fog")
+    surface.use_nodes = True
+    tree = surface.node_tree
+    tree.nodes.clear()
+    volume, output = tree.nodes.new("ShaderNodeVolumeScatter"), tree.nodes.new("ShaderNodeOutputMaterial")
+    volume.inputs["Density"].default_value, volume.inputs["Anisotropy"].default_value = density, forward
+    tree.links.new(volume.outputs["Volume"], output.inputs["Volume"])
+    add_box(center, size, surface, "fog").hide_set(True)
+
+
 def add_turned(rng: Rng, surface: Any) -> Any:
     """Add a turned thing about one unit high: a vase, a bottle, a bowl, a pawn."""
     heights = np.linspace(-0.5, 0.5, 40)
