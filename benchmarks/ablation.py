@@ -5,15 +5,16 @@
 
 Everything is trained on the same samples in the same order for the same number of steps, without estimates, as the
 paper's networks have none. Table 1: average and maximum weight of each frame of the window. Table 2: PSNR and SSIM on
-x/(1+x) over the test shot's clips against their cleanest independent target. Table 3: a U-Net with RA blocks at every
+x/(1+x) over the test shots' clips against their cleanest independent target. Table 3: a U-Net with RA blocks at every
 scale, at the coarse ones only, and without, at equal steps and, `equal time`, with as many steps as fit into the CPU
-time of the first. Finished trainings are kept in the output folder and not repeated, broken ones resumed;
-ablation.json holds every figure.
+time of the first. Finished trainings are kept in the output folder and not repeated, broken ones resumed; one seed is
+done before the next begins. ablation.json holds every figure, from the first training on.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import statistics
 import sys
@@ -60,8 +61,8 @@ def networks(frames: int, width: int, blocks: int, activation: str) -> dict[str,
 
 @torch.no_grad()
 def judge(model: Model | None, clips: Clips) -> dict[str, list[float]]:
-    """PSNR and SSIM of each test clip and level, weights of each frame; of the input if there is no model."""
-    found: dict[str, list[float]] = {"psnr": [], "ssim": []}
+    """PSNR, SSIM and mean over the target's, of each test clip and level; weights of each frame if there is a model."""
+    found: dict[str, list[float]] = {"psnr": [], "ssim": [], "mean": []}
     sums, greatest, count = np.zeros(clips.frames), np.zeros(clips.frames), 0
     for index in range(len(clips)):
         for batch in whole_frames(clips, index, 4 if model is None else model.multiple):
@@ -75,6 +76,7 @@ def judge(model: Model | None, clips: Clips) -> dict[str, list[float]]:
                 count += weights.shape[1]
             image, target = image * batch["modulation"], batch["target"]
             found["psnr"].append(float(tone_mapped_psnr(image, target)))
+            found["mean"].append(float(image.sum() / target.sum()))
             found["ssim"].append(ssim(*(x[0].permute(1, 2, 0).numpy() for x in (image, target))))
     if model is not None:
         found["average"], found["maximum"] = (sums / count).tolist(), greatest.tolist()
@@ -84,10 +86,11 @@ def judge(model: Model | None, clips: Clips) -> dict[str, list[float]]:
 def run(
     name: str, build: Callable[[], Model], config: TrainConfig, training: Clips, test: Clips, folder: Path
 ) -> dict[str, list[float]]:
-    """Train, unless that is done, and judge."""
+    """Train and judge; what is done already is read."""
     out = folder / f"{name}, seed {config.seed}.safetensors"
-    timing = out.with_suffix(".json")
-    if not timing.exists():
+    row = out.with_suffix(".json")
+    found: dict[str, list[float]] = json.loads(row.read_text()) if row.exists() else {}
+    if not found:
         torch.manual_seed(config.seed)
         model, start = build(), time.process_time()
 
@@ -96,12 +99,17 @@ def run(
                 left = values["seconds"] / values["done"] * (1 - values["done"]) / 60
                 print(f"\r{name}, seed {config.seed}: step {step}, {left:.1f} min left ", end="", flush=True)
 
-        train(training, training.of([]), model, config, out, resume=Path(f"{out}.state").exists(), log=log)
-        print()
-        timing.write_text(json.dumps({"cpu_seconds": time.process_time() - start}))
-    steps = load_notes(out)["training"]["steps"]
-    seconds = json.loads(timing.read_text())["cpu_seconds"]
-    return {**judge(load_model(out), test), "cpu_seconds": [seconds], "steps": [steps]}
+        losses = train(training, training.of([]), model, config, out, resume=Path(f"{out}.state").exists(), log=log)
+        steps = load_notes(out)["training"]["steps"]
+        # Of a resumed training only the last part has been timed.
+        found = {"cpu_seconds": [(time.process_time() - start) / max(1, len(losses)) * steps], "steps": [steps]}
+        row.write_text(json.dumps(found))
+    if "mean" not in found:
+        found |= judge(load_model(out), test)
+        row.write_text(json.dumps(found))
+        figures = f"PSNR {statistics.mean(found['psnr']):.2f}, SSIM {statistics.mean(found['ssim']):.4f}"
+        print(f"\r{name}, seed {config.seed}: {figures}, weights {' '.join(f'{x:.4f}' for x in found['average'])}")
+    return found
 
 
 def mean(values: list[list[float]]) -> list[float]:
@@ -139,37 +147,41 @@ def main(argv: list[str]) -> int:
         loss=options.loss,
         device="cpu",
         whole=options.whole,
+        checkpoint_minutes=2,
         sampler=SamplerConfig(crop=options.crop, sets=1),
     )
     results: dict[str, dict[str, list[float]]] = {"input": judge(None, test)}
+    rows: dict[str, list[dict[str, list[float]]]] = {}
+    shots = {shot: test.of([shot]) for shot in test.shots}
+    values = {shot: sum(len(clips.pairs(index)) for index in range(len(clips))) for shot, clips in shots.items()}
 
-    def compare(label: str, network: str, config: TrainConfig) -> None:
-        each = [
-            run(label, built[network], replace(config, seed=seed), training, test, options.out)
-            for seed in options.seeds
-        ]
+    def compare(label: str, network: str, config: TrainConfig) -> dict[str, list[float]]:
+        each = rows.setdefault(label, [])
+        each.append(run(label, built[network], config, training, test, options.out))
         results[label] = {key: mean([found[key] for found in each]) for key in each[0]}
         results[label]["mean of each seed"] = [statistics.mean(found["psnr"]) for found in each]
+        written = {"arguments": argv, "values of each shot": values, "results": results}
+        (options.out / "ablation.json").write_text(json.dumps(written, indent=2))
+        return each[-1]
 
-    if options.only != "unet":
-        for network in ("RA", "tKPCN"):
-            for loss in ("spatial", "temporal"):
-                compare(f"{network} + {loss} loss", network, replace(base, terms=loss))
-    if options.only != "paper":
-        unet = replace(base, terms="temporal", whole=1.0)
-        compare("U-Net, RA everywhere", "U-Net, RA everywhere", unet)
-        for network in ("U-Net, RA coarse", "U-Net, no RA"):
-            compare(network, network, unet)
-            ratio = results["U-Net, RA everywhere"]["cpu_seconds"][0] / results[network]["cpu_seconds"][0]
-            longer = replace(unet, steps=max(1, round(options.steps * ratio)))
-            compare(f"{network}, equal time", network, longer)
-    (options.out / "ablation.json").write_text(json.dumps({"arguments": argv, "results": results}, indent=2))
-    report(results, training.frames)
+    for seed in options.seeds:
+        if options.only != "unet":
+            for network in ("RA", "tKPCN"):
+                for loss in ("spatial", "temporal"):
+                    compare(f"{network} + {loss} loss", network, replace(base, terms=loss, seed=seed))
+        if options.only != "paper":
+            unet = replace(base, terms="temporal", whole=1.0, seed=seed)
+            everywhere = compare("U-Net, RA everywhere", "U-Net, RA everywhere", unet)
+            for network in ("U-Net, RA coarse", "U-Net, no RA"):
+                ratio = everywhere["cpu_seconds"][0] / compare(network, network, unet)["cpu_seconds"][0]
+                longer = replace(unet, steps=max(1, round(options.steps * ratio)))
+                compare(f"{network}, equal time", network, longer)
+    report(results, training.frames, values)
     return 0
 
 
-def report(results: dict[str, dict[str, list[float]]], frames: int) -> None:
-    """Print the tables."""
+def report(results: dict[str, dict[str, list[float]]], frames: int, values: dict[str, int]) -> None:
+    """Print the tables; values are how many figures each test shot has, in order."""
     print("\nTable 1: weights of the frames")
     print(f"{'':38s}" + "".join(f"{k:9d}" for k in range(-(frames // 2), frames // 2 + 1)))
     for name, found in results.items():
@@ -187,6 +199,15 @@ def report(results: dict[str, dict[str, list[float]]], frames: int) -> None:
             line += f"{found['steps'][0]:8.0f}{found['cpu_seconds'][0]:8.0f}"
         if len(found.get("mean of each seed", [])) > 1:
             line += f"   PSNR of each seed: {', '.join(f'{value:.2f}' for value in found['mean of each seed'])}"
+        print(f"{name:36s}{line}")
+    print("\nOf each test shot PSNR, and how much brighter the mean is than the target's")
+    print(f"{'':36s}" + "".join(f"{shot[-16:]:>18s}" for shot in values))
+    ends = [0, *itertools.accumulate(values.values())]
+    for name, found in results.items():
+        line = ""
+        for part in itertools.starmap(slice, itertools.pairwise(ends)):
+            brighter = 100 * (statistics.mean(found["mean"][part]) - 1)
+            line += f"{statistics.mean(found['psnr'][part]):9.2f} {brighter:+7.2f}%"
         print(f"{name:36s}{line}")
 
 
