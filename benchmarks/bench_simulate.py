@@ -202,17 +202,17 @@ def measure_vectors(name: str, size: tuple[int, int], film: tuple[int, int] | No
 
     def apart(vectors: dict[str, np.ndarray]) -> float:
         moved, inside = warp(following, x - vectors["Vector.Z"], y + vectors["Vector.W"])
-        return float(np.median(np.abs(albedo - moved).mean(axis=-1)[inside]))
+        return float(np.abs(albedo - moved).mean(axis=-1)[inside].mean())
 
     motion = np.hypot(here["Vector.Z"], here["Vector.W"])
     return {
         "scene": Path(name).stem if ":" not in name else name,
         "motion_px": float(np.median(motion)),
         "fastest_px": float(motion.max()),
-        "albedo_unwarped": float(np.median(np.abs(albedo - following).mean(axis=-1))),
+        "albedo_unwarped": float(np.abs(albedo - following).mean()),
         "albedo_warped": apart(here),
         "albedo_warped_blurred": apart(smeared),
-        "albedo_noise": float(np.median(np.abs(albedo - layer(again, "Denoising Albedo")).mean(axis=-1))),
+        "albedo_noise": float(np.abs(albedo - layer(again, "Denoising Albedo")).mean()),
     }
 
 

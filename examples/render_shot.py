@@ -7,6 +7,10 @@ Writes one multi-layer EXR per frame and noise level, in the layout that Blender
 The image is a crop (render border) of a film-size camera, so that motion and texture have the
 statistics of a real shot and not those of a thumbnail. Frames that exist are left alone, so a run
 that was stopped goes on where it was.
+
+It is kept for what was made with it: the bundled shot, the shots of the report and those that the weights were trained
+on, their moving objects and seeds as they were, and frames as Blender's defaults render them. For new shots there is
+`ravg simulate`.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
     render.image_settings.exr_codec = "ZIP"
     render.image_settings.use_exr_interleave = True
     cycles.use_denoising = cycles.use_adaptive_sampling = cycles.use_animated_seed = False
-    cycles.use_sample_subset = False
+    cycles.use_sample_subset = cycles.use_fast_gi = cycles.volume_biased = False
     cycles.time_limit = cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0
     layer.use_pass_combined = layer.use_pass_z = layer.use_pass_vector = True
     layer.cycles.denoising_store_passes = True

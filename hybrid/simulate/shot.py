@@ -9,7 +9,6 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-
 VALIDATION = ("table", "night", "garden")  # the shots of `validation`
 
 
