@@ -438,7 +438,10 @@ def _world_kind(world: Any) -> str:
 
 
 def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[Any, Any]]:
-    """Return where a grid of camera rays over the rendered region meets the scene, and which object it is."""
+    """Return where a grid of camera rays over the rendered region meets the scene, and which object it is.
+
+    Blender's rays meet surfaces; hair they pass.
+    """
     import bpy
 
     render, camera = scene.render, scene.camera
