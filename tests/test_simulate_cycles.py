@@ -205,6 +205,27 @@ def test_vectors_follow_what_moves_in_every_kind_of_scene(name, blur, scene, tmp
     assert np.quantile(errors, 0.8, axis=1).max() < 0.5
 
 
+def test_what_blender_keeps_between_frames_changes_no_picture(tmp_path):
+    """With persistent data, which shots are rendered with, a thing that flies and one that bends are as without."""
+    import bpy
+
+    from hybrid.simulate import cycles
+
+    shot = ShotSettings("validation:garden", 1, (1, 4), SIZE, {"n": 2})
+    pictures = []
+    for keep in (True, False):
+        cycles.build(shot, 0, 2)
+        bpy.context.scene.render.use_persistent_data = keep
+        for frame in shot.frames:
+            bpy.context.scene.frame_set(frame)
+            cycles.render_picture(bpy.context.scene, shot, tmp_path / f"{keep}.{frame:04d}.exr", 2, 1)
+        pictures.append([read(tmp_path / f"{keep}.{frame:04d}.exr") for frame in shot.frames])
+    for kept, fresh in zip(*pictures, strict=True):
+        for name in kept:
+            np.testing.assert_array_equal(kept[name], fresh[name], err_msg=name)
+    assert np.any(pictures[0][0]["ViewLayer.Combined.R"] != pictures[0][1]["ViewLayer.Combined.R"]), "something moves"
+
+
 def test_with_motion_blur_vectors_come_from_an_unblurred_pass(scene, rendered, tmp_path):
     shot = ShotSettings(str(scene), 1, (1,), SIZE, {"noisy": 8}, motion_blur=True)
     simulate([(shot, tmp_path)], threads=2)
