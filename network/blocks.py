@@ -77,8 +77,8 @@ class _MeanOfMiddleTwo(torch.autograd.Function):
             ctx.save_for_backward(
                 low_ab.ge_(low_cd),  # the lower middle value came from (a, b)
                 high_ab.le_(high_cd),  # the upper middle value came from (a, b)
-                torch.le(a, b, out=low_cd),
-                torch.le(c, d, out=high_cd),
+                low_cd.copy_(a).le_(b),
+                high_cd.copy_(c).le_(d),
             )
         return mean
 
