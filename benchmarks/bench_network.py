@@ -114,10 +114,11 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
         for bfloat16 in (False, True):
             model = for_inference(build(), bfloat16)
             color = torch.rand(1, 5, 3, tile, tile)
-            confidence, estimate = torch.rand(1, 5, 1, tile, tile), torch.rand(1, 5, 3, tile, tile)
+            window = dict.fromkeys(("color", "albedo", "normal", "estimate"), color)
+            window |= {"confidence": torch.rand(1, 5, 1, tile, tile), "exposure": torch.ones(1)}
             yield (
                 f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
-                lambda m=model, x=color, c=confidence, e=estimate: denoise_tile(m, x, x, x, c, estimate=e),
+                lambda m=model, w=window: denoise_tile(m, w),
                 tile**2,
             )
         for count in (1, 2):
@@ -127,7 +128,6 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
                 **dict.fromkeys(("color", "albedo", "normal", "estimate"), color),
                 **dict.fromkeys(("modulation", "target"), image),
                 "confidence": color[:, :, :1],
-                "present": torch.ones(count),
                 "exposure": torch.ones(count),
                 "error": torch.ones(count),
             }

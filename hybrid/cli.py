@@ -173,7 +173,12 @@ def pseudoref(
 def denoise(
     shot: ShotArgument,
     output: OutputOption,
-    preset: Annotated[str, typer.Option(help="of the weights that come with ravg: fast")] = "fast",
+    preset: Annotated[
+        str, typer.Option(help="of the weights that come with ravg: fast, balanced, quality, or auto, with --budget")
+    ] = "fast",
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="per frame, such as 10s: the most accurate preset that fits it")
+    ] = None,
     weights: Annotated[Path | None, typer.Option(help="a weights file of your own, instead of a preset")] = None,
     threshold: Annotated[
         float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
@@ -205,7 +210,7 @@ def denoise(
     from rich.table import Table
 
     from hybrid.breakdown import Breakdown, write_breakdown
-    from hybrid.estimates import choose_estimate
+    from hybrid.estimates import MODE_OF, choose_estimate
     from hybrid.timing import Timings
 
     if passes < 1:
@@ -214,10 +219,19 @@ def denoise(
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = _open(shot, frames, layer, aov, max_pixels=max_pixels)
     timings = Timings()
+    if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
+        raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
+    if budget is not None:
+        preset = _fitting(opened, budget, estimate, _plan(opened, effects, no_effects), precision)
     path = weights or neural.shipped_weights(preset)
     weighed = None if breakdown is None else Breakdown()
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
-    source = choose_estimate(estimate, opened, kept=keep_estimates)
+    if denoiser.takes_estimate:
+        # From the noisy frames alone, such a network works beside our own.
+        wanted = "nlm" if estimate == "none" else estimate
+        source = choose_estimate(wanted, opened, kept=keep_estimates, mode=MODE_OF.get(preset, "oidn-clean"))
+    else:
+        source = choose_estimate("none", opened)
     settings = {
         "layer": layer,
         "estimate": estimate,
@@ -469,6 +483,28 @@ def _beside(output: str) -> tempfile.TemporaryDirectory[str]:
     folder = Path(output).parent if Path(output).suffix else Path(output)
     folder.mkdir(parents=True, exist_ok=True)
     return tempfile.TemporaryDirectory(prefix=".ravg-", dir=folder)
+
+
+def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str) -> str:
+    """The most accurate preset that is measured to fit a time per frame, or the fastest; says what was measured."""
+    from hybrid.budget import measure_presets, parse_budget
+
+    neural, seconds = _neural(), parse_budget(budget)
+
+    def load(preset: str) -> tuple[Estimator, int]:
+        denoiser = neural.Denoiser(neural.shipped_weights(preset), precision=precision)
+        return denoiser, denoiser.radius
+
+    tried = []
+    for measured in measure_presets(shot, plan.effects, "nlm" if estimate == "none" else estimate, load):
+        tried.append(f"{measured.preset} {measured.seconds:.2g} s")
+        fits = measured.seconds <= seconds
+        if fits:
+            break
+    typer.echo(f"preset: {measured.preset} ({', '.join(tried)} a frame; {budget} asked for)", err=True)
+    if not fits:
+        typer.echo("warning: not even the fastest preset fits", err=True)
+    return measured.preset
 
 
 def _next_pass(

@@ -28,6 +28,8 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn-clean": {"quality": "high", "clean": True},
     "oidn-best": {"quality": "high", "prefilter": True},
 }
+# What "auto" takes of them for a preset of the network: each is a point of accuracy against time.
+MODE_OF = {"fast": "oidn-fast", "balanced": "oidn", "quality": "oidn-clean"}
 
 
 @dataclass(frozen=True)
@@ -49,13 +51,15 @@ class EstimateSource:
     reason: str
 
 
-def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | None = None) -> EstimateSource:
+def choose_estimate(
+    spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | None = None, mode: str = "oidn-clean"
+) -> EstimateSource:
     """Find the estimates that are asked for.
 
     Parameters
     ----------
     spec : str
-        "auto": what is in the file, else "oidn-clean" where OIDN is installed, else our own. "oidn" (quality high,
+        "auto": what is in the file, else `mode` where OIDN is installed, else our own. "oidn" (quality high,
         guides as given), "oidn-fast", "oidn-clean" (guides that hold noise prefiltered by us, with the neighbours'),
         "oidn-best" (prefiltered by OIDN), "nlm" (our own, from each frame's window), "none", or the pattern of a
         finished sequence of the same frames.
@@ -63,6 +67,8 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | N
         The noisy shot.
     own : Preset
         Of our own estimate.
+    mode : str
+        Of OIDN, for "auto".
     kept : str, optional
         Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder.
 
@@ -79,7 +85,7 @@ def choose_estimate(spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | N
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", _from_file, "the file holds a denoised picture")
         if _has_oidn():
-            return EstimateSource("oidn-clean", _oidn("oidn-clean", shot, kept), "OIDN is installed")
+            return EstimateSource(mode, _oidn(mode, shot, kept), "OIDN is installed")
         return EstimateSource("nlm", own, "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from skimage.restoration import denoise_nl_means
 
 from flow.tvl1 import refine_flow
-from hybrid.estimates import choose_estimate, estimate_oidn
+from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
 from hybrid.frames import Frame, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Plan, plan_shot
@@ -340,8 +340,8 @@ METHODS: dict[str, Method] = {
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "gated OIDN clean": _aligned("Gated averages", gated_average, source="oidn-clean"),
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
-    "network fast": _network("fast", "nlm"),
-    "network fast + OIDN": _network("fast", "oidn"),
+    "network, own estimates": _network("quality", "nlm"),
+    **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast", prefilter=False),
     "OIDN high": _oidn("high", prefilter=False),

@@ -34,7 +34,8 @@ from network.clips import (
     write_shards,
 )
 from network.inputs import window_exposure
-from network.models import PRESETS, denoise_tile, for_inference
+from network.models import PRESETS, denoise_tile, for_inference, window_length
+from network.stabilizer import Stabilizer
 from network.train import TrainConfig, train
 from nlm.average import replace_nonfinite
 
@@ -117,9 +118,14 @@ class Denoiser:
         self.timings = timings or Timings()
 
     @property
+    def takes_estimate(self) -> bool:
+        """Whether the network works beside per-frame estimates."""
+        return isinstance(self.model, Stabilizer)
+
+    @property
     def radius(self) -> int:
         """Frames on each side that the network looks at."""
-        return self.model.config.kernel.frames // 2
+        return window_length(self.model) // 2
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         """Denoise the centre of an aligned window."""
@@ -155,16 +161,9 @@ class Denoiser:
                     )
                 continue
             cut = {name: _tensor(_pad(layer[:, *outer], self.model.multiple)) for name, layer in layers.items()}
+            others = cut.pop("aovs", None)
             out, sums, aovs = denoise_tile(
-                self.model,
-                cut["color"],
-                cut.get("albedo"),
-                cut.get("normal"),
-                cut["confidence"],
-                exposure,
-                cut.get("estimate"),
-                threshold=self.threshold,
-                aovs=cut.get("aovs"),
+                self.model, {**cut, "exposure": exposure}, threshold=self.threshold, aovs=others
             )
             irradiance[inner] = _image(out)[offset]
             if aovs is not None:
@@ -374,9 +373,9 @@ def train_network(
     else:
         path = Path(init) if Path(init).suffix else shipped_weights(init)
         model = load_model(path)
-        if model.config.kernel.frames != training.frames:
+        if window_length(model) != training.frames:
             raise ValueError(
-                f"clips: expected windows of {model.config.kernel.frames} frames as {init} has, got {training.frames}"
+                f"clips: expected windows of {window_length(model)} frames as {init} has, got {training.frames}"
             )
     output.parent.mkdir(parents=True, exist_ok=True)
     together = int(os.environ.get("WORLD_SIZE", "1")) > 1

@@ -26,12 +26,13 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
+from network.stabilizer import Stabilizer, StabilizerConfig
 
 Config = TypeVar("Config")
 
 FORMAT = "ravg-network"
 #: Raised when a change makes older weights give other kernels. Files say which one they were written for.
-VERSION = 1
+VERSION = 2
 #: The greatest number in a description that is read: three times the width of any network here.
 LARGEST = 256
 
@@ -41,6 +42,7 @@ CLASSES: dict[str, tuple[Any, Any]] = {
     "RAUNet": (RAUNet, RAUNetConfig),
     "RAResNet": (RAResNet, RAResNetConfig),
     "TKPCN": (TKPCN, TKPCNConfig),
+    "Stabilizer": (Stabilizer, StabilizerConfig),
 }
 
 
@@ -69,7 +71,8 @@ def build(description: Mapping[str, Any]) -> Model:
         network, configuration = CLASSES[name]
         values = dict(description["config"])
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        values["kernel"] = _configure(KernelConfig, values["kernel"])
+        if "kernel" in values:
+            values["kernel"] = _configure(KernelConfig, values["kernel"])
         return cast(Model, network(_configure(configuration, values)))
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"model description: {error!r}") from error

@@ -388,7 +388,6 @@ class SamplerConfig:
 
     crop: int = 128  # height and width; of larger clips a place is drawn by importance
     sets: int = 10  # disjoint sets of clips, one for each epoch; the paper's ten
-    drop_estimate: float = 0.1  # the model must also work without one
     drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
@@ -397,7 +396,7 @@ class SamplerConfig:
         for name in ("crop", "sets"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("drop_estimate", "drop_frames", "fireflies"):
+        for name in ("drop_frames", "fireflies"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a probability, got {getattr(self, name)}")
 
@@ -459,8 +458,8 @@ class Samples(Dataset[dict[str, Tensor]]):
         -------
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal``, ``estimate`` ``(T, 3, H, W)``, ``confidence`` ``(T, 1, H, W)``,
-            ``modulation``, ``target`` ``(3, H, W)``, ``present`` (1 where the estimate may be used), ``exposure`` and
-            ``error`` ``()`` (the loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them.
+            ``modulation``, ``target`` ``(3, H, W)``, ``exposure`` and ``error`` ``()`` (the loss of the clip's best
+            input). A `torch.utils.data.DataLoader` stacks them.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
@@ -496,7 +495,6 @@ class Samples(Dataset[dict[str, Tensor]]):
             gain = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * exposure
             sample["color"][rng.integers(frames), :, rows, columns] += gain
         sample["exposure"] = exposure * 2 ** rng.uniform(-config.exposure_stops, config.exposure_stops)
-        sample["present"] = torch.tensor(float(rng.random() >= config.drop_estimate))
         sample["error"] = error
         return sample
 
@@ -526,7 +524,7 @@ def input_error(batch: dict[str, Tensor], loss: ImageLoss) -> Tensor:
     scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
     errors = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, centre])]
     # The floor matters only where the input equals the target, as in a synthetic or an empty clip.
-    return torch.minimum(*errors).clamp_min(1e-4)
+    return torch.minimum(*errors).clamp_min(1e-6)
 
 
 def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tensor]]:
@@ -552,6 +550,5 @@ def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tens
         height, width = (length // multiple * multiple for length in values["target"].shape[-2:])
         batch = {n: v[None].float() for n, v in values.items() if n == "exposure"}
         batch |= {n: v[None, ..., :height, :width].float() for n, v in values.items() if n != "exposure"}
-        batch["present"] = torch.ones(1)
         batches.append(batch)
     return batches

@@ -7,8 +7,8 @@ from torch import Tensor
 
 #: Channels of a frame without an estimate: color, albedo, normal, confidence (the paper's).
 CHANNELS = 10
-#: Channels an estimate adds: its three, its difference from the centre's, and one that tells that it is there.
-ESTIMATE_CHANNELS = 7
+#: Channels an estimate adds: its three, and its difference from the centre's.
+ESTIMATE_CHANNELS = 6
 
 
 def window_exposure(color: Tensor) -> Tensor:
@@ -44,10 +44,7 @@ def network_inputs(
     normal: Tensor | None,
     confidence: Tensor,
     exposure: Tensor,
-    *,
-    takes_estimate: bool,
     estimate: Tensor | None = None,
-    present: Tensor | None = None,
 ) -> Tensor:
     """Feature channels of each frame of an aligned window.
 
@@ -61,19 +58,15 @@ def network_inputs(
         ``(N, T, 1, H, W)`` in [0, 1].
     exposure : Tensor
         ``(N,)`` from `window_exposure`.
-    takes_estimate : bool
-        Whether the model has channels for an estimate.
     estimate : Tensor, optional
-        ``(N, T, 3, H, W)`` aligned estimates, irradiance.
-    present : Tensor, optional
-        ``(N,)``, 1 where a sample has its estimate, 0 where it is to be ignored. Default: all have.
+        ``(N, T, 3, H, W)`` aligned estimates, irradiance, for a model that takes them.
 
     Returns
     -------
     Tensor
-        ``(N, T, 10, H, W)``, or ``(N, T, 17, H, W)`` if takes_estimate: ``log1p(color / exposure)``,
-        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)``, ten times what that differs by
-        from the centre frame's, and its presence.
+        ``(N, T, 10, H, W)``, or ``(N, T, 16, H, W)`` with an estimate: ``log1p(color / exposure)``,
+        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)`` and ten times what that differs by
+        from the centre frame's.
 
     Raises
     ------
@@ -99,15 +92,10 @@ def network_inputs(
         missing if normal is None else normal,
         confidence,
     ]
-    if takes_estimate:
-        if estimate is None:
-            channels.append(color.new_zeros(()).expand(n, t, ESTIMATE_CHANNELS, h, w))
-        else:
-            if estimate.shape != (n, t, 3, h, w):
-                raise ValueError(f"estimate: expected shape {(n, t, 3, h, w)}, got {tuple(estimate.shape)}")
-            here = (color.new_ones(n) if present is None else present.to(color.dtype)).view(n, 1, 1, 1, 1)
-            log = torch.log1p((estimate * scale).clamp_min(0)) * here
-            # Ten times: what matters is a few hundredths, on the scale of the other channels some tenths.
-            difference = 10 * (log - log[:, t // 2 : t // 2 + 1])
-            channels += [log, difference, here.expand(n, t, 1, h, w)]
+    if estimate is not None:
+        if estimate.shape != (n, t, 3, h, w):
+            raise ValueError(f"estimate: expected shape {(n, t, 3, h, w)}, got {tuple(estimate.shape)}")
+        log = torch.log1p((estimate * scale).clamp_min(0))
+        # Ten times: what matters is a few hundredths, on the scale of the other channels some tenths.
+        channels += [log, 10 * (log - log[:, t // 2 : t // 2 + 1])]
     return torch.cat(channels, 2)

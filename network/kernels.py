@@ -173,60 +173,6 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     return numerators, denominators
 
 
-def filter_window(
-    kernels: Tensor,
-    color: Tensor,
-    size: int,
-    estimate: Tensor | None = None,
-    confidence: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Apply kernels that span the noisy window and, where there are any, the estimates.
-
-    Parameters
-    ----------
-    kernels : Tensor
-        ``(N, taps, H, W)``: T·K·K taps of the window, then those of the estimates.
-    color : Tensor
-        ``(N, T, C, H, W)`` aligned window: what the kernels were predicted for, or an AOV warped with it.
-    size : int
-        K of the window's taps.
-    estimate : Tensor, optional
-        ``(N, T, C, H, W)``, the estimates of the frames, of the same quantity as color; zeros for a sample that has
-        none. Without (an AOV that has none) their taps are left out, and dividing renormalises the others.
-    confidence : Tensor, optional
-        ``(N, T, 1, H, W)``, by which color was mixed with its centre frame; comes with estimate.
-
-    Returns
-    -------
-    numerators, denominators : Tensor
-        As for `apply_kernels`, ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)``. The estimate of a frame is counted
-        with that frame.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit together.
-
-    Notes
-    -----
-    With estimates e, the tap at x + d of a noisy frame n stands for ``n(x + d) − e(x + d) + e(x)``: what the estimate
-    knows of the way from there to here is not blurred, and the taps average nothing but what it has missed.
-    """
-    frames = color.shape[1]
-    taps = frames * size * size
-    if estimate is None:
-        return apply_kernels(kernels[:, :taps], color)
-    if estimate.shape[1] != frames:
-        raise ValueError(f"estimate: expected {frames} frames, got {estimate.shape[1]}")
-    if confidence is None:
-        raise ValueError("confidence: expected one beside estimate, got none")
-    centre = estimate[:, frames // 2, None]
-    mixed = centre + confidence * (estimate - centre)
-    numerators, denominators = apply_kernels(kernels[:, :taps], color - mixed)
-    more, share = apply_kernels(kernels[:, taps:], estimate)
-    return numerators + denominators * mixed + more, denominators + share
-
-
 def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:
     """Filtered image of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``.
 
@@ -270,7 +216,9 @@ class Filtered:
     Attributes
     ----------
     numerators, denominators : Tensor
-        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `filter_window`.
+        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `apply_kernels`.
+    kernels : Tensor or Pyramid
+        What made them.
     coarse : Filtered, optional
         The same at half the resolution.
     blend : Tensor, optional
@@ -288,28 +236,24 @@ class Filtered:
 
     numerators: Tensor
     denominators: Tensor
+    kernels: Tensor | Pyramid
     coarse: Filtered | None = None
     blend: Tensor | None = None
 
     @classmethod
-    def of(
-        cls,
-        kernels: Tensor | Pyramid,
-        color: Tensor,
-        size: int,
-        estimate: Tensor | None = None,
-        confidence: Tensor | None = None,
-    ) -> Filtered:
-        """Apply kernels of one or more resolutions; the arguments are those of `filter_window`."""
+    def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Filtered:
+        """Apply kernels of one or more resolutions to a window ``(N, T, C, H, W)``."""
         if isinstance(kernels, Tensor):
-            return cls(*filter_window(kernels, color, size, estimate, confidence))
-        sums = filter_window(kernels.kernels[0], color, size, estimate, confidence)
+            return cls(*apply_kernels(kernels, color), kernels)
+        sums = apply_kernels(kernels.kernels[0], color)
         if not kernels.blends:
-            return cls(*sums)
+            return cls(*sums, kernels)
         rest = Pyramid(kernels.kernels[1:], kernels.blends[1:])
-        halves = [None if image is None else _halve(image) for image in (estimate, confidence)]
-        half = cls.of(rest, _halve(color), size, *halves)
-        return cls(*sums, half, kernels.blends[0])
+        return cls(*sums, kernels, cls.of(rest, halve(color)), kernels.blends[0])
+
+    def apply(self, layers: Tensor) -> Tensor:
+        """Filter other layers of the window, ``(N, T, C, H, W)``, with the same kernels; ``(N, C, H, W)``."""
+        return Filtered.of(self.kernels, layers).image(layers[:, layers.shape[1] // 2])
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
         """Image that these frames give together, all without; fallback and epsilon as for `mean_of`."""
@@ -319,8 +263,8 @@ class Filtered:
         fine = mean_of(numerators, denominators, fallback, epsilon)
         if self.coarse is None or self.blend is None:
             return fine
-        low = self.coarse.image(_halve(fallback), frames, epsilon)
-        return fine + self.blend * _double(low - _halve(fine))
+        low = self.coarse.image(halve(fallback), frames, epsilon)
+        return fine + self.blend * double(low - halve(fine))
 
     def parts(self) -> tuple[Tensor, Tensor]:
         """What each frame contributes to the image of all, ``(N, T, C, H, W)``, and its weight, ``(N, T, 1, H, W)``.
@@ -336,17 +280,24 @@ class Filtered:
         blend = self.blend.unsqueeze(1)
         coarse_parts, coarse_shares = self.coarse.parts()
         return (
-            parts + blend * _double(coarse_parts - _halve(parts)),
-            shares + blend * _double(coarse_shares - _halve(shares)),
+            parts + blend * double(coarse_parts - halve(parts)),
+            shares + blend * double(coarse_shares - halve(shares)),
         )
 
 
-def _halve(image: Tensor) -> Tensor:
+def check_threshold(relative: float) -> float:
+    """A threshold in units of 1/K, checked."""
+    if not 0 <= relative < 1:
+        raise ValueError(f"threshold: expected 0 <= t·K < 1, so that t < 1/K, got t·K = {relative}")
+    return relative
+
+
+def halve(image: Tensor) -> Tensor:
     """Mean of 2×2 pixels of ``(..., H, W)``; H and W even."""
     return functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
 
 
-def _double(image: Tensor) -> Tensor:
+def double(image: Tensor) -> Tensor:
     """Linear interpolation of ``(..., H, W)`` to twice the size."""
     doubled = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
     return doubled.unflatten(0, image.shape[:-3])

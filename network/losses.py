@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from network.kernels import Filtered
+from network.stabilizer import Stabilized
 
 #: Frames of a window, and the weight of the loss of the image they give together.
 Term = tuple[tuple[int, ...], float]
@@ -104,6 +105,21 @@ def relmse(
     return _mean(inside * (2 * size - inside), weight)
 
 
+def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Squared error of what is seen: ``mean (T(d) − T(r))²``, ``T(x) = x / (x + s)``; for clean targets.
+
+    Notes
+    -----
+    The square of `tone_mapped_psnr` at the exposure of the picture. Noisy targets would darken by it, as T is concave.
+    Towards references it is better than `relmse`, which counts dark pixels by what they are relative to themselves: a
+    network trained so averaged more over time than the eye, or PSNR, would have it.
+    """
+    level = scale.view(-1, 1, 1, 1)
+    # 1 − s / (x + s), and not x / …: it cannot overflow; negative radiance counts as 0.
+    shown = [1 - level / (functional.relu(image) + level) for image in (prediction, target)]
+    return _mean((shown[0] - shown[1]).square(), weight)
+
+
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
     """Pairs of one frame before the centre and one after: first + fourth and second + fifth of five.
 
@@ -163,7 +179,7 @@ def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -
 
 def temporal_loss(
     loss: ImageLoss,
-    filtered: Filtered,
+    filtered: Filtered | Stabilized,
     color: Tensor,
     target: Tensor,
     modulation: Tensor,
@@ -177,7 +193,7 @@ def temporal_loss(
     ----------
     loss : ImageLoss
         Image loss.
-    filtered : Filtered
+    filtered : Filtered or Stabilized
         The window after its kernels.
     color : Tensor
         ``(N, T, C, H, W)`` aligned irradiance: what a subset to which the kernels give no weight falls back to.

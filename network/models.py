@@ -1,37 +1,35 @@
-"""Kernel-predicting networks in which only Robust Average blocks connect the frames.
+"""The networks by name, and those that predict kernels: in these only Robust Average blocks connect the frames.
 
 A model maps the features of an aligned window (`network.inputs`) to kernels (`network.kernels`). All of its
-convolutions are shared over the frames.
+convolutions are shared over the frames. `Stabilizer`, in a file of its own, works beside per-frame estimates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from network.blocks import ResidualBlock, RobustAverage, TemporalModule
-from network.inputs import CHANNELS, ESTIMATE_CHANNELS, network_inputs, window_exposure
-from network.kernels import Filtered, Pyramid, predict_kernel, softmax_kernel
+from network.inputs import CHANNELS, network_inputs
+from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
+from network.stabilizer import Stabilized, Stabilizer, StabilizerConfig
 
 
 @dataclass(frozen=True)
 class KernelConfig:
-    """The kernels a model predicts: their sources and their threshold."""
+    """The kernels a model predicts: their taps and their threshold."""
 
     frames: int = 5  # T, odd; the window
-    size: int = 5  # K of the noisy frames' K×K taps
-    estimate_size: int = 0  # K of the K×K taps on each frame's estimate; 0: takes none (the paper's model)
-    estimate_share: float = 0.95  # part of the output that the estimates have before training
-    spread: float = 1.0  # part of a noisy frame's weight that is spread over all its taps before training
-    threshold: float = 0.5  # t·K: 0.5 is the paper's t = 1 / (2K)
-    activation: str = "softmax"  # or "relu", the paper's; both with the threshold, 0 for none
+    size: int = 5  # K×K taps on each frame
+    threshold: float = 0.5  # t·taps: 0.5 is the paper's t = 1 / (2K)
+    activation: str = "relu"  # the paper's η_t, or "softmax"; both with the threshold, 0 for none
 
     def __post_init__(self) -> None:
         if self.activation not in ("relu", "softmax"):
@@ -40,32 +38,17 @@ class KernelConfig:
             value = getattr(self, name)
             if value < 1 or value % 2 == 0:
                 raise ValueError(f"{name}: expected an odd number >= 1, got {value}")
-        if self.estimate_size < 0 or (self.estimate_size and self.estimate_size % 2 == 0):
-            raise ValueError(f"estimate_size: expected 0 or an odd number, got {self.estimate_size}")
-        for name in ("estimate_share", "spread"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected 0 < {name} <= 1, got {getattr(self, name)}")
-        _check_threshold(self.threshold)
+        check_threshold(self.threshold)
 
     @property
-    def window_taps(self) -> int:
-        """Taps on the noisy window, T·K·K."""
+    def taps(self) -> int:
+        """T·K·K."""
         return self.frames * self.size**2
 
     @property
-    def estimate_taps(self) -> int:
-        """Taps on the estimates, T·K·K, or 0."""
-        return self.frames * self.estimate_size**2
-
-    @property
     def centre(self) -> int:
-        """The tap on the noisy pixel itself."""
-        return self.window_taps // 2
-
-    @property
-    def channels(self) -> int:
-        """Feature channels per frame that the model reads."""
-        return CHANNELS + (ESTIMATE_CHANNELS if self.estimate_size else 0)
+        """The tap on the pixel itself."""
+        return self.taps // 2
 
 
 @dataclass(frozen=True)
@@ -140,50 +123,32 @@ class TKPCNConfig:
 
 
 class KernelHead(nn.Module):
-    """Last layer: features of each frame to one kernel per pixel over all sources.
+    """Last layer: features of each frame to one kernel per pixel over all frames.
 
     Parameters
     ----------
     channels : int
         Width of the features.
     config : KernelConfig
-        Sources and threshold.
+        Taps and threshold.
 
     Notes
     -----
-    h is what the convolution predicts, c the confidence of the frame, b the kernel at the start: on each noisy frame a
-    peak on the pixel itself and the rest (`KernelConfig.spread`) on all its taps, on each estimate nearly all on the
-    pixel itself, times the share of the source.
-
-    With softmax the raw weights are ``log(b_i c_i) + h_i``, so that the kernel is ``b_i c_i e^{h_i}``, normalised and
-    thresholded, with h bounded to ±4 on the noisy frames and ±0.3 on the estimates. The training thus starts from the
-    gated average of the estimates with a tenth of the noisy frames, or without estimates from the mean over time and
-    the taps. A noisy tap may gain or lose a factor of 55, and what falls below the threshold is gone; but what has no
-    confidence stays out, whatever is predicted.
-
-    With relu, the paper's η_t, they are ``t + (1 − tK) b_i c_i + s h_i``, s the mean of the source's b. As ``η_t``
-    takes t away and renormalises, h = 0 gives the same start, and a tap may reach any weight and none. With estimates
-    some weight leaked past every edge and to frames that were not to be trusted: a shot with sharp outlines came out
-    0.6 dB below the start.
+    h is what the convolution predicts, c the confidence of the frame over the mean of all. With relu, the paper's η_t,
+    the raw weights are ``t + (1 − tK) c / K + h / K``: as η_t takes t away and renormalises, h = 0 gives the mean over
+    time and the taps, weighted by confidence, and a tap may reach any weight and none. With softmax they are
+    ``log c + h`` with h bounded to ±4: what has no confidence stays out, whatever is predicted.
     """
-
-    window_start: Tensor
-    estimate_start: Tensor
 
     def __init__(self, channels: int, config: KernelConfig) -> None:
         super().__init__()
         self.config = config
         self.window = nn.Conv2d(channels, config.size**2, 3, padding=1)
-        self.estimate = nn.Conv2d(channels, config.estimate_size**2, 3, padding=1) if config.estimate_size else None
-        self.register_buffer("window_start", _peak(config.size, config.spread), persistent=False)
-        self.register_buffer("estimate_start", _peak(max(1, config.estimate_size), 0.01), persistent=False)
         with torch.no_grad():
-            for convolution in (self.window, self.estimate):
-                if convolution is not None:
-                    convolution.weight.mul_(0.1)
-                    cast(Tensor, convolution.bias).zero_()
+            self.window.weight.mul_(0.1)
+            cast(Tensor, self.window.bias).zero_()
 
-    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
+    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
         """Predict kernels.
 
         Parameters
@@ -192,8 +157,6 @@ class KernelHead(nn.Module):
             ``(T·N, C, H, W)``, time first.
         confidence : Tensor
             ``(N, T, 1, H, W)``.
-        present : Tensor
-            ``(N,)``, 1 where a sample has an estimate, else 0: its taps then have no weight and do not count in K.
         threshold : float, optional
             t·K in [0, 1). Default: the configured one, which the model was trained with.
 
@@ -203,28 +166,17 @@ class KernelHead(nn.Module):
             ``(N, taps, H, W)`` float32.
         """
         config = self.config
-        here = present.float().view(-1, 1, 1, 1) if config.estimate_size else features.new_zeros(1, 1, 1, 1).float()
-        taps = config.window_taps + here * config.estimate_taps
-        share = config.estimate_share * here
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         confidence = confidence.float() + 1e-3
         confidence = confidence / confidence.mean(1, keepdim=True)
-        # Scales of the sources' weights, in units of 1/K: 1 where there is one source.
-        sources = [(self.window, self.window_start, taps * (1 - share) / config.window_taps, 4.0)]
-        if self.estimate is not None:
-            sources.append((self.estimate, self.estimate_start, taps * share / config.estimate_taps, 0.3))
-        weights = []
-        for convolution, start, scale, bound in sources:
-            raw = _frames_first(convolution(features), config.frames)
-            scale = scale.view(-1, 1, 1, 1, 1)
-            if config.activation == "softmax":  # absent, a source is at log(0), and has no weight
-                weights.append(bound * torch.tanh(raw / bound) + (confidence.log() + (scale * start).log()))
-            else:
-                floor = config.threshold * (scale > 0)
-                weights.append(floor + scale * ((1 - config.threshold) * confidence * start + raw))
-        cut = (config.threshold if threshold is None else _check_threshold(threshold)) / taps
-        activate = softmax_kernel if config.activation == "softmax" else predict_kernel
-        return activate(torch.cat([weight.flatten(1, 2) for weight in weights], 1), cut, centre=config.centre)
+        raw = _frames_first(self.window(features), config.frames)
+        cut = config.threshold if threshold is None else check_threshold(threshold)
+        if config.activation == "softmax":
+            weights = 4.0 * torch.tanh(raw / 4.0) + confidence.log()
+            return softmax_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)
+        # In units of 1/K, which η_t does not see.
+        weights = config.threshold + (1 - config.threshold) * confidence + raw
+        return predict_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)
 
 
 class RAUNet(nn.Module):
@@ -245,7 +197,7 @@ class RAUNet(nn.Module):
         super().__init__()
         self.config = config
         widths = config.widths
-        self.stem = nn.Conv2d(config.kernel.channels, widths[0], 3, padding=1)
+        self.stem = nn.Conv2d(CHANNELS, widths[0], 3, padding=1)
         self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
         self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in config.ra_scales})
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
@@ -258,14 +210,14 @@ class RAUNet(nn.Module):
         """Height and width must be multiples of this."""
         return int(2 ** (len(self.config.widths) - 1))
 
-    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
+    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
         """Kernels of an aligned window.
 
         Parameters
         ----------
         features : Tensor
             ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
-        confidence, present, threshold
+        confidence, threshold
             As for `KernelHead.forward`.
 
         Returns
@@ -278,7 +230,7 @@ class RAUNet(nn.Module):
         ValueError
             If frames or channels are not the model's, or height or width is no multiple of `multiple`.
         """
-        return cast(Tensor, self.head(self.trunk(features), confidence, present, threshold))
+        return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
 
     def trunk(self, features: Tensor) -> Tensor:
         """Features of an aligned window to those that kernels are predicted from, ``(T·N, C, H, W)``, time first."""
@@ -324,7 +276,7 @@ class RAResNet(nn.Module):
         super().__init__()
         self.config = config
         width, size = config.width, config.conv_size
-        self.stem = nn.Conv2d(config.kernel.channels, width, size, padding=size // 2)
+        self.stem = nn.Conv2d(CHANNELS, width, size, padding=size // 2)
         self.blocks = nn.ModuleList(ResidualBlock(width, size) for _ in range(config.blocks))
         self.average = nn.ModuleDict({str(block): RobustAverage(width, size) for block in config.ra_after})
         self.skip = nn.ModuleList(nn.Conv2d(2 * width, width, 1) for _ in range(config.skips))
@@ -335,9 +287,9 @@ class RAResNet(nn.Module):
         """Height and width must be multiples of this."""
         return 1
 
-    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
+    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
         """Kernels of an aligned window; see `RAUNet.forward`."""
-        return cast(Tensor, self.head(self.trunk(features), confidence, present, threshold))
+        return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
 
     def trunk(self, features: Tensor) -> Tensor:
         """See `RAUNet.trunk`."""
@@ -371,7 +323,7 @@ class TKPCN(nn.Module):
         super().__init__()
         self.config = config
         width, size = config.width, config.conv_size
-        self.stem = nn.Conv2d(config.kernel.channels, width, size, padding=size // 2)
+        self.stem = nn.Conv2d(CHANNELS, width, size, padding=size // 2)
         self.blocks = nn.ModuleList(ResidualBlock(width, size) for _ in range(config.blocks))
         self.temporal = TemporalModule(width, config.kernel.frames, config.temporal_blocks, size)
         self.head = KernelHead(width, config.kernel)
@@ -381,13 +333,13 @@ class TKPCN(nn.Module):
         """Height and width must be multiples of this."""
         return 1
 
-    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Tensor:
+    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
         """Kernels of an aligned window; see `RAUNet.forward`."""
         x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
         for block in self.blocks:
             x = block(x)
         x = self.temporal(x, self.config.kernel.frames)
-        return cast(Tensor, self.head(torch.relu(x), confidence, present, threshold))
+        return cast(Tensor, self.head(torch.relu(x), confidence, threshold))
 
 
 class MultiScale(nn.Module):
@@ -424,26 +376,31 @@ class MultiScale(nn.Module):
         """Height and width must be multiples of this."""
         return max(self.base.multiple, int(2 ** (self.config.scales - 1)))
 
-    def forward(self, features: Tensor, confidence: Tensor, present: Tensor, threshold: float | None = None) -> Pyramid:
+    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Pyramid:
         """Kernels of an aligned window at each resolution; the arguments are those of `RAUNet.forward`."""
         for name, length in zip(("height", "width"), features.shape[3:], strict=True):
             if length % self.multiple:
                 raise ValueError(f"features: expected a {name} that is a multiple of {self.multiple}, got {length}")
         x = self.base.trunk(features)
-        kernels, blends = [self.base.head(x, confidence, present, threshold)], []
+        kernels, blends = [self.base.head(x, confidence, threshold)], []
         for head, blend in zip(self.heads, self.blend, strict=True):
             centre = x.chunk(self.config.kernel.frames)[self.config.kernel.frames // 2]
             blends.append(torch.sigmoid(blend(centre)).float())
             x, confidence = functional.avg_pool2d(x, 2), functional.avg_pool3d(confidence, (1, 2, 2))
-            kernels.append(head(x, confidence, present, threshold))
+            kernels.append(head(x, confidence, threshold))
         return Pyramid(tuple(kernels), tuple(blends))
 
 
-Model = RAUNet | RAResNet | TKPCN | MultiScale
+Model = RAUNet | RAResNet | TKPCN | MultiScale | Stabilizer
 
 
-def fast(frames: int = 5, seed: int = 0) -> RAUNet:
-    """Small U-Net for two CPU cores: 0.25 M parameters, 0.25 M multiplications per pixel and window.
+def window_length(model: Model) -> int:
+    """Frames that a model looks at, T."""
+    return model.config.frames if isinstance(model, Stabilizer) else model.config.kernel.frames
+
+
+def fast(frames: int = 5, seed: int = 0) -> Stabilizer:
+    """Beside per-frame estimates, for two CPU cores: 0.2 M parameters.
 
     Parameters
     ----------
@@ -453,36 +410,50 @@ def fast(frames: int = 5, seed: int = 0) -> RAUNet:
         Of the initial weights; so for all presets.
     """
     with _seeded(seed):
-        return RAUNet(RAUNetConfig(_beside_estimates(frames)))
+        return Stabilizer(StabilizerConfig(frames))
 
 
-def balanced(frames: int = 5, seed: int = 0) -> RAUNet:
-    """U-Net of twice the width at full resolution, with RA blocks at every scale: 0.4 M parameters."""
+def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
+    """Beside per-frame estimates, wider."""
     with _seeded(seed):
-        return RAUNet(RAUNetConfig(_beside_estimates(frames), widths=(32, 48, 64), ra_scales=(0, 1, 2)))
+        return Stabilizer(StabilizerConfig(frames, widths=(32, 48, 64)))
 
 
-def quality(frames: int = 5, seed: int = 0) -> MultiScale:
-    """Four-scale U-Net with RA blocks at every scale and kernels at three resolutions: 1.6 M parameters."""
+def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
+    """Beside per-frame estimates, wider still, and at one resolution more."""
     with _seeded(seed):
-        base = RAUNetConfig(_beside_estimates(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
+        return Stabilizer(StabilizerConfig(frames, widths=(48, 64, 96)))
+
+
+def unet(frames: int = 5, seed: int = 0) -> RAUNet:
+    """From noisy frames alone, a small U-Net: 0.25 M parameters."""
+    with _seeded(seed):
+        return RAUNet(RAUNetConfig(KernelConfig(frames)))
+
+
+def multiscale(frames: int = 5, seed: int = 0) -> MultiScale:
+    """From noisy frames alone: a four-scale U-Net with RA blocks at every scale, kernels at three resolutions."""
+    with _seeded(seed):
+        base = RAUNetConfig(KernelConfig(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
         return MultiScale(MultiScaleConfig(base))
 
 
 def paper(frames: int = 5, seed: int = 0, conv_size: int = 3) -> RAResNet:
-    """The paper's network: 24 blocks of width 80, no estimate; conv_size is what the paper leaves open."""
+    """The paper's network: 24 blocks of width 80; conv_size is what the paper leaves open."""
     with _seeded(seed):
-        return RAResNet(RAResNetConfig(KernelConfig(frames=frames, activation="relu"), conv_size=conv_size))
+        return RAResNet(RAResNetConfig(KernelConfig(frames), conv_size=conv_size))
 
 
 def tkpcn(frames: int = 5, seed: int = 0, conv_size: int = 3) -> TKPCN:
     """The paper's baseline at the size of `paper`: no RA blocks, the temporal module of Vogels et al. 2018 instead."""
     with _seeded(seed):
-        return TKPCN(TKPCNConfig(KernelConfig(frames=frames, activation="relu"), conv_size=conv_size))
+        return TKPCN(TKPCNConfig(KernelConfig(frames), conv_size=conv_size))
 
 
 #: What can be asked for by name.
-PRESETS: dict[str, Callable[..., Model]] = {build.__name__: build for build in (fast, balanced, quality, paper, tkpcn)}
+PRESETS: dict[str, Callable[..., Model]] = {
+    build.__name__: build for build in (fast, balanced, quality, unet, multiscale, paper, tkpcn)
+}
 
 
 def for_inference(model: Model, bfloat16: bool) -> Model:
@@ -505,84 +476,83 @@ def channels_last(model: Model) -> Model:
     return model
 
 
+def filter_window(
+    model: Model,
+    window: Mapping[str, Tensor | None],
+    threshold: float | None = None,
+    run: Callable[..., Any] | None = None,
+) -> Filtered | Stabilized:
+    """Run a model on an aligned window.
+
+    Parameters
+    ----------
+    model : Model
+        Any.
+    window : mapping
+        ``color``, ``albedo``, ``normal``, ``estimate``, ``confidence`` and ``exposure``, as for `denoise_tile`.
+    threshold : float, optional
+        Instead of the model's own.
+    run : callable, optional
+        Stands for the model where it is wrapped.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit the model, or it takes estimates and there are none.
+    """
+    color, confidence, exposure = (cast(Tensor, window[name]) for name in ("color", "confidence", "exposure"))
+    estimate, run = window.get("estimate"), model if run is None else run
+    if not isinstance(model, Stabilizer):
+        features = network_inputs(color, window.get("albedo"), window.get("normal"), confidence, exposure)
+        return Filtered.of(run(features, confidence, threshold), color)
+    if estimate is None:
+        raise ValueError("estimate: expected one beside color, as this network takes, got none")
+    features = network_inputs(color, window.get("albedo"), window.get("normal"), confidence, exposure, estimate)
+    return cast(Stabilized, run(features, color, estimate, confidence, exposure, threshold))
+
+
 @torch.inference_mode()
 def denoise_tile(
     model: Model,
-    color: Tensor,
-    albedo: Tensor | None,
-    normal: Tensor | None,
-    confidence: Tensor,
-    exposure: Tensor | None = None,
-    estimate: Tensor | None = None,
+    window: Mapping[str, Tensor | None],
     *,
     threshold: float | None = None,
     aovs: Tensor | None = None,
-) -> tuple[Tensor, Filtered, Tensor | None]:
+) -> tuple[Tensor, Filtered | Stabilized, Tensor | None]:
     """Denoise one tile of an aligned window.
 
     Parameters
     ----------
     model : Model
         In the precision of `for_inference`.
-    color : Tensor
-        ``(N, T, 3, H, W)`` aligned irradiance, float32, finite.
-    albedo, normal : Tensor, optional
-        ``(N, T, 3, H, W)``.
-    confidence : Tensor
-        ``(N, T, 1, H, W)``.
-    exposure : Tensor, optional
-        ``(N,)`` of the *whole* window, from `network.inputs.window_exposure`. Default: of this tile, which is
-        right only if the tile is the frame.
-    estimate : Tensor, optional
-        ``(N, T, 3, H, W)`` aligned estimates, irradiance. Ignored by a model that takes none.
+    window : mapping
+        ``color``, ``(N, T, 3, H, W)`` aligned irradiance, float32, finite; ``albedo``, ``normal`` and ``estimate``
+        likewise, or None; ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, from
+        `network.inputs.window_exposure`.
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.
     aovs : Tensor, optional
-        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels.
+        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; by a `Stabilizer`
+        averaged with the frames' weights.
 
     Returns
     -------
     denoised : Tensor
         ``(N, 3, H, W)`` irradiance.
-    filtered : Filtered
+    filtered : Filtered or Stabilized
         The color's sums of each frame; its ``parts()`` are what each frame contributes.
     aovs : Tensor or None
-        ``(N, C, H, W)``, where there were any. Without an estimate of their own, they get the window's taps
-        renormalised.
+        ``(N, C, H, W)``, where there were any.
 
     Raises
     ------
     ValueError
-        If shapes do not fit the model; see `RAUNet.forward`.
+        See `filter_window`.
     """
-    config = model.config.kernel
-    if not config.estimate_size:
-        estimate = None
-    exposure = window_exposure(color) if exposure is None else exposure
-    present = color.new_full((color.shape[0],), 0.0 if estimate is None else 1.0)
-    features = network_inputs(
-        color,
-        albedo,
-        normal,
-        confidence,
-        exposure,
-        takes_estimate=config.estimate_size > 0,
-        estimate=estimate,
-        present=present,
-    )
-    kernels = model(features, confidence, present, threshold)
-    centre = config.frames // 2
-    filtered = Filtered.of(kernels, color, config.size, estimate, confidence)
+    filtered, centre = filter_window(model, window, threshold), window_length(model) // 2
+    color = cast(Tensor, window["color"])
     denoised = filtered.image(color[:, centre]).clamp_min(0)
-    if aovs is None:
-        return denoised, filtered, None
-    return denoised, filtered, Filtered.of(kernels, aovs, config.size).image(aovs[:, centre])
-
-
-def _beside_estimates(frames: int) -> KernelConfig:
-    """Kernels of the presets that take estimates."""
-    # The threshold: noisy taps start at a hundredth of the mean weight, and must not be cut before they learn.
-    return KernelConfig(frames=frames, estimate_size=1, estimate_share=0.9, threshold=0.005)
+    return denoised, filtered, None if aovs is None else filtered.apply(aovs)
 
 
 @contextmanager
@@ -595,7 +565,7 @@ def _seeded(seed: int) -> Iterator[None]:
 
 def _time_first(features: Tensor, config: KernelConfig, multiple: int, dtype: torch.dtype) -> Tensor:
     """``(N, T, C, H, W)`` to ``(T·N, C, H, W)`` channels last, after checking each axis by itself."""
-    expected = (config.frames, config.channels)
+    expected = (config.frames, CHANNELS)
     if features.ndim != 5 or tuple(features.shape[1:3]) != expected:
         raise ValueError(f"features: expected (N, {expected[0]}, {expected[1]}, H, W), got {tuple(features.shape)}")
     for name, length in zip(("height", "width"), features.shape[3:], strict=True):
@@ -616,10 +586,3 @@ def _peak(size: int, spread: float) -> Tensor:
     kernel = torch.full((1, 1, taps, 1, 1), spread)
     kernel[:, :, taps // 2] += taps * (1 - spread)
     return kernel
-
-
-def _check_threshold(relative: float) -> float:
-    """A threshold in units of 1/K, checked."""
-    if not 0 <= relative < 1:
-        raise ValueError(f"threshold: expected 0 <= t·K < 1, so that t < 1/K, got t·K = {relative}")
-    return relative

@@ -28,12 +28,17 @@ from torch.utils.data import DataLoader
 from network import losses
 from network.checkpoint import describe, save_model
 from network.clips import Clips, SamplerConfig, Samples, whole_frames
-from network.inputs import network_inputs
 from network.kernels import Filtered, mean_of
-from network.models import Model, channels_last
+from network.models import Model, channels_last, filter_window
 from network.perceptual import Perceptual, load_vgg19
+from network.stabilizer import Stabilized
 
-LOSSES: dict[str, losses.ImageLoss] = {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse}
+LOSSES: dict[str, losses.ImageLoss] = {
+    "l1": losses.l1,
+    "smape": losses.smape,
+    "relmse": losses.relmse,
+    "display": losses.display,
+}
 TERMS = ("temporal", "power", "spatial")
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -94,25 +99,10 @@ class TrainConfig:
 
 def predict(
     model: Model, batch: dict[str, Tensor], bfloat16: bool = False, run: Callable[..., Any] | None = None
-) -> Filtered:
+) -> Filtered | Stabilized:
     """Filter a batch of `Samples`; `run` stands for the model where it is wrapped."""
-    config = model.config.kernel
-    takes_estimate = config.estimate_size > 0
-    present = batch["present"] if takes_estimate else torch.zeros_like(batch["present"])
-    estimate = batch["estimate"] * present.view(-1, 1, 1, 1, 1) if takes_estimate else None
-    features = network_inputs(
-        batch["color"],
-        batch["albedo"],
-        batch["normal"],
-        batch["confidence"],
-        batch["exposure"],
-        takes_estimate=takes_estimate,
-        estimate=estimate,
-        present=present,
-    )
-    with torch.autocast(features.device.type, torch.bfloat16, enabled=bfloat16):
-        kernels = (model if run is None else run)(features, batch["confidence"], present)
-    return Filtered.of(kernels, batch["color"], config.size, estimate, batch["confidence"])
+    with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
+        return filter_window(model, batch, run=run)
 
 
 def batch_loss(
@@ -122,7 +112,7 @@ def batch_loss(
     loss: losses.ImageLoss,
     run: Callable[..., Any] | None = None,
 ) -> Tensor:
-    """Training loss of a batch: the temporal loss of each crop, relative to that of its clip's best input.
+    """Training loss of a batch: log(1 + the temporal loss of each crop, relative to that of its clip's best input).
 
     Notes
     -----
@@ -130,14 +120,15 @@ def batch_loss(
     crop's loss is divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the
     centre's estimate), so that every clip counts about the same. Where clips are whole frames and a crop was divided by
     its own input's loss, flat crops, in which averaging can do no harm, outweighed the edges, and the network averaged
-    where it should not.
+    where it should not. The logarithm is for the few crops that are twenty times worse than their clip: one of them
+    would undo what a hundred others have taught.
     """
     filtered = predict(model, batch, config.bfloat16, run)
     terms = config.loss_terms(batch["color"].shape[1])
     value = losses.temporal_loss(
         loss, filtered, batch["color"], batch["target"], batch["modulation"], batch["exposure"], terms, config.slope
     )
-    return (value / batch["error"]).mean()
+    return torch.log1p(value / batch["error"]).mean()
 
 
 @torch.no_grad()
@@ -155,8 +146,8 @@ def validate(model: Model, clips: Clips) -> dict[str, float]:
     -------
     dict
         PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's),
-        ``gated`` (their average), ``denoised``, and ``blind``, denoised without estimates. ``mean``: radiance of
-        denoised over that of the targets. ``side``: weight of the side frames.
+        ``gated`` (their average) and ``denoised``. ``mean``: radiance of denoised over that of the targets. ``side``:
+        weight of the side frames.
     """
     sums: dict[str, float] = {}
     device = next(model.parameters()).device
@@ -171,10 +162,8 @@ def validate(model: Model, clips: Clips) -> dict[str, float]:
             "estimate": estimate[:, centre],
             "gated": mean_of(estimate * confidence, confidence, estimate[:, centre]),
         }
-        for name, present in (("blind", 0.0), ("denoised", 1.0)):
-            batch["present"] = torch.full_like(batch["present"], present)
-            filtered = predict(model, batch)
-            images[name] = filtered.image(batch["color"][:, centre])
+        filtered = predict(model, batch)
+        images["denoised"] = filtered.image(batch["color"][:, centre])
         values = {name: float(losses.tone_mapped_psnr(image * modulation, target)) for name, image in images.items()}
         values["mean"] = float((images["denoised"] * modulation).sum() / target.sum().clamp_min(1e-6))
         values["side"] = 1 - float(filtered.parts()[1][:, centre].mean())

@@ -32,7 +32,7 @@ from network.clips import (
 pytestmark = pytest.mark.neural
 
 #: Nothing random but the clip, the level, the target and the orientation.
-PLAIN = SamplerConfig(crop=16, sets=1, drop_estimate=0, drop_frames=0, fireflies=0, exposure_stops=0)
+PLAIN = SamplerConfig(crop=16, sets=1, drop_frames=0, fireflies=0, exposure_stops=0)
 SPP = (8, 8, 2)
 
 
@@ -256,7 +256,7 @@ def test_processes_that_read_make_the_same_batches(tmp_path: Path) -> None:
     samples = Samples(folder_of(tmp_path, {"a": 3}), SamplerConfig(crop=16), 0)
     batches = [next(iter(DataLoader(samples, batch_sampler=[[0, 1, 2]], num_workers=workers))) for workers in (0, 1)]
     assert batches[0]["color"].shape == (3, 3, 3, 16, 16)
-    assert batches[0]["exposure"].shape == batches[0]["present"].shape == (3,)
+    assert batches[0]["exposure"].shape == (3,)
     assert all(torch.equal(value, batches[1][name]) for name, value in batches[0].items())
 
 
@@ -313,7 +313,6 @@ def test_variations_do_what_they_say(tmp_path: Path) -> None:
     assert float(bright.max()) > 2  # without, below 1.1 / 2
     away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n]["exposure"]) for n in range(20)]
     assert 0.25 * 0.25 <= min(away) < max(away) <= 4
-    assert [float(Samples(clips, replace(PLAIN, drop_estimate=p), 0)[0]["present"]) for p in (0, 1)] == [1, 0]
 
 
 def test_samplers_say_what_is_wrong(tmp_path: Path) -> None:
@@ -335,6 +334,6 @@ def test_whole_frames_are_every_level_towards_the_cleanest(tmp_path: Path) -> No
         assert batch["color"].shape == (1, 3, 3, 16, 20)
         assert batch["confidence"].shape == (1, 3, 1, 16, 20)
         assert batch["target"].shape == (1, 3, 16, 20)
-        assert batch["exposure"].shape == batch["present"].shape == (1,)
+        assert batch["exposure"].shape == (1,)
         target = make_clip(size=(18, 21)).noisy[1 if level == 0 else 0, :, :16, :20] / 2
         torch.testing.assert_close(batch["target"][0], target, rtol=1e-3, atol=1e-4)

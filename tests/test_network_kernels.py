@@ -15,7 +15,6 @@ from network.kernels import (
     Filtered,
     Pyramid,
     apply_kernels,
-    filter_window,
     mean_of,
     predict_kernel,
     softmax_kernel,
@@ -197,42 +196,11 @@ def test_a_firefly_outside_the_support_of_the_kernel_leaves_no_trace() -> None:
     assert torch.equal(filtered[..., :5], torch.ones(1, 3, 9, 5))
 
 
-def test_a_noisy_tap_is_moved_by_what_the_estimate_says_of_the_way() -> None:
-    """Against plain loops, in the middle of the image; side frames are mixed with the centre by confidence."""
-    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 27 + 3, 5, 4, seed=1)
-    estimates, confidence = uniform(1, 3, 2, 5, 4, seed=2), uniform(1, 3, 1, 5, 4, seed=3)
-    numerators, denominators = filter_window(kernels, color, 3, estimates, confidence)
-    mixed = confidence * estimates + (1 - confidence) * estimates[:, 1:2]
-    y, x = 2, 1
-    for t in range(3):
-        expected, weight = kernels[0, 27 + t, y, x] * estimates[0, t, :, y, x], kernels[0, 27 + t, y, x]
-        for tap in range(9):
-            there = (0, t, slice(None), y + tap // 3 - 1, x + tap % 3 - 1)
-            moved = color[there] - mixed[there] + mixed[0, t, :, y, x]
-            expected = expected + kernels[0, 9 * t + tap, y, x] * moved
-            weight = weight + kernels[0, 9 * t + tap, y, x]
-        torch.testing.assert_close(numerators[0, t, :, y, x], expected)
-        torch.testing.assert_close(denominators[0, t, 0, y, x], weight)
-
-
-def test_an_estimate_that_explains_the_frames_is_not_blurred() -> None:
-    color, kernels = uniform(1, 3, 2, 6, 6), uniform(1, 27 + 3, 6, 6, seed=1)
-    color = color[:, 1:2].expand_as(color)
-    sums = filter_window(kernels, color, 3, color, torch.ones(1, 3, 1, 6, 6))
-    torch.testing.assert_close(mean_of(*sums, color[:, 1]), color[:, 1])
-
-
-def test_a_layer_without_an_estimate_is_filtered_by_the_windows_taps() -> None:
-    color, kernels = uniform(1, 3, 2, 5, 4), uniform(1, 28, 5, 4, seed=1)
-    for got, expected in zip(filter_window(kernels, color, 3), apply_kernels(kernels[:, :27], color), strict=True):
-        assert torch.equal(got, expected)
-
-
 def test_kernels_are_linear_so_that_layers_still_sum() -> None:
     kernels, a, b = uniform(1, 27, 5, 4), uniform(1, 3, 3, 5, 4, seed=1), uniform(1, 3, 3, 5, 4, seed=2)
 
     def filtered(x: torch.Tensor) -> torch.Tensor:
-        return mean_of(*filter_window(kernels, x, 3), x[:, 1])
+        return mean_of(*apply_kernels(kernels, x), x[:, 1])
 
     torch.testing.assert_close(filtered(a + b), filtered(a) + filtered(b))
 
@@ -256,13 +224,6 @@ def test_without_any_weight_the_image_is_the_fallback() -> None:
 def test_shapes_that_do_not_fit_are_an_error(kernels, frames, message) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         apply_kernels(torch.zeros(kernels), torch.zeros(frames))
-
-
-def test_an_estimate_of_another_number_of_frames_is_an_error() -> None:
-    with pytest.raises(ValueError, match="estimate: expected 3 frames, got 2"):
-        filter_window(torch.zeros(1, 29, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 2, 1, 4, 4))
-    with pytest.raises(ValueError, match="confidence: expected one beside estimate, got none"):
-        filter_window(torch.zeros(1, 30, 4, 4), torch.zeros(1, 3, 1, 4, 4), 3, torch.zeros(1, 3, 1, 4, 4))
 
 
 # Several resolutions
@@ -294,7 +255,7 @@ def doubled(image: torch.Tensor) -> torch.Tensor:
 def test_resolutions_are_blended_as_in_the_equation(subset: tuple[int, ...] | None) -> None:
     kernels, color = pyramid(), uniform(1, 3, 2, 8, 8, seed=5)
     fallback = color[:, 1]
-    got = Filtered.of(kernels, color, 3).image(fallback, subset)
+    got = Filtered.of(kernels, color).image(fallback, subset)
     images = []
     for kernel in kernels.kernels:
         numerators, denominators = by_loops(kernel, color)
@@ -309,7 +270,7 @@ def test_resolutions_are_blended_as_in_the_equation(subset: tuple[int, ...] | No
 def test_parts_of_several_resolutions_sum_to_the_image_and_to_one() -> None:
     color = uniform(2, 3, 2, 8, 8, seed=5)
     for kernels in (pyramid(2), pyramid(2).kernels[0]):
-        filtered = Filtered.of(kernels, color, 3)
+        filtered = Filtered.of(kernels, color)
         parts, shares = filtered.parts()
         torch.testing.assert_close(parts.sum(1), filtered.image(color[:, 1]), rtol=1e-5, atol=1e-5)  # ε = 1e-6
         torch.testing.assert_close(shares.sum(1), torch.ones(2, 1, 8, 8, dtype=torch.float64))
@@ -318,13 +279,13 @@ def test_parts_of_several_resolutions_sum_to_the_image_and_to_one() -> None:
 def test_without_blend_only_the_finest_resolution_counts() -> None:
     kernels, color = pyramid(), uniform(1, 3, 2, 8, 8, seed=5)
     fine = Pyramid(kernels.kernels, tuple(torch.zeros_like(blend) for blend in kernels.blends))
-    expected = Filtered.of(kernels.kernels[0], color, 3).image(color[:, 1])
-    torch.testing.assert_close(Filtered.of(fine, color, 3).image(color[:, 1]), expected)
+    expected = Filtered.of(kernels.kernels[0], color).image(color[:, 1])
+    torch.testing.assert_close(Filtered.of(fine, color).image(color[:, 1]), expected)
 
 
 def test_a_constant_passes_all_resolutions() -> None:
     color = torch.full((1, 3, 2, 8, 8), 3.7, dtype=torch.float64)
-    torch.testing.assert_close(Filtered.of(pyramid(), color, 3).image(color[:, 1]), color[:, 1])
+    torch.testing.assert_close(Filtered.of(pyramid(), color).image(color[:, 1]), color[:, 1])
 
 
 def test_gradient_through_all_resolutions() -> None:
@@ -332,6 +293,6 @@ def test_gradient_through_all_resolutions() -> None:
     leaves = [value.clone().requires_grad_() for value in (*kernels.kernels, *kernels.blends)]
 
     def image(*values: torch.Tensor) -> torch.Tensor:
-        return Filtered.of(Pyramid(values[:3], values[3:]), color, 3).image(color[:, 1], (0, 2), 1e-3)
+        return Filtered.of(Pyramid(values[:3], values[3:]), color).image(color[:, 1], (0, 2), 1e-3)
 
     assert torch.autograd.gradcheck(image, leaves)

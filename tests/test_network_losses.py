@@ -14,6 +14,7 @@ from network.kernels import Filtered, apply_kernels, mean_of, predict_kernel
 from network.losses import (
     SUBSET_EPSILON,
     asymmetry,
+    display,
     frame_pairs,
     l1,
     power_terms,
@@ -27,7 +28,7 @@ from network.losses import (
 
 pytestmark = pytest.mark.neural
 
-LOSSES = [l1, smape, relmse]
+LOSSES = [l1, smape, relmse, display]
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -45,6 +46,8 @@ def by_loops(name: str, d: torch.Tensor, r: torch.Tensor, s: float) -> float:
                     values.append(abs(a - b) / s)
                 elif name == "smape":
                     values.append(abs(a - b) / (abs(a) + abs(b) + 0.01 * s))
+                elif name == "display":
+                    values.append((a / (a + s) - b / (b + s)) ** 2)
                 else:
                     e = abs(a - b) / math.sqrt(level**2 + 0.1 * s**2)
                     values.append(e**2 if e <= 4 else 4**2 + 2 * 4 * (e - 4))
@@ -106,6 +109,8 @@ def test_relmse_does_not_bias_the_mean_and_the_others_darken_it() -> None:
     # 59 % of such targets are below their mean; L1 counts heads: 0.59 − 0.41.
     assert pull_at_the_mean(l1) == pytest.approx(0.19, abs=0.02)
     assert pull_at_the_mean(smape) > 0.1
+    # Concave: the mean of T over the noise is below T of the mean.
+    assert pull_at_the_mean(display) > 0.1
     # Values beyond four times the mean are 0.3 % here: the limit costs next to nothing.
     assert 0 <= pull_at_the_mean(relmse) < 0.01
 
@@ -172,7 +177,7 @@ def test_temporal_loss_is_the_loss_of_renormalised_subsets(terms) -> None:  # ty
     kernels = predict_kernel(uniform(2, frames * 9, 6, 5), 0.0, centre=frames * 9 // 2)
     color, target = uniform(2, frames, 3, 6, 5, seed=1), uniform(2, 3, 6, 5, seed=2)
     modulation, scale = uniform(2, 3, 6, 5, seed=3), torch.tensor([0.5, 2.0], dtype=torch.float64)
-    filtered = Filtered(*apply_kernels(kernels, color))
+    filtered = Filtered.of(kernels, color)
 
     expected = 0
     for subset, weight in terms:
@@ -194,7 +199,7 @@ def test_frames_without_weight_are_judged_by_their_own_pixels() -> None:
     color, target = uniform(1, 5, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
     numerators, denominators = torch.zeros(1, 5, 3, 4, 4).double(), torch.zeros(1, 5, 1, 4, 4).double()
     numerators[:, 2], denominators[:, 2] = color[:, 2], 1
-    filtered = Filtered(numerators, denominators)
+    filtered = Filtered(numerators, denominators, denominators)
     one = torch.ones(1, dtype=torch.float64)
     got = temporal_loss(l1, filtered, color, target, torch.ones_like(target), one, temporal_terms(5))
     images = [color[:, 2], color[:, [0, 3]].mean(1), color[:, [1, 4]].mean(1)]
@@ -206,10 +211,17 @@ def test_temporal_loss_does_not_depend_on_the_scale() -> None:
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     scale = torch.ones(1, dtype=torch.float64)
     terms = temporal_terms(3, 1.0)
-    once = temporal_loss(relmse, Filtered(*sums), color, target, modulation, scale, terms, 3.0)
+    once = temporal_loss(relmse, Filtered(*sums, sums[1]), color, target, modulation, scale, terms, 3.0)
     numerators, denominators = sums
     scaled = temporal_loss(
-        relmse, Filtered(numerators * 512, denominators), color * 512, target * 512, modulation, scale * 512, terms, 3.0
+        relmse,
+        Filtered(numerators * 512, denominators, denominators),
+        color * 512,
+        target * 512,
+        modulation,
+        scale * 512,
+        terms,
+        3.0,
     )
     torch.testing.assert_close(scaled, once)
 
@@ -218,7 +230,9 @@ def test_the_slope_weighs_each_terms_errors() -> None:
     color, target = uniform(1, 3, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     one = torch.ones(1, dtype=torch.float64)
-    got = temporal_loss(smape, Filtered(*sums), color, target, torch.ones_like(target), one, spatial_terms(3), 2.0)
+    got = temporal_loss(
+        smape, Filtered(*sums, sums[1]), color, target, torch.ones_like(target), one, spatial_terms(3), 2.0
+    )
     image = mean_of(*sums, color[:, 1], SUBSET_EPSILON)
     expected = smape(image, target, one, asymmetry(image, target, color[:, 1], 2.0))
     torch.testing.assert_close(got, expected)

@@ -16,7 +16,7 @@ from hybrid.frames import open_shot  # noqa: E402
 from hybrid.training import open_levels, parse_samples  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
-from network.models import KernelConfig, RAUNet, RAUNetConfig  # noqa: E402
+from network.stabilizer import Stabilizer, StabilizerConfig  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -41,8 +41,7 @@ def weights(tmp_path_factory):
     """A small network of three frames, not trained."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    kernel = KernelConfig(frames=3, size=3, estimate_size=1, estimate_share=0.5)
-    save_model(path, RAUNet(RAUNetConfig(kernel, widths=(4, 4), ra_scales=(1,))))
+    save_model(path, Stabilizer(StabilizerConfig(frames=3, widths=(4, 4), ra_scales=(1,))))
     return path
 
 
@@ -104,7 +103,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
     assert "denoised" in capsys.readouterr().err
     assert load_notes(out)["training"]["steps"] == 2
-    assert load_model(out).config.kernel.frames == 3
+    assert load_model(out).config.frames == 3
     assert list((tmp_path / "logs").glob("events.*"))
 
     # On one's own footage, one level and no reference, from weights there are.
@@ -119,7 +118,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
         (["--steps", "1", "--resume"], "resume: no file"),
         (
             ["--steps", "1", "--preset", "slow"],
-            "preset is 'slow', expected one of fast, balanced, quality, paper",
+            "preset is 'slow', expected one of fast, balanced, quality, unet, multiscale, paper, tkpcn",
         ),
         (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
         ([], "steps, minutes: expected at least one limit"),
@@ -160,7 +159,7 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
         first = []
         for folder in folders:
             out = tmp_path / f"{folder.name}{passes}"
-            options = ["--weights", weights, "--estimate", "none", "--precision", "float32", "--effects", "warp"]
+            options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--effects", "warp"]
             code = run("denoise", folder, "-o", out, "--passes", passes, "--no-effects", "refine", *options)
             assert code == 0, capsys.readouterr().err
             left = {item.name for item in out.iterdir()}  # nothing of the first pass

@@ -12,9 +12,9 @@ torch = pytest.importorskip("torch")
 from hybrid import metrics  # noqa: E402
 from network import losses  # noqa: E402
 from network.blocks import ravg  # noqa: E402
-from network.inputs import network_inputs, window_exposure  # noqa: E402
+from network.inputs import window_exposure  # noqa: E402
 from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
-from network.models import denoise_tile, fast, for_inference  # noqa: E402
+from network.models import denoise_tile, fast, filter_window, for_inference, unet  # noqa: E402
 from network.perceptual import VGG19, Perceptual  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -112,36 +112,40 @@ def test_the_perceptual_loss_and_its_gradient_are_finite(perceptual, pair):
     assert bool(torch.isfinite(prediction.grad).all())
 
 
-@pytest.mark.parametrize("level", [0.0, 1e-42, 1e-6, 1.0, 1e6])
-def test_the_gradient_of_the_whole_network_is_finite(level):
+def hard_window(level: float) -> dict[str, torch.Tensor]:
+    """Noise around a level with one firefly, frames that are trusted or not, and estimates that lack the firefly."""
     torch.manual_seed(1)
-    model = fast()
     color = torch.rand(1, 5, 3, 16, 16) * level
+    estimate = color.mean((-2, -1), keepdim=True).expand_as(color)
     color[0, 2, :, 5, 5] = 1e6
     confidence = torch.randint(0, 2, (1, 5, 1, 16, 16)).float()
-    exposure = window_exposure(color)
-    features = network_inputs(color, None, None, confidence, exposure, takes_estimate=True)
-    kernels = model(features, confidence, torch.zeros(1))
-    numerators, share = apply_kernels(kernels[:, :125], color)
-    image = mean_of(numerators, share, color[:, 2])
-    losses.relmse(image, color[:, 2], exposure).sum().backward()
+    return {"color": color, "estimate": estimate, "confidence": confidence, "exposure": window_exposure(color)}
+
+
+@pytest.mark.parametrize("preset", [fast, unet])
+@pytest.mark.parametrize("level", [0.0, 1e-42, 1e-6, 1.0, 1e6])
+def test_the_gradient_of_the_whole_network_is_finite(level, preset):
+    model, window = preset(), hard_window(level)
+    image = filter_window(model, window).image(window["color"][:, 2])
+    losses.relmse(image, window["color"][:, 2], window["exposure"]).sum().backward()
     assert bool(torch.isfinite(image).all())
     assert all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in model.parameters())
 
 
 @pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
-def test_a_pixel_changes_nothing_beyond_the_networks_reach(bfloat16):
-    """The support of the U-Net: 90 pixels in theory; see docs/reliability.md for where the effect ends."""
+@pytest.mark.parametrize(("preset", "reach"), [(unet, 92), (fast, 320)])
+def test_a_pixel_changes_nothing_beyond_the_networks_reach(preset, reach, bfloat16):
+    """The support in theory; see docs/reliability.md for where the effect ends."""
     torch.manual_seed(0)
-    model = for_inference(fast(), bfloat16)
-    color = torch.rand(1, 5, 3, 8, 256)
-    confidence = torch.ones(1, 5, 1, 8, 256)
-    exposure = window_exposure(color)
-    plain = denoise_tile(model, color, None, None, confidence, exposure)[0]
+    model = for_inference(preset(), bfloat16)
+    color = torch.rand(1, 5, 3, 16, 512)
+    estimate, confidence = torch.full_like(color, 0.5), torch.ones(1, 5, 1, 16, 512)
+    window = {"color": color, "estimate": estimate, "confidence": confidence, "exposure": window_exposure(color)}
+    plain = denoise_tile(model, window)[0]
     color[0, 1, :, 4, 20] = 1e4
-    changed = denoise_tile(model, color, None, None, confidence, exposure)[0]
+    changed = denoise_tile(model, window)[0]
     differs = (plain != changed).any(1)[0].any(0).nonzero().flatten()
-    assert int(differs.max()) <= 20 + 92
+    assert int(differs.max()) <= 20 + reach
     assert bool((plain != changed).any())
 
 
