@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +21,10 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 Slices = tuple[slice, slice]
+
+#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. Of
+#: small frames it goes over several at once, or starting the operations would take longer than they do.
+TOGETHER = 1 << 21
 
 
 def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
@@ -358,10 +363,11 @@ class _ApplyKernels(torch.autograd.Function):
         kernels, frames = kernels.to(dtype), frames.to(dtype)
         numerators = frames.new_zeros(n, t, c, h, w)
         denominators = frames.new_zeros(n, t, 1, h, w)
-        for tap, (frame, here, there) in enumerate(_taps(kernels.shape[1], t, h, w)):
-            weight = kernels[:, tap : tap + 1, *here]
-            numerators[:, frame, :, *here].addcmul_(weight, frames[:, frame, :, *there])
-            denominators[:, frame, :, *here].add_(weight)
+        of_frame = kernels.unflatten(1, (t, -1))
+        for some, tap, here, there in _taps(kernels, frames):
+            weight = of_frame[:, some, tap : tap + 1, *here]
+            numerators[:, some, :, *here].addcmul_(weight, frames[:, some, :, *there])
+            denominators[:, some, :, *here].add_(weight)
         ctx.save_for_backward(kernels, frames)
         return numerators, denominators
 
@@ -369,30 +375,31 @@ class _ApplyKernels(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, to_numerators: Tensor, to_denominators: Tensor) -> tuple[Tensor | None, ...]:
         kernels, frames = ctx.saved_tensors
-        _, t, c, h, w = frames.shape
+        t, c = frames.shape[1:3]
         to_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[0] else None
         to_frames = torch.zeros_like(frames) if ctx.needs_input_grad[1] else None
-        for tap, (frame, here, there) in enumerate(_taps(kernels.shape[1], t, h, w)):
+        for some, tap, here, there in _taps(kernels, frames):
             if to_kernels is not None:
-                gradient = to_kernels[:, tap, *here].copy_(to_denominators[:, frame, 0, *here])
+                gradient = to_kernels.unflatten(1, (t, -1))[:, some, tap, *here]
+                gradient.copy_(to_denominators[:, some, 0, *here])
                 for channel in range(c):
-                    gradient.addcmul_(to_numerators[:, frame, channel, *here], frames[:, frame, channel, *there])
+                    gradient.addcmul_(to_numerators[:, some, channel, *here], frames[:, some, channel, *there])
             if to_frames is not None:
-                to_frames[:, frame, :, *there].addcmul_(
-                    kernels[:, tap : tap + 1, *here], to_numerators[:, frame, :, *here]
-                )
+                weight = kernels.unflatten(1, (t, -1))[:, some, tap : tap + 1, *here]
+                to_frames[:, some, :, *there].addcmul_(weight, to_numerators[:, some, :, *here])
         return to_kernels, to_frames
 
 
-def _taps(taps: int, frames: int, height: int, width: int) -> Iterator[tuple[int, Slices, Slices]]:
-    """For each tap its frame, the pixels for which it is inside the image, and the pixels it reads there."""
-    size = math.isqrt(taps // frames)
+def _taps(kernels: Tensor, frames: Tensor) -> Iterator[tuple[slice, int, Slices, Slices]]:
+    """Some of the frames, a tap, the pixels for which it is inside the image, and the pixels it reads there."""
+    count, height, width = frames.shape[1], *frames.shape[3:]
+    size = math.isqrt(kernels.shape[1] // count)
     radius = size // 2
-    for frame in range(frames):
-        for dy in range(-radius, radius + 1):
+    together = max(1, TOGETHER // (frames[:, 0].numel() * frames.element_size()))
+    for first in range(0, count, together):
+        for tap, (dy, dx) in enumerate(product(range(-radius, radius + 1), repeat=2)):
             rows = slice(max(0, -dy), max(0, height - max(0, dy)))
             from_rows = slice(max(0, dy), max(0, height + min(0, dy)))
-            for dx in range(-radius, radius + 1):
-                columns = slice(max(0, -dx), max(0, width - max(0, dx)))
-                from_columns = slice(max(0, dx), max(0, width + min(0, dx)))
-                yield frame, (rows, columns), (from_rows, from_columns)
+            columns = slice(max(0, -dx), max(0, width - max(0, dx)))
+            from_columns = slice(max(0, dx), max(0, width + min(0, dx)))
+            yield slice(first, first + together), tap, (rows, columns), (from_rows, from_columns)
