@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -222,30 +224,34 @@ def test_a_batch_that_cannot_be_shared_is_an_error(
         train(*sets, make_model(), CONFIG, tmp_path / "w")
 
 
-def test_a_resumed_training_goes_on_as_if_nothing_had_happened(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "w.safetensors"
+def _train_and_be_killed(rank: int, folder: str, out: str) -> None:
+    """With a checkpoint after every step, killed after the fifth and before its checkpoint."""
+    torch.set_num_threads(1)
+
+    def log(step: int, values: dict[str, float]) -> None:
+        if step == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    train(*_sets_of(folder), make_model(), replace(CONFIG, checkpoint_minutes=0.0), out, log=log)
+
+
+def _sets_of(folder: str | Path) -> tuple[Clips, Clips]:
+    return split_by_shot(open_clips(folder), ["shot1"])
+
+
+def test_a_training_that_is_killed_is_resumed_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    (tmp_path / "clips").mkdir()
+    for seed in range(2):
+        write_shards(tmp_path / "clips", f"shot{seed}", (4, 4), [make_clip(seed)])
+    sets, out = _sets_of(tmp_path / "clips"), tmp_path / "w.safetensors"
     unbroken_model = make_model()
     unbroken = train(*sets, unbroken_model, CONFIG, out)
     assert not Path(f"{out}.state").exists()  # nothing to resume
     unbroken_average = load_model(out)
+    out.unlink()
 
-    # The same, with a checkpoint after every step, cut off before the fifth loss.
-    every_step = replace(CONFIG, checkpoint_minutes=0.0)
-    calls = 0
-
-    def cut_off(*args: object) -> torch.Tensor:
-        nonlocal calls
-        calls += 1
-        if calls == 5:
-            raise KeyboardInterrupt
-        return batch_loss(*args)
-
-    monkeypatch.setattr(network.train, "batch_loss", cut_off)
-    with pytest.raises(KeyboardInterrupt):
-        train(*sets, make_model(), every_step, out)
-    monkeypatch.undo()
+    with pytest.raises(torch.multiprocessing.ProcessExitedException, match="SIGKILL"):
+        torch.multiprocessing.spawn(_train_and_be_killed, (str(tmp_path / "clips"), str(out)))
     model = make_model(seed=9)  # other weights: they must come from the file
     assert train(*sets, model, CONFIG, out, resume=True) == unbroken[4:]
     assert equal_weights(model, unbroken_model)
