@@ -333,11 +333,9 @@ class _Threshold(torch.autograd.Function):
         # Also a denormal, whose reciprocal is infinite.
         nothing = total < 1e-30
         kernel.div_(total.masked_fill_(nothing, torch.inf))
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(weights, kernel, total)
-            ctx.threshold, ctx.relative = threshold, relative
-            kernel = kernel.clone() if bool(nothing.any()) else kernel
-        kernel[:, centre : centre + 1] += nothing
+        kernel[:, centre : centre + 1] += nothing  # no gradient: that is divided by the total, infinity
+        ctx.save_for_backward(weights, kernel, total)
+        ctx.threshold, ctx.relative = threshold, relative
         return kernel
 
     @staticmethod
