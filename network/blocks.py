@@ -63,7 +63,7 @@ def ravg(frames: Sequence[Tensor]) -> Tensor:
 class _MeanOfMiddleTwo(torch.autograd.Function):
     """ravg of four frames, the case of every step of a five-frame window; see ``ravg``.
 
-    Sorted pairs (a, b) and (c, d) give the two middle values directly. Autograd through seven minima and maxima
+    Sorted pairs (a, b) and (c, d) give the two middle values directly. Autograd through six minima and maxima
     costs ten times this backward pass, which keeps four 0/1 masks in the data's own type (so that every pass
     over memory is vectorised) and sends half the gradient to each of the two frames that were averaged.
     """
