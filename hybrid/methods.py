@@ -340,7 +340,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "gated OIDN clean": _aligned("Gated averages", gated_average, source="oidn-clean"),
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
-    "network, own estimates": _network("quality", "nlm"),
+    "network without OIDN": _network("quality", "nlm"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast", prefilter=False),

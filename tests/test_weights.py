@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from hybrid.estimates import MODE_OF
 from hybrid.frames import open_shot
 from hybrid.metrics import mean_bias, psnr
 from hybrid.neural import Denoiser, shipped_weights
@@ -38,8 +39,9 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(window, reference):
     assert final > robust + 2
 
 
-def test_fast_reaches_what_its_card_says(window, reference):
-    path = shipped_weights("fast")
+@pytest.mark.parametrize("preset", list(MODE_OF))
+def test_weights_reach_what_their_card_says(window, reference, preset):
+    path = shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     promised = float(re.search(r"frame 11 of the bundled shot: (\d+\.\d+) dB", card)[1])
     image = Denoiser(path)(window).color

@@ -16,7 +16,7 @@ from safetensors.torch import save_file  # noqa: E402
 from hybrid.cli import main  # noqa: E402
 from hybrid.neural import shipped_weights  # noqa: E402
 from network.checkpoint import describe, load_model, save_model  # noqa: E402
-from network.models import fast, paper  # noqa: E402
+from network.models import fast, paper, unet  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -31,7 +31,7 @@ def good(tmp_path_factory):
 def write(path, model=None, **metadata):
     """A file with the tensors of a model and any metadata; None leaves an entry out."""
     model = model or fast()
-    entries = {"format": "ravg-network", "version": "1", "description": json.dumps(describe(model)), "notes": "{}"}
+    entries = {"format": "ravg-network", "version": "2", "description": json.dumps(describe(model)), "notes": "{}"}
     entries = {name: value for name, value in (entries | metadata).items() if value is not None}
     save_file({name: value.half().contiguous() for name, value in model.state_dict().items()}, path, entries)
     return path
@@ -88,7 +88,7 @@ def test_pickles_are_not_opened(tmp_path):
     [
         ({"format": None}, "format"),
         ({"format": "somebody-elses"}, "format"),
-        ({"version": "2"}, "version 1, got 2"),
+        ({"version": "1"}, "version 2, got 1"),
         ({"version": "one"}, "version"),
         ({"description": None}, "description"),
         ({"description": "not json"}, "Expecting value"),
@@ -125,10 +125,20 @@ def test_wrong_metadata_is_named(tmp_path, metadata, word):
 )
 def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
     """A width of 2^40 asked for a terabyte before its shape was compared with the file's."""
-    described = describe(fast())
+    described = describe(unet())
     kernel = changes.get("kernel", {})
     described["config"] |= {name: value for name, value in changes.items() if name != "kernel"}
     described["config"]["kernel"] = described["config"]["kernel"] | kernel if kernel is not None else None
+    with pytest.raises(ValueError, match="weights"):
+        load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"ra_scales": [7]}, {"threshold": 2}], ids=str
+)
+def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
+    described = describe(fast())
+    described["config"] |= changes
     with pytest.raises(ValueError, match="weights"):
         load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
 
