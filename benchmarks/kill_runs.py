@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,6 +95,8 @@ class Bench:
                 code = ravg(self.arguments(output, *more))
             except KeyboardInterrupt:  # before the command was there to take it
                 code = 130
+            except BaseException:
+                traceback.print_exc()
             finally:
                 os._exit(code)
         return child
@@ -179,7 +182,7 @@ def stop_at_random(bench: Bench, stops: int, seed: int) -> float:
             continue
         told = re.search(r"stopped: (\d) of 6 frames are finished", words)
         if code not in (130, 1) or "Traceback" in words:
-            bench.problems.append(f"Ctrl-C {number}: exit code {code}: {words[-300:]}")
+            bench.problems.append(f"Ctrl-C {number}: exit code {code}: {words[-600:]}")
         elif told and int(told[1]) > (there := len(frames(folder)) if folder.exists() else 0):
             bench.problems.append(f"Ctrl-C {number}: told of {told[1]} frames, there are {there}")
     return longest
@@ -230,7 +233,7 @@ def check_refused(bench: Bench, what: str, code: int, said: Path, folder: Path) 
     """Exit code 1, one line, nothing left."""
     words = said.read_text(errors="replace")
     if code != 1 or "Traceback" in words or not words.rstrip().splitlines()[-1].startswith("error: "):
-        bench.problems.append(f"{what}: exit code {code}: {words[-300:]}")
+        bench.problems.append(f"{what}: exit code {code}: {words[-600:]}")
     if left := [path.name for path in folder.glob("*")] + [path.name for path in folder.glob(".*")]:
         bench.problems.append(f"{what}: left {left}")
 
