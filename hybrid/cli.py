@@ -196,7 +196,7 @@ def denoise(
     layer: LayerOption = None,
     effects: OnOption = None,
     no_effects: OffOption = None,
-    tile: Annotated[int, typer.Option(help="pixels on a side that the network sees at once")] = 256,
+    tile: Annotated[int, typer.Option(help="pixels on a side that the network sees at once")] = 384,
     precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
     resume: ResumeOption = False,
     max_memory: MemoryOption = None,

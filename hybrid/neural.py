@@ -97,7 +97,7 @@ class Denoiser:
         self,
         weights: Path,
         *,
-        tile: int = 256,
+        tile: int = 384,
         precision: str = "auto",
         threshold: float | None = None,
         breakdown: Breakdown | None = None,

@@ -134,7 +134,9 @@ def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"ra_scales": [7]}, {"threshold": 2}], ids=str
+    "changes",
+    [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"ra_scales": [7]}, {"threshold": 2}],
+    ids=str,
 )
 def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
     described = describe(fast())
