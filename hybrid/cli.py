@@ -229,7 +229,8 @@ def denoise(
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
-        source = choose_estimate(wanted, opened, kept=keep_estimates, mode=MODE_OF.get(preset, "oidn-clean"))
+        mode = "oidn-clean" if weights is not None else MODE_OF[preset]
+        source = choose_estimate(wanted, opened, kept=keep_estimates, mode=mode)
     else:
         source = choose_estimate("none", opened)
     settings = {

@@ -523,10 +523,9 @@ class Aligner:
                     kept[index] = warped[name]
                 # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
                 measured = known & inside & (warped["valid"][..., 0] > 0.999)
-                seen[index] = self._novelty(flow) * measured
-                confidence[index] = self._novelty(flow) * self._trust(
-                    layers, warped, flow, measured, back[0], rows.start
-                )
+                novelty = self._novelty(flow)
+                seen[index] = novelty * measured
+                confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
         return window, confidence, seen
 
     def _gather_estimates(self, number: int, numbers: list[int], seen: Array, rows: slice) -> Array:

@@ -7,10 +7,12 @@ second. Spatial layers see a larger batch and need not know about time; splittin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 
 def ravg(frames: Sequence[Tensor]) -> Tensor:
@@ -174,6 +176,50 @@ class RobustAverage(nn.Module):
             weight = torch.sigmoid(self.weight(torch.relu(of_frame[i] + self.on_average(average))))
             state[i] = torch.lerp(state[i], average, weight)
         return torch.cat(state)
+
+
+class UNet(nn.Module):
+    """U-Net shared over the frames, connected in time by RA blocks on the way down.
+
+    Parameters
+    ----------
+    inputs : int
+        Channels it reads.
+    widths : sequence of int
+        Channels of each scale, finest first.
+    ra_scales : sequence of int
+        Scales with an RA block.
+
+    Notes
+    -----
+    One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
+    addition up.
+    """
+
+    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int]) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(inputs, widths[0], 3, padding=1)
+        self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
+        self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in ra_scales})
+        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
+        self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
+
+    def scales(self, x: Tensor, frames: int) -> list[Tensor]:
+        """``(T·N, C, H, W)``, time first, to the features of every scale, finest first."""
+        x = self.stem(x)
+        scales: list[Tensor] = []
+        for scale, block in enumerate(self.encode):
+            if scale:
+                x = self.down[scale - 1](x)
+            x = block(x)
+            if str(scale) in self.average:
+                x = self.average[str(scale)](x, frames)
+            scales.append(x)
+        for scale in reversed(range(len(self.decode))):
+            up = functional.interpolate(self.up[scale](scales[scale + 1]), scale_factor=2.0, mode="nearest")
+            scales[scale] = self.decode[scale](scales[scale] + up)
+        return [torch.relu(x) for x in scales]
 
 
 class TemporalModule(nn.Module):

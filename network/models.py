@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage, TemporalModule
+from network.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
 from network.inputs import CHANNELS, network_inputs
 from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
 from network.stabilizer import Stabilized, Stabilizer, StabilizerConfig
@@ -179,31 +178,19 @@ class KernelHead(nn.Module):
         return predict_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)
 
 
-class RAUNet(nn.Module):
+class RAUNet(UNet):
     """Small U-Net: shared over the frames, connected in time by RA blocks on the way down.
 
     Parameters
     ----------
     config : RAUNetConfig
         Sizes.
-
-    Notes
-    -----
-    One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest
-    neighbour and addition up.
     """
 
     def __init__(self, config: RAUNetConfig) -> None:
-        super().__init__()
+        super().__init__(CHANNELS, config.widths, config.ra_scales)
         self.config = config
-        widths = config.widths
-        self.stem = nn.Conv2d(CHANNELS, widths[0], 3, padding=1)
-        self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
-        self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in config.ra_scales})
-        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
-        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
-        self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
-        self.head = KernelHead(widths[0], config.kernel)
+        self.head = KernelHead(config.widths[0], config.kernel)
 
     @property
     def multiple(self) -> int:
@@ -234,20 +221,8 @@ class RAUNet(nn.Module):
 
     def trunk(self, features: Tensor) -> Tensor:
         """Features of an aligned window to those that kernels are predicted from, ``(T·N, C, H, W)``, time first."""
-        frames = self.config.kernel.frames
-        x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
-        skips = []
-        for scale, block in enumerate(self.encode):
-            if scale:
-                skips.append(x)
-                x = self.down[scale - 1](x)
-            x = block(x)
-            if str(scale) in self.average:
-                x = self.average[str(scale)](x, frames)
-        for scale in reversed(range(len(skips))):
-            x = skips[scale] + functional.interpolate(self.up[scale](x), scale_factor=2.0, mode="nearest")
-            x = self.decode[scale](x)
-        return torch.relu(x)
+        x = _time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype)
+        return self.scales(x, self.config.kernel.frames)[0]
 
 
 class RAResNet(nn.Module):

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage
+from network.blocks import UNet
 from network.inputs import CHANNELS, ESTIMATE_CHANNELS
 from network.kernels import check_threshold, double, halve, mean_of, softmax_kernel
 
@@ -105,7 +104,7 @@ def shrink(residual: Tensor, shares: Sequence[Tensor]) -> Tensor:
     return share * residual + double(shrink(low, coarser)) - share * double(low)
 
 
-class Stabilizer(nn.Module):
+class Stabilizer(UNet):
     """U-Net at half resolution, shared over the frames, connected in time by RA blocks on the way down.
 
     Parameters
@@ -122,15 +121,9 @@ class Stabilizer(nn.Module):
     """
 
     def __init__(self, config: StabilizerConfig) -> None:
-        super().__init__()
-        self.config = config
         widths = config.widths
-        self.stem = nn.Conv2d(4 * (CHANNELS + ESTIMATE_CHANNELS), widths[0], 3, padding=1)
-        self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
-        self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in config.ra_scales})
-        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
-        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
-        self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
+        super().__init__(4 * (CHANNELS + ESTIMATE_CHANNELS), widths, config.ra_scales)
+        self.config = config
         self.weight = nn.Conv2d(widths[0], 4, 3, padding=1)
         # Features of a share: those of its scale, and four of the residual. Full resolution has a quarter of the first.
         sources = [widths[0] // 4, *widths, widths[-1]]
@@ -186,7 +179,8 @@ class Stabilizer(nn.Module):
         for name, length in zip(("height", "width"), features.shape[3:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"features: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        scales = self._trunk(features)
+        halved = functional.pixel_unshuffle(features.transpose(0, 1).flatten(0, 1), 2)
+        scales = self.scales(halved.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last), config.frames)
         logits = _bounded(functional.pixel_shuffle(self.weight(scales[0]), 2).float(), WEIGHT_BOUND)
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         logits = logits.unflatten(0, (config.frames, -1)).transpose(0, 1) + (confidence.float() + 1e-3).log()
@@ -211,24 +205,6 @@ class Stabilizer(nn.Module):
             logit = head(torch.cat([of_scale, seen.to(of_scale.dtype)], 1)).float()
             shares.append(torch.sigmoid(_bounded(logit, SHARE_BOUND)))
         return Stabilized(weights * estimate, residual, weights, tuple(shares))
-
-    def _trunk(self, features: Tensor) -> list[Tensor]:
-        """Features ``(T·N, C, H, W)``, time first, at half resolution and below."""
-        frames = self.config.frames
-        x = functional.pixel_unshuffle(features.transpose(0, 1).flatten(0, 1), 2)
-        x = self.stem(x.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last))
-        scales: list[Tensor] = []
-        for scale, block in enumerate(self.encode):
-            if scale:
-                x = self.down[scale - 1](x)
-            x = block(x)
-            if str(scale) in self.average:
-                x = self.average[str(scale)](x, frames)
-            scales.append(x)
-        for scale in reversed(range(len(self.decode))):
-            up = functional.interpolate(self.up[scale](scales[scale + 1]), scale_factor=2.0, mode="nearest")
-            scales[scale] = self.decode[scale](scales[scale] + up)
-        return [torch.relu(x) for x in scales]
 
 
 def _bounded(x: Tensor, bound: float) -> Tensor:
