@@ -205,6 +205,46 @@ def test_vectors_follow_what_moves_in_every_kind_of_scene(name, blur, scene, tmp
     assert np.quantile(errors, 0.8, axis=1).max() < 0.5
 
 
+@pytest.mark.parametrize("blur", [False, True])
+def test_vectors_follow_what_bends_and_hair(blur, scene, tmp_path):
+    """A sheet whose shape key moves every vertex by a known amount a frame, and fur that flies: 10 px are a unit."""
+    import bpy
+
+    from hybrid.simulate import cycles, things
+
+    shot = ShotSettings(str(scene), 1, (1, 2), SIZE, {"n": 16}, motion_blur=blur)
+    cycles.build(shot, 0, 2)
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=40, y_subdivisions=40, size=3, location=(-1.6, -1, 0))
+    sheet = bpy.context.active_object
+    sheet.rotation_euler = (np.pi / 2, 0, 0)  # its y is up
+    sheet.shape_key_add(name="basis")
+    bent = sheet.shape_key_add(name="bent")
+    for point, vertex in zip(bent.data, sheet.data.vertices, strict=True):
+        x, y, _ = vertex.co
+        point.co = (x + 0.2 * np.sin(2 * y), y + 0.1 * x, 0)
+    bent.slider_min, bent.slider_max = -5, 5
+    fur = things.add_fur(np.random.default_rng(1), sheet.active_material)
+    fur.scale = (3, 3, 3)
+    for frame in range(-3, 6):
+        bent.value = frame - 1
+        bent.keyframe_insert("value", frame=frame)
+        fur.location = (1.7 - 0.2 * (frame - 1), -2, 0.1 * (frame - 1))
+        fur.keyframe_insert("location", frame=frame)
+    cycles.apply(bpy.context.scene, {"render.use_motion_blur": blur})
+    bpy.context.scene.frame_set(1)
+    cycles.render_picture(bpy.context.scene, shot, tmp_path / "n.exr", 16, 1)
+    vector = layer(read(tmp_path / "n.exr"), "Vector", "XYZW")
+    rows, columns = np.mgrid[6:30, 4:28]  # inside the sheet
+    x, y = (columns + 0.5 - 32) / 10 + 1.6, (18 - rows - 0.5) / 10
+    moved = np.stack([2 * np.sin(2 * y), x], axis=-1)  # px to the right, and up
+    np.testing.assert_allclose(vector[rows, columns], -np.concatenate([moved, moved], axis=-1), atol=0.05)
+    # Between strands there is the wall, which stands still: of 16 samples, so many meet the fur.
+    hair = vector[12:24, 43:55].reshape(-1, 4)
+    share = hair @ [2, -1, 2, -1] / 10
+    np.testing.assert_allclose(hair, np.round(16 * share)[:, None] * [2, -1, 2, -1] / 16, atol=0.01)
+    assert 0.5 < np.median(share) < 1
+
+
 def test_what_blender_keeps_between_frames_changes_no_picture(tmp_path):
     """With persistent data, which shots are rendered with, a thing that flies and one that bends are as without."""
     import bpy
