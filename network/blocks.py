@@ -189,16 +189,18 @@ class UNet(nn.Module):
         Channels of each scale, finest first.
     ra_scales : sequence of int
         Scales with an RA block.
+    cell : int
+        Pixels in each direction that the finest scale has one of.
 
     Notes
     -----
     One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
-    addition up.
+    addition up. The first convolution sees 3×3 cells.
     """
 
-    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int]) -> None:
+    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int], cell: int = 1) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(inputs, widths[0], 3, padding=1)
+        self.stem = nn.Conv2d(inputs, widths[0], 3 * cell, stride=cell, padding=cell)
         self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
         self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in ra_scales})
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))

@@ -32,7 +32,7 @@ Config = TypeVar("Config")
 
 FORMAT = "ravg-network"
 #: Raised when a change makes older weights give other kernels. Files say which one they were written for.
-VERSION = 2
+VERSION = 3
 #: The greatest number in a description that is read: three times the width of any network here.
 LARGEST = 256
 

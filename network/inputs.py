@@ -86,16 +86,17 @@ def network_inputs(
         raise ValueError(f"exposure: expected shape {(n,)}, got {tuple(exposure.shape)}")
     scale = exposure.reciprocal().view(n, 1, 1, 1, 1)
     missing = color.new_zeros(()).expand(n, t, 3, h, w)
+    # In place, as these are passes over memory and nothing else.
     channels = [
-        torch.log1p((color * scale).clamp_min(0)),
-        missing if albedo is None else torch.log1p(albedo.clamp_min(0)),
+        (color * scale).clamp_min_(0).log1p_(),
+        missing if albedo is None else albedo.clamp_min(0).log1p_(),
         missing if normal is None else normal,
         confidence,
     ]
     if estimate is not None:
         if estimate.shape != (n, t, 3, h, w):
             raise ValueError(f"estimate: expected shape {(n, t, 3, h, w)}, got {tuple(estimate.shape)}")
-        log = torch.log1p((estimate * scale).clamp_min(0))
+        log = (estimate * scale).clamp_min_(0).log1p_()
         # Ten times: what matters is a few hundredths, on the scale of the other channels some tenths.
-        channels += [log, 10 * (log - log[:, t // 2 : t // 2 + 1])]
+        channels += [log, (log - log[:, t // 2 : t // 2 + 1]).mul_(10)]
     return torch.cat(channels, 2)

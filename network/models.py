@@ -389,14 +389,15 @@ def fast(frames: int = 5, seed: int = 0) -> Stabilizer:
 
 
 def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, wider."""
+    """Beside per-frame estimates, wider at coarse scales, which cost little: 0.5 M parameters."""
     with _seeded(seed):
-        return Stabilizer(StabilizerConfig(frames, widths=(32, 48, 64)))
+        return Stabilizer(StabilizerConfig(frames, widths=(16, 48, 80)))
 
 
 def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """The network of `balanced`, with weights of its own: trained further beside the estimates it is meant for."""
-    return balanced(frames, seed)
+    """Beside per-frame estimates, on cells of 2×2 pixels: 0.4 M parameters."""
+    with _seeded(seed):
+        return Stabilizer(StabilizerConfig(frames, 2, (32, 48, 64)))
 
 
 def unet(frames: int = 5, seed: int = 0) -> RAUNet:

@@ -32,15 +32,20 @@ class StabilizerConfig:
     """Sizes of a `Stabilizer`."""
 
     frames: int = 5  # T, odd; the window
-    widths: tuple[int, ...] = (16, 32, 48)  # channels at half, quarter, eighth resolution
+    cell: int = 4  # pixels in each direction that the finest scale has one of, a power of two
+    widths: tuple[int, ...] = (16, 32, 48)  # channels of each scale, finest first
     ra_scales: tuple[int, ...] = (0, 1, 2)  # of these, the ones with an RA block
     threshold: float = 0.05  # t·T: a frame of less than this part of the mean weight has none
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.frames % 2 == 0:
             raise ValueError(f"frames: expected an odd number >= 1, got {self.frames}")
+        if self.cell not in (1, 2, 4, 8):
+            raise ValueError(f"cell: expected 1, 2, 4 or 8, got {self.cell}")
         if not self.widths or min(self.widths) < 1:
             raise ValueError(f"widths: expected at least one positive width, got {self.widths}")
+        if self.widths[0] % self.cell**2:
+            raise ValueError(f"widths: expected the first to be a multiple of {self.cell**2}, got {self.widths[0]}")
         if not set(self.ra_scales) <= set(range(len(self.widths))):
             raise ValueError(f"ra_scales: expected scales 0 to {len(self.widths) - 1}, got {self.ra_scales}")
         check_threshold(self.threshold)
@@ -105,7 +110,7 @@ def shrink(residual: Tensor, shares: Sequence[Tensor]) -> Tensor:
 
 
 class Stabilizer(UNet):
-    """U-Net at half resolution, shared over the frames, connected in time by RA blocks on the way down.
+    """U-Net on cells of pixels, shared over the frames, connected in time by RA blocks on the way down.
 
     Parameters
     ----------
@@ -114,19 +119,20 @@ class Stabilizer(UNet):
 
     Notes
     -----
-    Pixels of 2×2 are channels of one pixel at half resolution. A frame's weight is ``c e^h``, c its confidence and h in
-    [−0.15, 0.15] predicted, normalised over the frames and thresholded (η_t, section 4 of the paper): training starts
-    from the gated average. The shares are predicted from the centre frame's features, and from the size of the residual
-    and of its noise at their scale. They start between 1 % at full resolution and 5 % at the coarsest, a sixteenth.
+    A feature of the finest scale is that of a cell of pixels; its channels are shared out to the pixels where those
+    are asked for. A frame's weight is ``c e^h``, c its confidence and h in [−0.15, 0.15] predicted, normalised over the
+    frames and thresholded (η_t, section 4 of the paper): training starts from the gated average. The shares are found
+    from the centre frame's features, and from the size of the residual and of its noise at their scale; there is one
+    scale more than the network has. They start at 5 % at the coarsest, and each at three fifths of the next coarser.
     """
 
     def __init__(self, config: StabilizerConfig) -> None:
         widths = config.widths
-        super().__init__(4 * (CHANNELS + ESTIMATE_CHANNELS), widths, config.ra_scales)
+        super().__init__(CHANNELS + ESTIMATE_CHANNELS, widths, config.ra_scales, config.cell)
         self.config = config
-        self.weight = nn.Conv2d(widths[0], 4, 3, padding=1)
-        # Features of a share: those of its scale, and four of the residual. Full resolution has a quarter of the first.
-        sources = [widths[0] // 4, *widths, widths[-1]]
+        self.weight = nn.Conv2d(widths[0], config.cell**2, 3, padding=1)
+        # Features of a share: those of its scale, and four of the residual. Finer than a cell they are its parts.
+        sources = [*(widths[0] // part**2 for part in self.finer), *widths, widths[-1]]
         self.shares = nn.ModuleList(
             nn.Sequential(nn.Conv2d(width + 4, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)) for width in sources
         )
@@ -141,7 +147,12 @@ class Stabilizer(UNet):
     @property
     def multiple(self) -> int:
         """Height and width must be multiples of this."""
-        return int(2 ** (len(self.config.widths) + 1))
+        return int(self.config.cell * 2 ** len(self.config.widths))
+
+    @property
+    def finer(self) -> list[int]:
+        """How many times finer than a cell the bands are that are finer, the finest first: cell, …, 4, 2."""
+        return [2**k for k in range(self.config.cell.bit_length() - 1, 0, -1)]
 
     def forward(
         self,
@@ -179,9 +190,9 @@ class Stabilizer(UNet):
         for name, length in zip(("height", "width"), features.shape[3:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"features: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        halved = functional.pixel_unshuffle(features.transpose(0, 1).flatten(0, 1), 2)
-        scales = self.scales(halved.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last), config.frames)
-        logits = _bounded(functional.pixel_shuffle(self.weight(scales[0]), 2).float(), WEIGHT_BOUND)
+        stacked = features.transpose(0, 1).flatten(0, 1)  # time first
+        scales = self.scales(stacked.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last), config.frames)
+        logits = _bounded(functional.pixel_shuffle(self.weight(scales[0]), config.cell).float(), WEIGHT_BOUND)
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
         logits = logits.unflatten(0, (config.frames, -1)).transpose(0, 1) + (confidence.float() + 1e-3).log()
         logits = logits.squeeze(2)
@@ -192,7 +203,8 @@ class Stabilizer(UNet):
         limit = RESIDUAL_LIMIT * (estimate.clamp_min(0) + exposure.view(-1, 1, 1, 1, 1))
         residual = weights * torch.minimum(torch.maximum(residual, -limit), limit)
         own = [scale.unflatten(0, (config.frames, -1))[centre] for scale in scales]
-        own = [functional.pixel_shuffle(own[0], 2), *own, functional.avg_pool2d(own[-1], 2)]
+        own = [*(functional.pixel_shuffle(own[0], part) for part in self.finer), *own]
+        own.append(functional.avg_pool2d(own[-1], 2))
         shares: list[Tensor] = []
         size = exposure.reciprocal().view(-1, 1, 1, 1)
         mean, variance = residual.sum(1), residual.square().sum(1).mean(1, keepdim=True)

@@ -32,9 +32,9 @@ def window(n: int = 1, t: int = 3, h: int = 16, w: int = 24) -> dict[str, torch.
     }
 
 
-def small(frames: int = 3, threshold: float = 0.05) -> Stabilizer:
+def small(frames: int = 3, threshold: float = 0.05, cell: int = 2) -> Stabilizer:
     torch.manual_seed(0)
-    return Stabilizer(StabilizerConfig(frames, (4, 8), (0, 1), threshold))
+    return Stabilizer(StabilizerConfig(frames, cell, (16, 8), (0, 1), threshold))
 
 
 def silent(model: Stabilizer) -> Stabilizer:
@@ -107,6 +107,18 @@ def test_what_the_estimates_have_lost_comes_back_at_coarse_scales() -> None:
     with torch.no_grad():
         model.shares[-1][-1].bias.fill_(50)
     torch.testing.assert_close(denoised(model, data).mean(), data["color"].mean(), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("cell", [1, 2, 4])
+def test_features_of_a_cell_are_bands_and_weights_of_its_pixels(cell: int) -> None:
+    model, data = small(cell=cell), window(w=32)
+    assert model.multiple == 4 * cell
+    result = stabilized(model, data)
+    # Each scale of the network, a coarser one, and the finer ones up to the picture's own.
+    assert [share.shape[-2:] for share in result.shares] == [(16 >> k, 32 >> k) for k in range(2 + cell.bit_length())]
+    bare = {**data, "confidence": torch.ones_like(data["confidence"])}
+    weights = stabilized(model, bare).denominators
+    assert not torch.equal(weights[..., ::cell, ::cell], weights[..., cell - 1 :: cell, cell - 1 :: cell]) or cell == 1
 
 
 @pytest.mark.parametrize("frames", [1, 3, 5, 7])
@@ -189,7 +201,9 @@ def test_what_does_not_fit_is_an_error() -> None:
         filter_window(model, data, 1.0)
     for change, message in (
         ({"frames": 4}, "frames: expected an odd number"),
+        ({"cell": 3}, "cell: expected 1, 2, 4 or 8"),
         ({"widths": ()}, "widths: expected at least one"),
+        ({"cell": 4, "widths": (8, 16)}, "widths: expected the first to be a multiple of 16"),
         ({"ra_scales": (3,)}, "ra_scales: expected scales 0 to 2"),
         ({"threshold": 1.0}, "threshold: expected"),
     ):

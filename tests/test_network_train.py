@@ -91,7 +91,7 @@ def make_model(seed: int = 0) -> RAUNet:
 
 def make_stabilizer() -> Stabilizer:
     torch.manual_seed(0)
-    return Stabilizer(StabilizerConfig(3, (4, 8), (0, 1)))
+    return Stabilizer(StabilizerConfig(3, 2, (4, 8), (0, 1)))
 
 
 def a_batch(clips: Clips, config: TrainConfig, count: int) -> dict[str, torch.Tensor]:

@@ -41,7 +41,7 @@ def weights(tmp_path_factory):
     """A small network of three frames, not trained."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    save_model(path, Stabilizer(StabilizerConfig(frames=3, widths=(4, 4), ra_scales=(1,))))
+    save_model(path, Stabilizer(StabilizerConfig(frames=3, cell=2, widths=(4, 4), ra_scales=(1,))))
     return path
 
 
