@@ -55,7 +55,6 @@ def estimate_confidence(
     warped_normal: np.ndarray | None = None,
     depth: np.ndarray | None = None,
     warped_depth: np.ndarray | None = None,
-    valid: np.ndarray | None = None,
     albedo_noise: np.ndarray | float = 0.0,
     normal_noise: np.ndarray | float = 0.0,
     albedo_sigma: float = 0.1,
@@ -68,7 +67,7 @@ def estimate_confidence(
     flow
         (H, W, 2) float, pixels, finite, centre to neighbour.
     inside
-        (H, W) bool, as `flow.warp.warp` gives it.
+        (H, W) bool, as `flow.warp.warp` gives it; false also where the vector, or a pixel it leads to, is no good.
     reverse
         (H, W, 2) float, neighbour to centre, or None. Of the whole frame, also where all else is of some of its rows.
     albedo, warped_albedo
@@ -78,8 +77,6 @@ def estimate_confidence(
         (H, W, 3) float, any one space; any length, 0 where there is no surface.
     depth, warped_depth
         (H, W) float > 0, any unit. Only for motion that hardly changes the distance.
-    valid
-        (H, W) bool: vectors and pixels known to be good.
     albedo_noise, normal_noise
         Standard deviation of a component, scalar or (H, W): under depth of field guides are noisy, and differ
         without being wrong. `flow.guide.estimate_noise` gives it.
@@ -101,7 +98,7 @@ def estimate_confidence(
     Notes
     -----
     inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / σ_a²) · clamp((n·n′ − 0.8) / 0.2)
-    · clamp((0.2 − |Δd| / max(d, d′)) / 0.1) · valid, then the minimum of 3 x 3 pixels, because what surrounds an
+    · clamp((0.2 − |Δd| / max(d, d′)) / 0.1), then the minimum of 3 x 3 pixels, because what surrounds an
     occlusion is mixed into its border. Δa is divided by the albedo where that is above 1. What moves without the
     geometry (shadows, reflections) is invisible here.
 
@@ -119,13 +116,10 @@ def estimate_confidence(
             raise ValueError(f"{name} and warped_{name} come together, got only one of them")
         if centre is not None and warped is not None and (centre.shape != warped.shape or centre.shape[:2] != shape):
             raise ValueError(f"{name} has shape {centre.shape}, warped_{name} {warped.shape}, expected both {shape}")
-    for name, mask in (("inside", inside), ("valid", valid)):
-        if mask is not None and mask.shape != shape:
-            raise ValueError(f"{name} has shape {mask.shape}, expected {shape}")
+    if inside.shape != shape:
+        raise ValueError(f"inside has shape {inside.shape}, expected {shape}")
 
     confidence = inside.astype(np.float32)
-    if valid is not None:
-        confidence *= valid
     if reverse is not None:
         confidence *= _agree_forward_backward(flow, reverse, first_row)
     with np.errstate(invalid="ignore"):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import cast
 
 import fileseq
 import numpy as np
@@ -78,30 +77,6 @@ class Frame:
                 raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
         if (self.motion is None) != (self.motion_convention is None):
             raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Frames t − radius … t + radius along the shot's step; None where there is none. The centre is there."""
-
-    frames: tuple[Frame | None, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.frames) % 2 == 0 or self.frames[len(self.frames) // 2] is None:
-            raise ValueError(f"window of {len(self.frames)} frames, expected an odd number and a centre")
-        sizes = {frame.color.shape for frame in self.frames if frame is not None}
-        if len(sizes) != 1:
-            raise ValueError(f"frames of one window must be of one size, got {sorted(sizes)}")
-
-    @property
-    def radius(self) -> int:
-        """Number of frames on either side."""
-        return len(self.frames) // 2
-
-    @property
-    def centre(self) -> Frame:
-        """The frame the window is for."""
-        return cast(Frame, self.frames[self.radius])
 
 
 class Shot:
@@ -239,12 +214,6 @@ class Shot:
         while len(self._held) > self._keep:
             self._held.popitem(last=False)
         return frame
-
-    def window(self, number: int, radius: int) -> Window:
-        """A frame with its neighbours t ± step … t ± radius · step; None for those that are not there."""
-        self._keep = max(self._keep, 2 * radius + 1)
-        numbers = [number + self.step * k for k in range(-radius, radius + 1)]
-        return Window(tuple(self.read(n) if n == number or self.has(n) else None for n in numbers))
 
     def write(
         self,

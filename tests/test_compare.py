@@ -178,14 +178,11 @@ def test_reading_and_warming_up_are_not_counted(monkeypatch: pytest.MonkeyPatch)
             clock.now += 10
             return super().read(number)
 
-        def window(self, number: int) -> Frame:
-            return self.read(number)
-
     def method(shot: SlowShot) -> Iterator[tuple[int, Array]]:
         clock.now += 0 if clock.compiled else 1000
         clock.compiled = True
         for number in shot.numbers:
-            color = shot.window(number).color
+            color = shot.read(number).color
             clock.now += 3
             yield number, color
 

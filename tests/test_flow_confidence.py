@@ -24,7 +24,7 @@ def test_a_still_frame_is_trusted_everywhere() -> None:
     normal = rng.normal(size=(*SHAPE, 3)).astype(np.float32)
     confidence = estimate_confidence(
         STILL, inside=INSIDE, reverse=STILL, albedo=albedo, warped_albedo=albedo, normal=normal, warped_normal=normal,
-        depth=depth, warped_depth=depth, valid=INSIDE,
+        depth=depth, warped_depth=depth,
     )  # fmt: skip
     # The cosine of a vector with itself, in float32.
     np.testing.assert_allclose(confidence, 1, atol=1e-5)
@@ -37,15 +37,15 @@ def test_tiny_frames(shape: tuple[int, int]) -> None:
     assert (estimate_confidence(still, inside=inside, reverse=still) == 1).all()
 
 
-def test_out_of_frame_and_invalid_are_zero_with_their_neighbours() -> None:
+def test_out_of_frame_and_bad_pixels_are_zero_with_their_neighbours() -> None:
     flow = np.broadcast_to(np.float32([3, 0]), (*SHAPE, 2))
     _, inside = warp(np.zeros(SHAPE), flow)
     confidence = estimate_confidence(flow, inside=inside)
     assert not confidence[:, 16:].any()
     assert (confidence[:, :16] == 1).all()
-    valid = INSIDE.copy()
-    valid[5, 5] = False
-    confidence = estimate_confidence(STILL, inside=INSIDE, valid=valid)
+    good = INSIDE.copy()
+    good[5, 5] = False
+    confidence = estimate_confidence(STILL, inside=good)
     assert not confidence[4:7, 4:7].any()
     assert confidence.sum() == confidence.size - 9
 

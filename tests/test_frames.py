@@ -1,4 +1,4 @@
-"""Shots, windows of frames, and the names of files."""
+"""Shots, the frames around a frame, and the names of files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 from hybrid import frames as frames_module
 from hybrid.exr import ExrError, read_exr, write_layers
-from hybrid.frames import Frame, Window, open_shot, output_path
+from hybrid.frames import Frame, Shot, open_shot, output_path
+from hybrid.pseudo_reference import Aligner
 
 SIZE = 4, 6
 
@@ -27,8 +28,10 @@ def save(folder: Path, numbers, name: str = "shot.{:04d}.exr", size: tuple[int, 
     return folder
 
 
-def numbers_of(window: Window) -> list[int | None]:
-    return [None if frame is None else frame.number for frame in window.frames]
+def neighbours(shot: Shot, number: int, radius: int) -> list[int | None]:
+    """Numbers of a frame and what there is around it."""
+    around = Aligner(shot, ()).around(number, radius)
+    return [n if shot.has(n) else None for n in around]
 
 
 # --- names
@@ -47,7 +50,7 @@ def test_every_way_of_naming_a_shot_finds_the_same_frames(tmp_path, pattern):
 def test_one_file_is_a_shot_of_one_frame(tmp_path):
     shot = open_shot(save(tmp_path, [8, 9]) / "shot.0009.exr")
     assert shot.numbers == (9,)
-    assert numbers_of(shot.window(9, 1)) == [None, 9, None]
+    assert neighbours(shot, 9, 1) == [None, 9, None]
     save(tmp_path, [1], "still.exr")
     assert open_shot(tmp_path / "still.exr").numbers == (1,)
 
@@ -92,8 +95,8 @@ def test_range_selects_frames_and_neighbours_come_from_outside_of_it(tmp_path):
     shot = open_shot(tmp_path, frames="3-7x2")
     assert shot.numbers == (3, 5, 7)
     assert shot.step == 1
-    assert numbers_of(shot.window(3, 2)) == [1, 2, 3, 4, 5]
-    assert numbers_of(open_shot(tmp_path).window(9, 2)) == [7, 8, 9, None, None]
+    assert neighbours(shot, 3, 2) == [1, 2, 3, 4, 5]
+    assert neighbours(open_shot(tmp_path), 9, 2) == [7, 8, 9, None, None]
 
 
 @pytest.mark.parametrize("frames", ["abc", "1-", "", "1-2x0.5"])
@@ -112,7 +115,7 @@ def test_hole_is_a_warning_and_a_narrower_window(tmp_path):
     shot = open_shot(save(tmp_path, [1, 2, 4, 5, 8]))
     assert shot.numbers == (1, 2, 4, 5, 8)
     assert shot.warnings == ["missing frames 3,6-7: the windows beside them are narrower"]
-    assert numbers_of(shot.window(4, 2)) == [2, None, 4, 5, None]
+    assert neighbours(shot, 4, 2) == [2, None, 4, 5, None]
     asked = open_shot(tmp_path, frames="4-6")
     assert (asked.numbers, len(asked.warnings)) == ((4, 5), 1)
 
@@ -120,11 +123,11 @@ def test_hole_is_a_warning_and_a_narrower_window(tmp_path):
 def test_every_second_frame_has_neighbours_two_away(tmp_path):
     shot = open_shot(save(tmp_path, [1, 3, 5, 9]))
     assert shot.step == 2
-    assert numbers_of(shot.window(5, 1)) == [3, 5, None]
+    assert neighbours(shot, 5, 1) == [3, 5, None]
     assert "missing frames 7" in shot.warnings[0]
     asked = open_shot(tmp_path, frames="1-5")  # asked for all: the even ones are holes
     assert asked.step == 1
-    assert numbers_of(asked.window(3, 1)) == [None, 3, None]
+    assert neighbours(asked, 3, 1) == [None, 3, None]
 
 
 # --- reading
@@ -173,8 +176,8 @@ def test_overrides_and_missing_aovs(tmp_path):
         open_shot(tmp_path / "a.exr", layers={"color": "key"}, aovs=["rim"]).read(1)
 
 
-def test_window_that_slides_reads_each_file_once_and_holds_no_more_than_it_needs(tmp_path, monkeypatch):
-    shot = open_shot(save(tmp_path, range(1, 13)))
+def test_frames_that_are_kept_are_read_once_and_no_more_are_held(tmp_path, monkeypatch):
+    shot = open_shot(save(tmp_path, range(1, 13)), keep=5)
     opened: list[Path] = []
 
     def counted(path, *, pixels=True, **kwargs):
@@ -184,7 +187,8 @@ def test_window_that_slides_reads_each_file_once_and_holds_no_more_than_it_needs
 
     monkeypatch.setattr(frames_module, "read_exr", counted)
     for number in shot.numbers:
-        assert shot.window(number, 2).centre.number == number
+        for near in neighbours(shot, number, 2):
+            assert near is None or shot.read(near).number == near
         assert len(shot._held) <= 5
     assert sorted(opened) == [shot.path(number) for number in shot.numbers]
 
@@ -195,24 +199,24 @@ def test_opening_a_shot_reads_nothing_and_a_damaged_frame_is_an_error_when_met(t
     path.write_bytes(path.read_bytes()[:-30])
     (tmp_path / "shot.0004.exr").write_text("not an image")
     shot = open_shot(tmp_path)
-    assert shot.window(1, 1).radius == 1
+    assert shot.read(1).number == 1
     with pytest.raises(ExrError, match=r"shot\.0003\.exr: damaged or truncated"):
-        shot.window(2, 1)
+        shot.read(3)
 
 
 def test_frames_of_other_sizes_are_an_error_that_names_both(tmp_path):
     save(save(tmp_path, [1, 2]), [3], size=(4, 7))
     shot = open_shot(tmp_path)
-    assert shot.window(1, 1).radius == 1
+    assert shot.read(2).number == 2
     with pytest.raises(ValueError, match="frame 1 is 6x4, frame 3 is 7x4"):
-        shot.window(2, 1)
+        shot.read(3)
 
 
 def test_missing_frame_cannot_be_read(tmp_path):
     shot = open_shot(save(tmp_path, [1, 3, 4]))
     assert [shot.has(number) for number in (1, 2)] == [True, False]
     with pytest.raises(FileNotFoundError, match="frame 2 is not there; the shot has 1,3-4"):
-        shot.window(2, 1)
+        shot.read(2)
 
 
 def test_frame_says_which_array_is_wrong():
@@ -224,8 +228,6 @@ def test_frame_says_which_array_is_wrong():
         Frame(1, image(1), motion=image(1, 2))
     with pytest.raises(ValueError, match="'glow'"):
         Frame(1, image(1), aovs={"glow": image(1)[..., 0]})
-    with pytest.raises(ValueError, match="centre"):
-        Window((Frame(1, image(1)), None, None))
 
 
 # --- cropped frames
