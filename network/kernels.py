@@ -22,8 +22,8 @@ from torch.nn import functional
 
 Slices = tuple[slice, slice]
 
-#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. Of
-#: small frames it goes over several at once, or starting the operations would take longer than they do.
+#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. It goes
+#: over some rows of large frames, and over several small ones, or starting the operations would take longer than they do.
 TOGETHER = 1 << 21
 
 
@@ -393,11 +393,13 @@ def _taps(kernels: Tensor, frames: Tensor) -> Iterator[tuple[slice, int, Slices,
     count, height, width = frames.shape[1], *frames.shape[3:]
     size = math.isqrt(kernels.shape[1] // count)
     radius = size // 2
-    together = max(1, TOGETHER // (frames[:, 0].numel() * frames.element_size()))
-    for first in range(0, count, together):
+    band = max(1, TOGETHER // (frames[:, 0, :, 0].numel() * frames.element_size()))
+    together = max(1, band // height)
+    for first, top in product(range(0, count, together), range(0, height, band)):
         for tap, (dy, dx) in enumerate(product(range(-radius, radius + 1), repeat=2)):
-            rows = slice(max(0, -dy), max(0, height - max(0, dy)))
-            from_rows = slice(max(0, dy), max(0, height + min(0, dy)))
+            start, stop = max(top, -dy), min(top + band, height - max(0, dy))
             columns = slice(max(0, -dx), max(0, width - max(0, dx)))
             from_columns = slice(max(0, dx), max(0, width + min(0, dx)))
-            yield slice(first, first + together), tap, (rows, columns), (from_rows, from_columns)
+            if start < stop:
+                here, there = (slice(start, stop), columns), (slice(start + dy, stop + dy), from_columns)
+                yield slice(first, first + together), tap, here, there

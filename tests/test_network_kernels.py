@@ -11,6 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+import network.kernels
 from network.kernels import (
     Filtered,
     Pyramid,
@@ -162,6 +163,18 @@ def test_gradient_of_applying_kernels(shape: tuple[int, int]) -> None:
     kernels = uniform(2, 18, *shape).requires_grad_()
     frames = uniform(2, 2, 2, *shape, seed=1).requires_grad_()
     assert torch.autograd.gradcheck(apply_kernels, (kernels, frames))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_in_how_many_pieces_kernels_are_applied_changes_nothing(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernels, frames = uniform(2, 50, 7, 6).requires_grad_(), uniform(2, 2, 3, 7, 6, seed=1).requires_grad_()
+    found = []
+    for pieces in (network.kernels.TOGETHER, rows * 2 * 3 * 6 * 8):  # of both samples, three channels, six columns
+        monkeypatch.setattr(network.kernels, "TOGETHER", pieces)
+        sums = apply_kernels(kernels, frames)
+        found.append([*sums, *torch.autograd.grad([s.square().sum() for s in sums], (kernels, frames))])
+    for whole, parts in zip(*found, strict=True):
+        assert torch.equal(whole, parts)
 
 
 def test_an_impulse_shows_where_each_tap_reads() -> None:
