@@ -22,8 +22,8 @@ from torch.nn import functional
 
 Slices = tuple[slice, slice]
 
-#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. It goes
-#: over some rows of large frames, and over several small ones, or starting the operations would take longer than they do.
+#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. Those
+#: are some rows of large frames, and several small frames, or starting the operations would take longer than they do.
 TOGETHER = 1 << 21
 
 
