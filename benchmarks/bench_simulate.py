@@ -7,11 +7,12 @@ A scene is `FILE.blend`, `FILE.blend@CAMERA`, `random:SEED` or `validation:NAME`
 its own (needs bpy), with motion blur asked for. *Everything on* means 32 bounces of every kind, all caustics, the
 light tree, six more passes, and the shutter open even where nothing moves.
 
-Time and sameness: CPU seconds per picture, everything on against what the scene calls for, in turn, and each effect
-alone; the least of several, as what else the machine does only adds to them, and as the error how far the second
-least is above; the change of the mean radiance; the two-seed test, MSE(full, lean) / (variance of full + variance of
-lean); the same ratio for two levels of noise, with the seeds that shots have and, to see that it can fail, with a
-common one. Squared differences are taken on T(x) = x / (x + mean), which keeps a firefly from being the whole figure.
+Time and sameness: CPU seconds per picture, everything on against what the scene calls for, and each effect alone,
+always in turn, as what else the machine does changes by the minute; the median of the ratios of such pairs, and as the
+error half of their range; the change of the mean radiance; the two-seed test, MSE(full, lean) / (variance of full +
+variance of lean); the same ratio for two levels of noise, with the seeds that shots have and, to see that it can fail,
+with a common one. Squared differences are taken on T(x) = x / (x + mean), which keeps a firefly from being the whole
+figure.
 
 Vectors (`--vectors`): how far the next frame is from this one before and after warping along the vectors, on the
 albedo; and the same with motion blur on. Prints Markdown.
@@ -41,7 +42,7 @@ GROUPS = {
     "more passes": ("layer.",),
 }
 KINDS = ("diffuse", "glossy", "transmission", "volume", "transparent_max", "max")
-PAIRS = 4  # pictures of each kind
+PAIRS = 5  # pictures of each kind
 
 
 def warp(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -71,6 +72,12 @@ def level_ratio(a: np.ndarray, b: np.ndarray) -> float:
     """
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     return float(1 - 2 * (a * b).mean() / ((a**2).mean() + (b**2).mean()))
+
+
+def saving(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return what is saved, of (full, lean) seconds rendered one after the other: the median, and half of the range."""
+    saved = [1 - lean / full for full, lean in pairs]
+    return float(np.median(saved)), (max(saved) - min(saved)) / 2
 
 
 def shot_of(name: str, size: tuple[int, int], film: tuple[int, int] | None, spp: int, blur: bool) -> Any:
@@ -154,16 +161,16 @@ def measure_time(name: str, size: tuple[int, int], film: tuple[int, int] | None,
         if keys is None:
             bounces = {key for key in EVERYTHING if key.endswith("_bounces")}
             source = by_rule if "causes" in group else lean
-            change = {key: source[key] for key in bounces if "brings" not in group or by_rule[key] != 0}
+            change = {key: source[key] for key in bounces if "bring" not in group or by_rule[key] != 0}
         else:
             change = {key: value for key, value in lean.items() if key.startswith(keys)}
         change = {key: value for key, value in change.items() if value != full.get(key)}
         if change:
-            effects[group] = min(render({**full, **change}, number)[1] for number in range(3))
+            settings = {**full, **change}
+            effects[group] = saving([(render(full, k)[1], render(settings, k)[1]) for k in range(PAIRS)])
 
-    (full_cpu, full_second), (lean_cpu, lean_second) = (
-        sorted(seconds for _, seconds in some)[:2] for some in (fulls, leans)
-    )
+    full_cpu, lean_cpu = (min(seconds for _, seconds in some) for some in (fulls, leans))
+    saved = saving([(a, b) for (_, a), (_, b) in zip(fulls, leans, strict=True)])
     return {
         "scene": Path(name).stem if ":" not in name else name,
         "depths": [lean[f"cycles.{kind}_bounces"] for kind in KINDS],
@@ -171,9 +178,8 @@ def measure_time(name: str, size: tuple[int, int], film: tuple[int, int] | None,
         "plan_cpu_s": planning,
         "full_cpu_s": full_cpu,
         "lean_cpu_s": lean_cpu,
-        "saved": 1 - lean_cpu / full_cpu,
-        "saved_error": full_second / full_cpu - 1 + lean_second / lean_cpu - 1,
-        "saved_by": {group: 1 - seconds / full_cpu for group, seconds in effects.items()},
+        "saved": saved,
+        "saved_by": effects,
         "mean_change": float(means.mean()),
         "mean_change_error": float(means.std(ddof=1) / np.sqrt(PAIRS)),
         "two_seeds": two_seed_ratio(first, second),
@@ -218,6 +224,11 @@ def measure_vectors(name: str, size: tuple[int, int], film: tuple[int, int] | No
     }
 
 
+def percent(saved: tuple[float, float]) -> str:
+    """Write a saving and its error."""
+    return f"{100 * saved[0]:.0f} ± {100 * saved[1]:.0f} %"
+
+
 def markdown(results: list[dict[str, Any]]) -> str:
     """Return the tables of the results."""
     if "saved" not in results[0]:
@@ -238,13 +249,13 @@ def markdown(results: list[dict[str, Any]]) -> str:
     for r in results:
         rows.append(
             f"| {r['scene']} | {'/'.join(map(str, r['depths']))} | {r['full_cpu_s']:.2f} | {r['lean_cpu_s']:.2f} "
-            f"| {100 * r['saved']:.0f} ± {100 * r['saved_error']:.0f} % "
+            f"| {percent(r['saved'])} "
             f"| {100 * r['mean_change']:+.2f} ± {100 * r['mean_change_error']:.2f} % "
             f"| {r['two_seeds']:.3f} | {r['two_levels']:.3f} | {r['common_seed']:.3f} |"
         )
     rows += ["", "| scene | " + " | ".join(GROUPS) + " |", "|---" * (len(GROUPS) + 1) + "|"]
     for r in results:
-        cells = [f"{100 * r['saved_by'][g]:.0f} %" if g in r["saved_by"] else "–" for g in GROUPS]
+        cells = [percent(r["saved_by"][g]) if g in r["saved_by"] else "–" for g in GROUPS]
         rows.append(f"| {r['scene']} | " + " | ".join(cells) + " |")
     return "\n".join(rows)
 

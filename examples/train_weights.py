@@ -3,11 +3,11 @@
     python examples/train_weights.py SCENES OUT --blender-python blender/bin/python
 
 SCENES holds the .blend files named below; what is added to them and where the camera stands follows from the table, so
-the same shots come out again; twelve random shots are `ravg simulate random`, seeds from 3000 on. None of the scenes
+the same shots come out again; 32 random shots are `ravg simulate random`, seeds from 3000 on. None of the scenes
 that ravg is judged on (contemporary_bathroom, breakfast_room, modern_hall) is among them. Needs pyoidn. Rendering takes
-three hours of one core, the clips half an hour, both resumable shot by shot; the trainings two hours. The weights that
-ship had four shots more, of the same scenes, and were begun with another loss (docs/experiments.md): the recipe is
-theirs, the numbers will differ.
+four hours of one core, the clips half an hour, both resumable shot by shot; the trainings an hour and a half. The
+weights that ship had four shots more, of the same scenes, and partly other steps (their cards): the recipe is theirs,
+the numbers will differ.
 """
 
 from __future__ import annotations
@@ -52,8 +52,9 @@ SHOTS = [
     Shot("chalice", "Camera_near1", "0.576,0.710", "1920x1080", 21, 1, 158, 15),
     Shot("country_kitchen", "Camera_move", "0.349,0.536", "1280x720", 23, 0, 159, 17),
 ]
-RANDOM = ["--frames", "7", "--size", "256x144", "--spp", "8-64", "--levels", "a=n,c=n/e,d=4", "--shots", "12"]
+RANDOM = ["--frames", "7", "--size", "256x144", "--spp", "8-64", "--levels", "a=n,c=n/e,d=4", "--shots", "32"]
 RANDOM += ["--seed", "3000", "--reference", "128", "--reference-frames", "4"]
+PRESETS = "fast", "balanced", "quality"
 
 
 def main() -> int:
@@ -61,7 +62,7 @@ def main() -> int:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--blender-python", default=sys.executable, help="a Python that has bpy")
-    parser.add_argument("--minutes", type=float, default=40, help="of training, for fast and for balanced")
+    parser.add_argument("--minutes", type=float, default=27, help="of training, for each preset")
     options = parser.parse_args()
     ravg = [sys.executable, "-m", "hybrid.cli"]
 
@@ -83,24 +84,14 @@ def main() -> int:
     for estimate in ("oidn-clean", "oidn-fast", "nlm"):
         clips = options.out / "clips" / estimate
         run(*ravg, "prepare", *folders, "-o", clips, "--tile", 0, "--reference", "--estimate", estimate)
-    common = ["--loss", "display", "--whole", 6, "--batch", 1, "--rate", 5e-4, "--clip", 0.1, "--ema", 0.997]
-    for preset in ("fast", "balanced"):
-        weights = options.out / f"{preset}.safetensors"
-        run(
-            *ravg,
-            "train",
-            options.out / "clips",
-            "-o",
-            weights,
-            "--preset",
-            preset,
-            "--minutes",
-            options.minutes,
-            *common,
-        )
-    clips, weights = options.out / "clips" / "oidn-clean", options.out / "quality.safetensors"
-    further = ["--init", options.out / "balanced.safetensors", "--minutes", options.minutes / 3]
-    run(*ravg, "train", clips, "-o", weights, *further, *common, "--rate", 3e-4)
+    common = ["--loss", "display", "--whole", 6, "--batch", 1, "--clip", 0.1, "--ema", 0.997]
+    clips, weights = options.out / "clips", {name: options.out / f"{name}.safetensors" for name in PRESETS}
+    for preset in PRESETS:
+        schedule = ["--minutes", options.minutes, "--rate", 6e-4]
+        run(*ravg, "train", clips, "-o", weights[preset], "--preset", preset, *schedule, *common)
+    # quality goes on beside the estimates that it is meant for.
+    further = ["--init", weights["quality"], "--minutes", options.minutes / 2, "--rate", 4e-4]
+    run(*ravg, "train", clips / "oidn-clean", "-o", options.out / "quality_clean.safetensors", *further, *common)
     return 0
 
 
