@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -47,8 +48,8 @@ def open_levels(
     ValueError
         If there are several levels and no samples of one of them.
     """
-    from hybrid.exr import read_exr
     from hybrid.frames import open_shot
+    from hybrid.samples import samples_of
 
     path = Path(spec)
     if path.is_dir():
@@ -64,12 +65,10 @@ def open_levels(
     levels = {name: open_shot(item, frames=frames, layers=layers or {}, keep=1) for name, item in specs.items()}
     counts = []
     for name, shot in levels.items():
-        header = read_exr(shot.path(shot.numbers[0]), pixels=False).parts[0].header
-        written = [value for key, value in header.items() if re.fullmatch(r"cycles\..*\.samples", key)]
-        count = (samples or {}).get(name) or (float(written[0]) if written else None)
+        count = (samples or {}).get(name) or samples_of(shot)
         if count is None and len(levels) > 1:
             raise ValueError(f"levels: no samples in the header of {name}; expected --levels {name}=SAMPLES,…")
-        counts.append(1.0 if count is None else count)
+        counts.append(float(count or 1))
     return path.resolve().name, levels, counts
 
 
@@ -119,10 +118,10 @@ def prepare_command(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         task = progress.add_task("prepare", total=sum(len(next(iter(shot.values()))) for _, shot, _ in found))
-        for spec, (name, shot, counts) in zip(shots, found, strict=True):
+        for name, shot, counts in found:
             first = next(iter(shot.values()))
             progress.update(task, description=f"prepare {name}")
-            if any(output.glob(f"{name}.*.safetensors")):
+            if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
                 progress.advance(task, len(first))
                 continue
             neural.write_clips(
@@ -134,7 +133,9 @@ def prepare_command(
                 tile=tile,
                 tiles=tiles,
                 estimate=estimate,
-                reference=open_shot(str(Path(spec) / "reference.####.exr"), keep=1) if reference else None,
+                reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
+                if reference
+                else None,
                 seed=seed,
                 advance=lambda: progress.advance(task),
             )

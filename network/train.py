@@ -210,7 +210,8 @@ def train(
     Raises
     ------
     ValueError
-        If the state to resume is cut short or of another training, or the batch cannot be shared evenly.
+        If the state to resume is cut short or of another training, the batch cannot be shared evenly, or the crops do
+        not fit the model.
     FileNotFoundError
         If there is no state to resume.
 
@@ -222,6 +223,10 @@ def train(
     rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if _in_group() else (0, 1)
     if config.batch % world:
         raise ValueError(f"batch: expected a multiple of the {world} processes, got {config.batch}")
+    if config.sampler.crop % model.multiple:
+        raise ValueError(
+            f"crop: expected a multiple of {model.multiple}, as this model needs, got {config.sampler.crop}"
+        )
     device = _device(config.device)
     state_path = Path(f"{os.fspath(out)}.state")
     channels_last(model.to(device).train())

@@ -386,7 +386,7 @@ def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
         metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     for change, message in [
         ({"format": "other"}, "expected format 'ravg-network', got 'other'"),
-        ({"version": "99"}, "expected version 2, got 99"),
+        ({"version": "99"}, "expected version 3, got 99"),
         ({"description": "{"}, "bad.safetensors"),
         ({"description": json.dumps(describe(RAResNet(RAResNetConfig(width=4))))}, "expected shape"),
     ]:

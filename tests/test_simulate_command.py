@@ -12,6 +12,7 @@ from hybrid.simulate.command import (
     SimulationError,
     check_blender,
     missing,
+    parse_center,
     parse_frames,
     parse_numbers,
     parse_size,
@@ -101,6 +102,10 @@ def test_frames_and_sizes():
         parse_numbers("1-4")
     with pytest.raises(ValueError, match="film: got '320'"):
         parse_size("320", "film")
+    assert parse_center("0.25,1") == (0.25, 1)
+    for wrong in ("0.5", "0.5,", "0.5,1.5", "a,b", "-0.1,0"):
+        with pytest.raises(ValueError, match=f"center: got '{wrong}', expected X,Y"):
+            parse_center(wrong)
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,14 @@ def rendered(scene, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def blurred(scene, tmp_path_factory):
+    """Render the cube's first frame with the shutter open, with more samples than the guides' own pass has."""
+    out = tmp_path_factory.mktemp("blurred")
+    simulate([(ShotSettings(str(scene), 1, (1,), SIZE, {"noisy": 24}, motion_blur=True), out)], threads=2)
+    return out
+
+
 def read(path):
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: channel.pixels.astype(np.float64) for name, channel in file.channels().items()}
@@ -113,6 +121,15 @@ def test_meta_says_what_is_needed_to_render_it_again(rendered):
     assert meta["plan"]["facts"]["glossy"] == 0
     assert meta["plan"]["facts"]["motion_pixels"] == pytest.approx(3, abs=0.2)
     assert {"a.0001.exr", "reference.0002.exr"} <= set(meta["seconds"])
+
+
+def test_headers_say_how_many_samples_the_picture_has(rendered, blurred):
+    """Put together of halves, of two references, of a blurred picture and sharp guides."""
+    names = {"a.0002": 8, "c.0002": 4, "reference_a.0002": 16, "reference.0002": 32}
+    paths = {rendered / f"{name}.exr": samples for name, samples in names.items()} | {blurred / "noisy.0001.exr": 24}
+    for path, samples in paths.items():
+        with OpenEXR.File(str(path), header_only=True) as file:
+            assert file.header()["cycles.ViewLayer.samples"] == str(samples), path.name
 
 
 def test_noise_levels_are_independent(rendered):
@@ -266,16 +283,14 @@ def test_what_blender_keeps_between_frames_changes_no_picture(tmp_path):
     assert np.any(pictures[0][0]["ViewLayer.Combined.R"] != pictures[0][1]["ViewLayer.Combined.R"]), "something moves"
 
 
-def test_with_motion_blur_vectors_come_from_an_unblurred_pass(scene, rendered, tmp_path):
-    shot = ShotSettings(str(scene), 1, (1,), SIZE, {"noisy": 8}, motion_blur=True)
-    simulate([(shot, tmp_path)], threads=2)
-    blurred, sharp = read(tmp_path / "noisy.0001.exr"), read(rendered / "a.0001.exr")
+def test_with_motion_blur_vectors_come_from_an_unblurred_pass(rendered, blurred):
+    smeared, sharp = read(blurred / "noisy.0001.exr"), read(rendered / "a.0001.exr")
     # Other samples of the same edges: half of the pixels have no edge.
-    difference = np.abs(layer(blurred, "Vector", "XYZW") - layer(sharp, "Vector", "XYZW")).max(axis=-1)
+    difference = np.abs(layer(smeared, "Vector", "XYZW") - layer(sharp, "Vector", "XYZW")).max(axis=-1)
     assert np.median(difference) < 0.02
     assert (difference > 0.5).mean() < 0.1
-    assert set(blurred) == {name for name in sharp if ".Half " not in name}
-    meta = json.loads((tmp_path / "meta.json").read_text())
+    assert set(smeared) == {name for name in sharp if ".Half " not in name}
+    meta = json.loads((blurred / "meta.json").read_text())
     assert meta["plan"]["cycles"]["render.use_motion_blur"]
 
 

@@ -64,6 +64,13 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
 
 
+def test_one_sequence_is_prepared_towards_the_reference_beside_it(shot, tmp_path):
+    (tmp_path / "wall.b.0000.safetensors").touch()  # another shot's, whose name begins alike
+    options = ("--tile", 0, "--estimate", "nlm", "--window", 3, "--reference", "--frames", SCENE.first)
+    assert run("prepare", shot / "a.####.exr", "-o", tmp_path, *options) == 0
+    assert (tmp_path / "wall.0000.safetensors").is_file()
+
+
 def test_levels_of_a_shot_are_found_without_its_references(shot):
     name, levels, samples = open_levels(str(shot), {"a": 24, "c": 8})
     assert (name, list(levels), samples) == ("wall", ["a", "c"], [24, 8])
@@ -99,7 +106,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     assert (found.shots, len(found.of(["other"]))) == (["other", "wall"], 3)
     assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
 
-    train = ["train", clips, "-o", out, "--crop", "16", "--batch", "1", "--threads", "1", "--float32"]
+    train = ["train", clips, "-o", out, "--crop", "32", "--batch", "1", "--threads", "1", "--float32"]
     assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
     assert "denoised" in capsys.readouterr().err
     assert load_notes(out)["training"]["steps"] == 2
@@ -116,6 +123,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     capsys.readouterr()
     for more, message in (
         (["--steps", "1", "--resume"], "resume: no file"),
+        (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 32, as this model needs, got 40"),
         (
             ["--steps", "1", "--preset", "slow"],
             "preset is 'slow', expected one of fast, balanced, quality, unet, multiscale, paper, tkpcn",

@@ -237,6 +237,14 @@ def parse_size(text: str, name: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+def parse_center(text: str) -> tuple[float, float]:
+    """Read `X,Y`, fractions of the camera's picture."""
+    match = re.fullmatch(r"([01]?\.?\d+),([01]?\.?\d+)", text)
+    if match is None or max(where := (float(match[1]), float(match[2]))) > 1:
+        raise ValueError(f"center: got {text!r}, expected X,Y, both from 0 to 1")
+    return where
+
+
 def parse_frames(text: str) -> tuple[int, ...]:
     """Read `7`, the first seven frames, or `8-14`."""
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
@@ -282,10 +290,6 @@ def simulate_command(
         raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file, random or validation")
     if jobs < 1:
         raise ValueError(f"jobs: got {jobs}, expected at least 1")
-    where = None
-    if center is not None:
-        x, _, y = center.partition(",")
-        where = (float(x), float(y))
     first = ShotSettings(
         scene=scene,
         seed=seed,
@@ -295,7 +299,7 @@ def simulate_command(
         reference=reference,
         reference_frames=parse_numbers(reference_frames) if reference_frames else None,
         film=parse_size(film, "film") if film else None,
-        center=where,
+        center=parse_center(center) if center else None,
         camera=camera,
         motion=motion,
         movers=movers,

@@ -27,6 +27,7 @@ from hybrid.simulate.shot import ShotSettings, frame_seed
 PILOT_SAMPLES = 8
 PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
 PILOT_BOTH_ENDS = 30e6  # samples of a shot above which the pilot may take the time for two frames
+SAMPLES = "cycles.ViewLayer.samples"  # what Cycles writes in a header: of one rendering, which may be a part
 GUIDE_SAMPLES = 16  # of the unblurred pass: edges are antialiased, and nothing is lit
 
 
@@ -210,11 +211,11 @@ def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, see
             apply(scene, {"render.use_motion_blur": False, "cycles.diffuse_bounces": 0})
             render_frame(scene, partial, min(samples, GUIDE_SAMPLES), seed)
             apply(scene, lit)
-            header, sharp = read_channels(partial)
+            _, sharp = read_channels(partial)
             lighting = {name: channels[name] for name in channels if ".Combined." in name or ".Half " in name}
             channels = {**sharp, **lighting}
         if channels:
-            OpenEXR.File(header, channels).write(str(partial))
+            OpenEXR.File({**header, SAMPLES: str(samples)}, channels).write(str(partial))
         partial.rename(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -222,12 +223,12 @@ def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, see
 
 def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -> None:
     """Render two independent halves of the reference, and their mean; of all only the colour is kept."""
-    halves = []
+    halves, half = [], max(shot.reference // 2, 1)
     for name in ("reference_a", "reference_b"):
         path = folder / f"{name}.{frame:04d}.exr"
         if not path.exists():
             partial = path.with_name(f".{os.getpid()}-{path.name}")
-            render_frame(scene, partial, max(shot.reference // 2, 1), frame_seed(shot.seed, name, frame))
+            render_frame(scene, partial, half, frame_seed(shot.seed, name, frame))
             header, channels = read_channels(partial)
             color = {key: values for key, values in channels.items() if ".Combined." in key}
             OpenEXR.File(header, color).write(str(partial))
@@ -237,7 +238,7 @@ def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -
     path = folder / f"reference.{frame:04d}.exr"
     partial = path.with_name(f".{os.getpid()}-{path.name}")
     mean = {name: ((a[name].astype(np.float32) + b[name]) / 2).astype(np.float16) for name in a}
-    OpenEXR.File(header, mean).write(str(partial))
+    OpenEXR.File({**header, SAMPLES: str(2 * half)}, mean).write(str(partial))
     partial.rename(path)
 
 
