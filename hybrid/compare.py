@@ -274,7 +274,9 @@ def compare_shot(
     Raises
     ------
     ValueError
-        If shot and reference have no frame in common or differ in size, or a method leaves frames out.
+        If shot and reference have no frame in common; before any method runs, if what is given beside the shot
+        lacks a frame or differs from it in size, or if levels come without samples or without "noisy" to compare
+        with; afterwards, if a method has left frames out.
     """
     if folder is None:
         with TemporaryDirectory() as temporary:
@@ -288,6 +290,20 @@ def compare_shot(
     if not numbers:
         spans = " and ".join(map(_span, halves))
         raise ValueError(f"reference has frames {spans}, the shot {_span(shot)}: none in common")
+    if levels and samples is None:
+        raise ValueError("levels need the samples per pixel of the shot; its files do not tell them")
+    if levels and ("noisy" not in methods or "psnr" not in measures):
+        raise ValueError("levels are compared with the shot's own noise, expected the method 'noisy' and its PSNR")
+    given = [("reference", half, numbers) for half in halves]
+    given += [(f"method {name!r}", m.given, numbers) for name, m in methods.items() if m.given is not None]
+    for level, count in levels:
+        common = [number for number in numbers if level.has(number)]
+        if not common:
+            spans = f"frames {_span(level)}, expected some of {_span_of(numbers)}"
+            raise ValueError(f"level of {count:g} samples has {spans}")
+        given.append((f"level of {count:g} samples", level, common))
+    with _apart() as pool:  # so that the frames it reads do not travel to the methods inside the shot
+        pool.submit(_check_sizes, shot, given).result()
     for number in numbers:
         images = [half.read(number).color for half in halves]
         _save(folder, "reference", number, np.mean(images, axis=0))
@@ -295,7 +311,7 @@ def compare_shot(
             _save(folder, "reference a", number, images[0])
             _save(folder, "reference b", number, images[1])
     facts = {"Frames": f"{_span_of(numbers)}, {images[0].shape[1]} × {images[0].shape[0]} pixels"}
-    with _apart() as pool:  # so that the frames it reads do not travel to the methods inside the shot
+    with _apart() as pool:
         pairs = pool.submit(_save_pairs, shot, numbers, folder).result()
     static = _static_pixels(folder, numbers, pairs, exposure)
     facts["Pixels that stand still"] = f"{static.mean():.1%}"
@@ -358,6 +374,22 @@ def compare_shot(
         "Versions": ", ".join(_versions()),
     }
     return Comparison(title, tuple(results), facts)
+
+
+def _check_sizes(shot: Shot, given: Sequence[tuple[str, Shot, Sequence[int]]]) -> None:
+    """Read the frames that are needed of what is given beside the shot; all must be there, and of its size.
+
+    This costs seconds. Found when a method's frames are measured, the same would cost all that has run by then.
+    """
+    expected = shot.read(shot.numbers[0]).color.shape
+    for what, sequence, numbers in given:
+        for number in numbers:
+            if not sequence.has(number):
+                raise ValueError(f"{what} gave no frame {number}, expected all of {_span_of(numbers)}")
+            found = sequence.read(number).color.shape
+            if found != expected:
+                sizes = f"{found[1]}x{found[0]}, expected {expected[1]}x{expected[0]}, the shot's"
+                raise ValueError(f"frame {number} of {what} is {sizes}")
 
 
 def known_samples(samples: float | None) -> float:
@@ -523,16 +555,8 @@ def _levels(
 ) -> list[tuple[float, float]]:
     """Mean squared error on the tone curve of every level there is, the shot's own among them, by samples."""
     known = [(known_samples(samples), _mean_error(noisy))]
-    if samples is None:
-        if levels:
-            raise ValueError("levels need the samples per pixel of the shot; its files do not tell them")
-        return known
     for shot, count in levels:
         common = [number for number in numbers if shot.has(number)]
-        if not common:
-            raise ValueError(
-                f"level of {count:g} samples has frames {_span(shot)}, expected some of {_span_of(numbers)}"
-            )
         scores = [psnr(shot.read(n).color, load_reference(folder, n), exposure=exposure) for n in common]
         known.append((count, float(np.mean([_error(score) for score in scores]))))
     return sorted(known)

@@ -59,6 +59,7 @@ class Method:
     maps : from a shot to (number, (H, W) maps in [0, 1] by title), to be looked at.
     cost : seconds where they are not measured: 0 for what is there anyway, None where they are not known.
     threads : how many the method may use; 0 leaves it to the machine.
+    given : the frames, where another denoiser has left them in files: they can be checked before anything runs.
     settings : what the report tells of it; in a sweep, what differs from `base`.
     sweep, base : what is varied, and the method that is varied.
     """
@@ -68,6 +69,7 @@ class Method:
     maps: Maps | None = None
     cost: float | None = math.nan
     threads: int = 0
+    given: Shot | None = None
     settings: Mapping[str, object] = field(default_factory=dict)
     sweep: str = ""
     base: str = ""
@@ -96,7 +98,7 @@ def finished(shot: Shot, *, other: Shot) -> Iterator[tuple[int, Array]]:
 
 def external(other: Shot) -> Method:
     """A finished sequence as a method; its time is not known."""
-    return Method(partial(finished, other=other), "External", cost=None)
+    return Method(partial(finished, other=other), "External", cost=None, given=other)
 
 
 # Ours, on aligned windows

@@ -312,10 +312,27 @@ def test_wrong_input_is_an_error() -> None:
         compare_shot(shot, make_shots((8, 9))[1], NOISY)
     with pytest.raises(ValueError, match="'lazy' gave no frame 5"):
         compare_shot(shot, reference, ways(lazy=lazy))
-    with pytest.raises(ValueError, match="levels need the samples per pixel of the shot"):
-        compare_shot(shot, reference, NOISY, measures=QUICK, levels=[(shot, 4)])
-    with pytest.raises(ValueError, match="level of 4 samples has frames 8–9, expected some of 4–6"):
-        compare_shot(shot, reference, NOISY, measures=QUICK, samples=8, levels=[(make_shots((8, 9))[0], 4)])
+
+
+def test_wrong_input_is_found_before_any_method_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long comparison must not end in an error that could have been seen at its start."""
+    monkeypatch.setattr(compare, "time_methods", lambda *_, **__: pytest.fail("methods were run"))
+    shot, reference = make_shots()
+    small = MemoryShot({n: Frame(n, f.color[:, 1:]) for n, f in shot.frames.items()})
+    short = MemoryShot({n: f for n, f in reference.frames.items() if n != 5})
+
+    def refuses(words: str, methods: dict[str, Method] = NOISY, *, reference=reference, **more: object) -> None:
+        with pytest.raises(ValueError, match=words):
+            compare_shot(shot, reference, methods, measures=QUICK, **more)
+
+    refuses("frame 4 of reference is 31x24, expected 32x24", reference=small)
+    refuses("frame 4 of reference is 31x24, expected 32x24", reference=(reference, small))
+    refuses("'theirs' gave no frame 5, expected all of 4–6", NOISY | {"theirs": external(short)})
+    refuses("frame 4 of method 'theirs' is 31x24, expected 32x24", NOISY | {"theirs": external(small)})
+    refuses("levels need the samples per pixel of the shot", levels=[(shot, 4)])
+    refuses("expected the method 'noisy'", ways(perfect=perfect), samples=8, levels=[(shot, 4)])
+    refuses("expected some of 4–6", samples=8, levels=[(make_shots((8, 9))[0], 4)])
+    refuses("frame 4 of level of 4 samples is 31x24", samples=8, levels=[(small, 4)])
 
 
 class TestMotionBetween:
