@@ -127,7 +127,7 @@ def test_a_read_only_folder_is_named(shot_folder, tmp_path, capsys):
 
 def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
     (tmp_path / "o").write_text("not a folder")
-    assert "o" in one_line_error(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o" / "x.####.exr")
+    assert str(tmp_path / "o") in one_line_error(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o" / "x.####.exr")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.frames import open_shot  # noqa: E402
-from hybrid.neural import Denoiser, has_bfloat16, shipped_weights, write_clips  # noqa: E402
+from hybrid.neural import Denoiser, shipped_weights, write_clips  # noqa: E402
 from hybrid.pseudo_reference import DRAFT, Aligner  # noqa: E402
 from network.checkpoint import save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
@@ -185,10 +185,6 @@ def test_bad_options_are_refused(weights):
             Denoiser(weights, **options)
     with pytest.raises(ValueError, match="expected one of"):
         shipped_weights("slowest")
-
-
-def test_bfloat16_is_detected_without_failing():
-    assert has_bfloat16() in (True, False)
 
 
 def test_more_threshold_stays_closer_to_the_input_and_to_its_own_frame():
