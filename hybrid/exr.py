@@ -587,11 +587,11 @@ def _tails(image: ExrImage, layer: Layer) -> list[str]:
 _LACK = {
     "albedo": "textures are filtered together with the light: blur, about 2 dB",
     "normal": "edges between surfaces of one color are held by color alone",
-    "depth": "edges between surfaces of one color and direction are held by color alone",
+    "depth": "where vectors lead backward only, the nearer of two surfaces is told by speed",
     "motion": "flow is estimated from the picture: slower, and less exact",
     "variance": "noise is estimated from half buffers where there are two, else from the window",
     "alpha": "nothing, if the picture has no transparent parts",
-    "estimate": "moving light is told from noise by noisy frames alone",
+    "estimate": "single frames are denoised by OIDN, or by our own filters",
 }
 
 

@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 from hybrid import metrics  # noqa: E402
+from hybrid.estimates import MODE_OF  # noqa: E402
+from hybrid.neural import shipped_weights  # noqa: E402
 from network import losses  # noqa: E402
 from network.blocks import ravg  # noqa: E402
+from network.checkpoint import load_model  # noqa: E402
 from network.inputs import window_exposure  # noqa: E402
 from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
 from network.models import denoise_tile, fast, filter_window, for_inference, unet  # noqa: E402
@@ -115,10 +118,10 @@ def test_the_perceptual_loss_and_its_gradient_are_finite(perceptual, pair):
 def hard_window(level: float) -> dict[str, torch.Tensor]:
     """Noise around a level with one firefly, frames that are trusted or not, and estimates that lack the firefly."""
     torch.manual_seed(1)
-    color = torch.rand(1, 5, 3, 16, 16) * level
+    color = torch.rand(1, 5, 3, 32, 32) * level
     estimate = color.mean((-2, -1), keepdim=True).expand_as(color)
     color[0, 2, :, 5, 5] = 1e6
-    confidence = torch.randint(0, 2, (1, 5, 1, 16, 16)).float()
+    confidence = torch.randint(0, 2, (1, 5, 1, 32, 32)).float()
     return {"color": color, "estimate": estimate, "confidence": confidence, "exposure": window_exposure(color)}
 
 
@@ -133,20 +136,20 @@ def test_the_gradient_of_the_whole_network_is_finite(level, preset):
 
 
 @pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
-@pytest.mark.parametrize(("preset", "reach"), [(unet, 92), (fast, 320)])
-def test_a_pixel_changes_nothing_beyond_the_networks_reach(preset, reach, bfloat16):
-    """The support in theory; see docs/reliability.md for where the effect ends."""
+@pytest.mark.parametrize("preset", [None, *MODE_OF], ids=["unet", *MODE_OF])
+def test_a_firefly_changes_little_around_it_and_nothing_far_away(preset, bfloat16):
+    """92 pixels are what a unet can see in theory; of the weights that ship 74 and, beyond 1e-5, 34 were measured."""
     torch.manual_seed(0)
-    model = for_inference(preset(), bfloat16)
-    color = torch.rand(1, 5, 3, 16, 512)
-    estimate, confidence = torch.full_like(color, 0.5), torch.ones(1, 5, 1, 16, 512)
-    window = {"color": color, "estimate": estimate, "confidence": confidence, "exposure": window_exposure(color)}
+    model = for_inference(unet() if preset is None else load_model(shipped_weights(preset)), bfloat16)
+    color = torch.rand(1, 5, 3, 64, 512)
+    estimate, confidence = torch.full_like(color, 0.5), torch.ones(1, 5, 1, 64, 512)
+    window = {"color": color, "estimate": estimate, "confidence": confidence, "exposure": torch.full((1,), 0.5)}
     plain = denoise_tile(model, window)[0]
-    color[0, 1, :, 4, 20] = 1e4
-    changed = denoise_tile(model, window)[0]
-    differs = (plain != changed).any(1)[0].any(0).nonzero().flatten()
-    assert int(differs.max()) <= 20 + reach
-    assert bool((plain != changed).any())
+    color[0, 1, :, 30, 20] = 1e4
+    change = (denoise_tile(model, window)[0] - plain).abs().amax((0, 1, 2))
+    assert 0 < float(change.max())
+    assert not bool(change[20 + 92 :].any())
+    assert preset is None or float(change[20 + 48 :].max()) < 1e-5  # the halo of a tile
 
 
 IMAGES = {
