@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -70,17 +70,25 @@ def choose_estimate(
     mode : str
         Of OIDN, for "auto".
     kept : str, optional
-        Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder.
+        Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder. Where none are
+        made, the reason says that none are kept.
 
     Raises
     ------
     ImportError
         If OIDN is asked for by name and not installed.
     ValueError
-        If a sequence lacks frames of the shot.
+        If a sequence lacks frames of the shot, or `kept` is one file for several, neighbours among them.
     FileNotFoundError
         If there is no such sequence.
     """
+    source = _choose(spec, shot, own, kept, mode)
+    if kept is not None and source.name not in OIDN_MODES:
+        return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
+    return source
+
+
+def _choose(spec: str, shot: Shot, own: Preset, kept: str | None, mode: str) -> EstimateSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", _from_file, "the file holds a denoised picture")
@@ -109,6 +117,7 @@ def _has_oidn() -> bool:
 def _oidn(mode: str, shot: Shot, kept: str | None) -> Estimate:
     run: Callable[[Frame], Array] = partial(estimate_oidn, **OIDN_MODES[mode])
     if kept is not None:
+        output_path(kept, shot, shot.numbers[0], beside=True)  # refuses one name for several frames before any is made
         run = partial(_run_or_read, run=run, shot=shot, kept=kept)
     return CleanGuides(run) if OIDN_MODES[mode].get("clean") else run
 

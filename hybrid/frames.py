@@ -338,7 +338,7 @@ def open_shot(
     return Shot(_find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep, max_pixels=max_pixels)
 
 
-def output_path(pattern: str | Path, shot: Shot, number: int) -> Path:
+def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = False) -> Path:
     """Where the result for a frame goes.
 
     Parameters
@@ -350,6 +350,8 @@ def output_path(pattern: str | Path, shot: Shot, number: int) -> Path:
         The shot.
     number
         Frame number.
+    beside
+        Frames that were not asked for get files too.
 
     Raises
     ------
@@ -362,8 +364,9 @@ def output_path(pattern: str | Path, shot: Shot, number: int) -> Path:
     else:
         sequence = fileseq.FileSequence(pattern, pad_style=_PADDING)
         placeholder = bool(sequence.padding()) and not sequence.frameSet()
-        if not placeholder and len(shot) > 1:
-            raise ValueError(f"output {pattern!r} names one file for {len(shot)} frames, expected OUT.####.exr")
+        count = shot.count if beside else len(shot)
+        if not placeholder and count > 1:
+            raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
         path = Path(sequence.frame(number)) if placeholder else Path(pattern)
     # Not only its own input: frames still to come need the noisy neighbours.
     if shot.reads(path):

@@ -256,6 +256,23 @@ def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
     np.testing.assert_allclose(images[0], 0.5 * shot.read(MIDDLE).color, rtol=1e-3)
 
 
+def test_pictures_are_kept_in_a_file_each(tmp_path, monkeypatch):
+    """Also where one frame was asked for: its neighbours are denoised as well."""
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    folder, one = SCENE.write(tmp_path), str(tmp_path / "kept.exr")
+    with pytest.raises(ValueError, match=r"kept\.exr' names one file for 5 frames, expected OUT\.####\.exr"):
+        choose_estimate("oidn", open_shot(folder, frames=str(MIDDLE)), kept=one)
+    alone = open_shot(folder / f"shot.{MIDDLE}.exr")
+    assert choose_estimate("oidn", alone, kept=one).reason == "asked for"
+
+
+def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy", edit=denoised))
+    for spec in ("auto", "nlm", "none", str(tmp_path / "noisy")):
+        assert "nothing of it is kept" in choose_estimate(spec, shot, kept=str(tmp_path / "kept")).reason
+        assert "kept" not in choose_estimate(spec, shot).reason
+
+
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_estimates_come_out_stable(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
