@@ -29,9 +29,6 @@ from flow.motion import compose_flow, forward_backward_error, invert_flow, norma
 from flow.tvl1 import dense_flow, refine_flow, select_flow
 from flow.warp import warp
 
-# CPU seconds at 1920 x 1080 of the prototypes this replaces.
-PROTOTYPE = {"refine_flow 3/3/30": 1.2, "refine_flow 2/2/15": 0.38}
-
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -105,10 +102,6 @@ def main(argv: list[str]) -> int:
         "mix_centre": lambda: mix_centre(warped, albedo, inside.astype(np.float32)),
     }
     cpu_seconds = {name: measure(function, options.repeats) for name, function in stages.items()}
-    for name, prototype in PROTOTYPE.items():
-        cpu_seconds[name]["ratio_to_prototype"] = cpu_seconds[name]["median"] / (
-            prototype * width * height / (1920 * 1080)
-        )
     commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     report = {
         "size": [width, height], "threads": options.threads, "repeats": options.repeats, "seed": 0,

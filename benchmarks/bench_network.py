@@ -30,9 +30,6 @@ from network.losses import relmse
 from network.models import PRESETS, channels_last, denoise_tile, for_inference
 from network.train import TrainConfig, batch_loss
 
-# CPU seconds per megapixel of the prototypes this replaces: forward, forward and backward.
-PROTOTYPE = {"apply_kernels": 0.11, "apply_kernels, training": 0.60}
-
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -145,8 +142,6 @@ def main(argv: list[str]) -> int:
     for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.presets)):
         seconds = measure(function, options.repeats)
         results[name] = {**seconds, "per_megapixel": seconds["median"] / pixels * 1e6}
-        if name in PROTOTYPE:
-            results[name]["over_prototype"] = results[name]["per_megapixel"] / PROTOTYPE[name]
     commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     header = {
         "unit": "CPU seconds",

@@ -216,7 +216,7 @@ def spread_seconds(runs: Mapping[str, Sequence[Run]]) -> dict[str, tuple[float, 
     Notes
     -----
     The median alone. Dividing out the load of a round (as all methods felt it), or of a run (by a fixed piece of work
-    between its frames), made ratios repeat no better on a machine with eight busy processes to a core: load changes
+    between its frames), made ratios repeat no better on a machine under eight times its load: that changes
     within seconds. More rounds do help; `benchmarks/bench_compare.py` shows how far the ratios can be trusted.
     """
     out = {}

@@ -401,7 +401,7 @@ def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
 
 
 def unet(frames: int = 5, seed: int = 0) -> RAUNet:
-    """From noisy frames alone, a small U-Net: 0.25 M parameters."""
+    """From noisy frames alone, a small U-Net: 0.24 M parameters."""
     with _seeded(seed):
         return RAUNet(RAUNetConfig(KernelConfig(frames)))
 
@@ -553,11 +553,3 @@ def _frames_first(x: Tensor, frames: int) -> Tensor:
     """``(T·N, K·K, H, W)`` to float32 ``(N, T, K·K, H, W)``, planes contiguous as the kernels' passes want them."""
     x = x.unflatten(0, (frames, -1)).transpose(0, 1)
     return x.to(torch.float32, memory_format=torch.contiguous_format)
-
-
-def _peak(size: int, spread: float) -> Tensor:
-    """A K×K kernel, (1, 1, K·K, 1, 1), of mean 1: `spread` of it uniform, the rest at the centre."""
-    taps = size * size
-    kernel = torch.full((1, 1, taps, 1, 1), spread)
-    kernel[:, :, taps // 2] += taps * (1 - spread)
-    return kernel
