@@ -1,9 +1,9 @@
 """Predicted kernels: activation with a threshold, and applying them frame by frame.
 
 A kernel has one weight per tap: the K×K neighbours of a pixel in each frame of the aligned window (time, then
-row, then column). All taps of a pixel are normalised together. Applying them keeps the frames apart: numerators ``S_t = Σ k_i x_i`` and denominators
-``N_t = Σ k_i`` over the taps of frame t. The filtered image is ``Σ S_t / Σ N_t``; any subset of the frames, and
-the share of each frame, are sums of the same.
+row, then column). All taps of a pixel are normalised together. Applying them keeps the frames apart: numerators
+``S_t = Σ k_i x_i`` and denominators ``N_t = Σ k_i`` over the taps of frame t. The filtered image is ``Σ S_t / Σ N_t``;
+any subset of the frames, and the share of each frame, are sums of the same.
 """
 
 from __future__ import annotations
