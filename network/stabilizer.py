@@ -122,9 +122,9 @@ class Stabilizer(UNet):
     A feature of the finest scale is that of a cell of pixels; its channels are shared out to the pixels where those
     are asked for. A frame's weight is ``c e^h``, c its confidence and h in [−0.15, 0.15] predicted, normalised over the
     frames and thresholded (η_t, section 4 of the paper): training starts from the gated average. The shares are found
-    from the centre frame's features, and from the size of the residual and of its noise at their scale. Scales are those
-    finer than a cell, those of the network, and one coarser. They start at 5 % at the coarsest, and each at three fifths of
-    the next coarser.
+    from the centre frame's features, and from the size of the residual and of its noise at their scale. Scales are
+    those finer than a cell, those of the network, and one coarser. They start at 5 % at the coarsest, and each at
+    three fifths of the next coarser.
     """
 
     def __init__(self, config: StabilizerConfig) -> None:
