@@ -51,8 +51,10 @@ class Breakdown:
         self.pixels += flat.shape[1]
 
     def rows(self) -> Iterator[tuple[str, str, str, str]]:
-        """Frame, average, minimum and maximum weight, to be printed."""
-        values = (self._sum / max(self.pixels, 1), self._least, self._greatest)
+        """Frame, average, minimum and maximum weight, to be printed; none where nothing has been counted."""
+        if not self.pixels:
+            return
+        values = (self._sum / self.pixels, self._least, self._greatest)
         for name, *figures in zip(frame_names(len(self._sum)), *values, strict=True):
             yield (name, *(f"{figure:.4f}" for figure in figures))  # type: ignore[misc]
 

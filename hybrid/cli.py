@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -17,8 +18,6 @@ from hybrid.simulate.command import simulate_command
 from hybrid.training import prepare_command, train_command
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
-    import tempfile
-
     from rich.table import Table as RichTable
 
     from hybrid.estimates import EstimateSource
@@ -145,6 +144,7 @@ def pseudoref(
 
     chosen = _choose(PRESETS, preset, "preset")
     opened = _open(shot, frames, layer, max_pixels=max_pixels)
+    _spare_input(opened, output, preview=preview)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     if source.estimate is None:
@@ -162,11 +162,11 @@ def pseudoref(
             preset=preset,
             settings={"layer": layer, "estimate": estimate},
             effects=(effects, no_effects),
-            preview=preview,
             resume=resume,
             max_memory=max_memory,
         )
     )
+    _preview(opened, output, preview)
 
 
 @app.command()
@@ -185,7 +185,12 @@ def denoise(
     ] = None,
     estimate: EstimateOption = "auto",
     keep_estimates: KeepOption = None,
-    passes: Annotated[int, typer.Option(help="run again on the result: a wider window in time, a softer picture")] = 1,
+    passes: Annotated[
+        int,
+        typer.Option(
+            help="run again on the result: a wider window in time, a softer picture; --resume makes all passes again"
+        ),
+    ] = 1,
     breakdown: Annotated[
         Path | None,
         typer.Option(metavar="PNG", help="a picture of what each frame contributes, with layers and figures of it"),
@@ -204,13 +209,11 @@ def denoise(
 ) -> None:
     """Denoise with the Robust Average network."""
     neural = _neural()
-    import contextlib
-
     from rich.console import Console
     from rich.table import Table
 
     from hybrid.breakdown import Breakdown, write_breakdown
-    from hybrid.estimates import MODE_OF, choose_estimate
+    from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
     from hybrid.timing import Timings
 
     if passes < 1:
@@ -218,63 +221,65 @@ def denoise(
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = _open(shot, frames, layer, aov, max_pixels=max_pixels)
+    _spare_input(opened, output, preview=preview, breakdown=breakdown)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
     if budget is not None:
         preset = _fitting(opened, budget, estimate, _plan(opened, effects, no_effects), precision)
     path = weights or neural.shipped_weights(preset)
-    weighed = None if breakdown is None else Breakdown()
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[preset]
-        source = choose_estimate(wanted, opened, kept=keep_estimates, mode=mode)
+        made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
+        source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
+    elif estimate in ("auto", "none"):
+        source = EstimateSource("none", None, "this network takes none")
     else:
-        source = choose_estimate("none", opened)
+        raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
     settings = {
         "layer": layer,
         "estimate": estimate,
         "aov": aov,
         "tile": tile,
         "threshold": threshold,
+        "breakdown": breakdown is not None,
         "precision": denoiser.precision,
         "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
     }
-    with contextlib.ExitStack() as stack:
-        for number in range(1, passes + 1):
-            last = number == passes
-            into = output if last else stack.enter_context(_beside(output))
-            if last:
-                denoiser.breakdown = weighed
-            _run(
-                _Job(
-                    opened,
-                    into,
-                    denoiser,
-                    timings,
-                    source,
-                    command="denoise" if passes == 1 else f"denoise, pass {number} of {passes}",
-                    preset=preset if weights is None else path.name,
-                    settings=settings,
-                    effects=(effects, no_effects),
-                    preview=preview if last else None,
-                    resume=resume,
-                    max_memory=max_memory,
-                    radius=denoiser.radius,
-                    neural=True,
-                )
-            )
-            if not last:
-                opened, source = _next_pass(opened, into, layer, aov)
-        if breakdown is not None and weighed is not None:
-            write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
-            table = Table("frame", "average weight", "minimum", "maximum")
-            for row in weighed.rows():
+    job = _Job(
+        opened,
+        output,
+        denoiser,
+        timings,
+        source,
+        command="denoise",
+        preset=preset if weights is None else path.name,
+        settings=settings,
+        effects=(effects, no_effects),
+        resume=resume,
+        max_memory=max_memory,
+        radius=denoiser.radius,
+        neural=True,
+    )
+    with _last_pass(job, passes) as last:
+        if breakdown is not None:
+            denoiser.breakdown = Breakdown()
+        _run(last)
+    _preview(opened, output, preview)
+    if breakdown is not None and denoiser.breakdown is not None:
+        write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
+        if denoiser.breakdown.pixels:
+            title = "Weights in the frames made by this run"
+            table = Table("frame", "average weight", "minimum", "maximum", title=title, title_justify="left")
+            for row in denoiser.breakdown.rows():
                 table.add_row(*row)
             Console().print(table)
-            typer.echo(f"wrote {breakdown}")
+        else:
+            typer.echo("no weights to print: all frames were finished already")
+        typer.echo(f"wrote {breakdown}")
 
 
 @app.command()
@@ -477,13 +482,15 @@ def _plan(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Pl
     return plan_shot(shot).force(_split(on), _split(off))
 
 
-def _beside(output: str) -> tempfile.TemporaryDirectory[str]:
-    """A folder for what the next pass reads, on the disk of the output, gone when all is done."""
-    import tempfile
+def _spare_input(shot: Shot, output: str, **pictures: Path | None) -> None:
+    """Refuse to write over a frame of the shot, before anything is made."""
+    from hybrid.frames import output_path
 
-    folder = Path(output).parent if Path(output).suffix else Path(output)
-    folder.mkdir(parents=True, exist_ok=True)
-    return tempfile.TemporaryDirectory(prefix=".ravg-", dir=folder)
+    for number in shot.numbers:
+        output_path(output, shot, number)
+    for option, path in pictures.items():
+        if path is not None and shot.reads(path):
+            raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
 
 
 def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str) -> str:
@@ -506,17 +513,6 @@ def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str)
     if not fits:
         typer.echo("warning: not even the fastest preset fits", err=True)
     return measured.preset
-
-
-def _next_pass(
-    shot: Shot, folder: str, layer: Sequence[str] | None, aovs: Sequence[str] | None
-) -> tuple[Shot, EstimateSource]:
-    """The result of a pass as the shot of the next: its picture is the color, and an estimate already."""
-    from hybrid.estimates import EstimateSource
-
-    denoised = shot.layers(shot.numbers[0]).target.name or "RGBA"
-    again = _open(folder, None, [*(layer or ()), f"color={denoised}"], aovs)
-    return again, EstimateSource("denoised", lambda frame: frame.color, "the pass before has made them")
 
 
 def _split(names: Sequence[str] | None) -> list[str]:
@@ -543,11 +539,33 @@ class _Job:
     preset: str
     settings: Mapping[str, object]  # all options that the pixels depend on
     effects: tuple[Sequence[str] | None, Sequence[str] | None]  # forced on, forced off
-    preview: Path | None
     resume: bool
     max_memory: str | None
     radius: int = 2
     neural: bool = False
+
+
+@contextmanager
+def _last_pass(job: _Job, passes: int) -> Iterator[_Job]:
+    """Make all passes but the last, in folders that go when the block ends; it is given what is left to run."""
+    from hybrid.estimates import EstimateSource
+    from hybrid.files import temporary_folder
+    from hybrid.frames import output_path
+
+    command = job.command
+    home = output_path(job.output, job.shot, job.shot.numbers[0]).parent
+    with ExitStack() as stack:
+        for number in range(1, passes):
+            folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
+            made = job.shot.around(job.radius * (passes - number))  # what the windows of later passes reach
+            _run(replace(job, shot=made, output=str(folder), command=f"{command}, pass {number} of {passes}"))
+            job = replace(
+                job,
+                shot=job.shot.remade({n: output_path(folder, made, n) for n in made.numbers}),
+                source=EstimateSource("denoised", lambda frame: frame.color, "the pass before has made them"),
+                command=f"{command}, pass {passes} of {passes}",
+            )
+        yield job
 
 
 def _run(job: _Job) -> None:
@@ -576,12 +594,10 @@ def _denoise(job: _Job, done: list[int]) -> None:
     from rich.table import Table
 
     from hybrid.memory import parse_size, plan_rows
-    from hybrid.pipeline import denoise_shot, write_preview
+    from hybrid.pipeline import denoise_shot
     from hybrid.plan import Plan
 
-    shot, source, timings, preview = job.shot, job.source, job.timings, job.preview
-    if preview is not None and shot.reads(preview):
-        raise ValueError(f"preview {str(preview)!r} would overwrite an input frame")
+    shot, source, timings = job.shot, job.source, job.timings
     limit = None if job.max_memory is None else parse_size(job.max_memory)
     fit = (
         partial(plan_rows, limit, shot, estimate=source.estimate, radius=job.radius, neural=job.neural)
@@ -641,9 +657,6 @@ def _denoise(job: _Job, done: list[int]) -> None:
     for row in timings.rows(pixels):
         table.add_row(*row)
     console.print(table)
-    if preview is not None:
-        write_preview(shot, job.output, preview)
-        console.print(escape(f"wrote {preview}"), highlight=False)
     folder = finished.path.parent
     timings.write(
         folder / "ravg.json",
@@ -660,6 +673,15 @@ def _denoise(job: _Job, done: list[int]) -> None:
         escape(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}"),
         highlight=False,
     )
+
+
+def _preview(shot: Shot, output: str, path: Path | None) -> None:
+    """Write the preview if one is asked for, and say so."""
+    from hybrid.pipeline import write_preview
+
+    if path is not None:
+        write_preview(shot, output, path)
+        typer.echo(f"wrote {path}", err=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

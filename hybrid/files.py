@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -33,9 +34,7 @@ def replace_file(path: Path) -> Iterator[Path]:
     OSError
         If the folder cannot be written to; it names `path`, not the temporary file.
     """
-    # Host, process and thread: whoever else writes the same frame at the same time has a file of its own.
-    writer = f"{_host()}-{os.getpid()}-{threading.get_ident()}"
-    temporary = path.with_name(f".{path.name}.{writer}.tmp")
+    temporary = _temporary(path)
     _unfinished.add(temporary)
     try:
         with temporary.open("wb"):
@@ -54,20 +53,57 @@ def replace_file(path: Path) -> Iterator[Path]:
         _unfinished.discard(temporary)
 
 
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Make a folder beside `path` to work in; it goes, with all that is in it, when the block ends.
+
+    Parameters
+    ----------
+    path : Path
+        What the folder is named after. The folder it is in is made, and cleared of what killed processes have left.
+
+    Yields
+    ------
+    Path
+        The folder.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path.parent)
+    folder = _temporary(path)
+    _unfinished.add(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+        yield folder
+    finally:
+        _remove(folder)
+        _unfinished.discard(folder)
+
+
 def remove_unfinished() -> None:
     """Remove what this process is writing to, because it is about to end in the midst of it."""
     for temporary in tuple(_unfinished):
-        with suppress(OSError):
-            temporary.unlink()
+        _remove(temporary)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of processes that were killed: those of this host whose process is no more."""
+    """Remove temporary files and folders of processes that were killed: those of this host whose process is no more."""
     pattern = re.compile(rf"\..*\.{re.escape(_host())}-(\d+)-\d+\.tmp")
     for path in folder.iterdir():
         if (match := pattern.fullmatch(path.name)) and not _runs(int(match[1])):
-            with suppress(OSError):
-                path.unlink()
+            _remove(path)
+
+
+def _temporary(path: Path) -> Path:
+    # Host, process and thread: whoever else writes the same frame at the same time has a file of its own.
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{threading.get_ident()}.tmp")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def _host() -> str:

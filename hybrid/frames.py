@@ -6,6 +6,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -163,6 +164,27 @@ class Shot:
             return True
         # Another name for the same file: a hard link, or another case where the disk takes no notice of it.
         return _identity(path) in self._identities
+
+    def around(self, reach: int) -> Shot:
+        """The same shot, asked also for the frames up to `reach` steps before and after, where they are there."""
+        near = {n + k * self.step for n in self.numbers for k in range(-reach, reach + 1)}
+        wider = copy(self)
+        wider.numbers = tuple(sorted(near & self._files.keys()))
+        return wider
+
+    def remade(self, files: Mapping[int, Path]) -> Shot:
+        """The same frames from files that `write` has made of these: the denoised picture is now the color."""
+        # A name of its own has any layer but that of bare channels.
+        color = self.layers(self.numbers[0]).target.name or "RGBA"
+        made = Shot(
+            files,
+            layers={**self._overrides, "color": color},
+            aovs=self._aovs,
+            keep=self._keep,
+            max_pixels=self._max_pixels,
+        )
+        made.numbers, made.step = self.numbers, self.step
+        return made
 
     def path(self, number: int) -> Path:
         """The file of a frame.

@@ -118,6 +118,23 @@ def test_the_input_is_not_overwritten(shot_folder, capsys):
     assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
 
 
+@pytest.mark.neural
+@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("option", ["-o", "--preview", "--breakdown"])
+def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys, passes, option):
+    """The second pass reads what the first has made, and used to write over what that was made from."""
+    pytest.importorskip("torch")
+    before = {path: path.read_bytes() for path in shot_folder.iterdir()}
+    words = ["denoise", shot_folder, "--estimate", "nlm", "--passes", passes]
+    if option == "-o":
+        words += ["-o", shot_folder / "shot.####.exr"]
+    else:
+        words += ["-o", tmp_path / "out", option, shot_folder / "shot.1002.exr"]
+    assert "overwrite" in one_line_error(capsys, *words)
+    assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
+    assert not (tmp_path / "out").exists()  # it was refused before anything was made
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_read_only_folder_is_named(shot_folder, tmp_path, capsys):
     out = tmp_path / "o"

@@ -111,6 +111,18 @@ def test_range_without_any_frame_is_not_found(tmp_path):
         open_shot(save(tmp_path, [1, 2]), frames="5-6")
 
 
+def test_frames_around_those_asked_for_are_those_there_are(tmp_path):
+    shot = open_shot(save(tmp_path, (1, 2, 3, 5, 6, 9)), frames="3-5")
+    assert shot.around(0).numbers == (3, 5)
+    assert shot.around(2).numbers == (1, 2, 3, 5, 6)
+    assert shot.numbers == (3, 5)
+    # Of these files alone the step would be 2.
+    made = shot.remade({number: shot.path(number) for number in (1, 3, 5)})
+    assert (made.numbers, made.step, shot.step) == ((3, 5), 1, 1)
+    assert made.has(1)
+    assert not made.has(2)
+
+
 def test_hole_is_a_warning_and_a_narrower_window(tmp_path):
     shot = open_shot(save(tmp_path, [1, 2, 4, 5, 8]))
     assert shot.numbers == (1, 2, 4, 5, 8)

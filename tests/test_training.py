@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from conftest import Scene
@@ -16,6 +17,7 @@ from hybrid.frames import open_shot  # noqa: E402
 from hybrid.training import open_levels, parse_samples  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
+from network.models import unet  # noqa: E402
 from network.stabilizer import Stabilizer, StabilizerConfig  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -176,3 +178,70 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
         seen.append(not np.array_equal(*first))
     assert seen == [False, True]
     assert run("denoise", folders[0], "-o", tmp_path, "--weights", weights, "--passes", "0") == 2
+
+
+# All stages said, so that no plan is measured on other frames, or on a denoised picture.
+STAGES = ["--effects", "demodulate,warp", "--no-effects", "outliers,refine,gate,fixed-noise,prefilter,alpha,skip"]
+
+
+def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, monkeypatch):
+    """The first pass has to make the neighbours as well; it used to make only the frames asked for."""
+    folder = Scene(height=40, width=48, frames=5).write(tmp_path / "in")
+    monkeypatch.setattr("hybrid.exr.MAX_PIXELS", 100)  # so that all passes have to know of --max-pixels
+    options = ["--weights", weights, "--precision", "float32", "--passes", 2, "--max-pixels", 4000, *STAGES]
+    code = run("denoise", folder, "-o", tmp_path / "all", "--estimate", "nlm", *options)
+    assert code == 0, capsys.readouterr().err
+    assert run("denoise", folder, "-o", tmp_path / "one", "--estimate", "nlm", "--frames", "1003", *options) == 0
+    name = "shot.1003.exr"
+    assert {path.name for path in (tmp_path / "one").iterdir()} == {"ravg.json", name}
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+
+
+def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
+    """On their left was what the first pass had made."""
+    folder = SCENE.write(tmp_path / "in")
+    noisy = []
+    for passes in (1, 2):
+        pictures = tmp_path / f"preview{passes}.png", tmp_path / f"parts{passes}.png"
+        options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", *STAGES]
+        options += ["--passes", passes, "--preview", pictures[0], "--breakdown", pictures[1]]
+        assert run("denoise", folder, "-o", tmp_path / f"out{passes}", *options) == 0
+        noisy.append([cv2.imread(str(path))[: SCENE.height, : SCENE.width] for path in pictures])
+    np.testing.assert_array_equal(*noisy)
+    np.testing.assert_array_equal(*noisy[0])  # both are exposed alike
+
+
+def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):
+    """Frames made without one used to pass for finished, and have no such layers; and if all were, there was a bug."""
+    folder = SCENE.write(tmp_path / "in")
+    words = ["denoise", folder, "-o", tmp_path / "out", "--weights", weights, "--estimate", "nlm", "--resume"]
+    picture = tmp_path / "parts.png"
+    assert run(*words) == 0
+    assert run(*words, "--breakdown", picture) == 0
+    printed = capsys.readouterr()
+    assert "finished already" not in printed.err
+    assert "before1" in printed.out
+    whole = picture.read_bytes()
+    picture.unlink()
+    assert run(*words, "--breakdown", picture) == 0
+    printed = capsys.readouterr()
+    assert "3 of 3 frames were finished already" in printed.err
+    assert "no weights to print: all frames were finished already" in printed.out
+    assert "average weight" not in printed.out
+    assert picture.read_bytes() == whole
+
+
+def test_a_network_without_estimates_says_so(tmp_path, capsys):
+    path = tmp_path / "small.safetensors"
+    save_model(path, unet(frames=3))
+    folder = SCENE.write(tmp_path / "in")
+    words = ["denoise", folder, "--weights", path, "-o", tmp_path / "out", "--estimate"]
+    assert run(*words, "oidn") == 1
+    assert "estimate is 'oidn', expected auto or none: the network of small.safetensors takes none" in (
+        capsys.readouterr().err
+    )
+    assert not (tmp_path / "out").exists()
+    assert run(*words, "auto") == 0
+    assert "estimates: none (this network takes none)" in capsys.readouterr().err
+    assert run(*words, "none", "--passes", 2) == 0
+    assert "estimates: none (this network takes none)" in capsys.readouterr().err

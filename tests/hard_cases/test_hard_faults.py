@@ -18,7 +18,7 @@ from test_hard_files import ROOT, run_alone
 
 from hybrid.cli import main
 from hybrid.exr import read_exr
-from hybrid.files import remove_leftovers, replace_file
+from hybrid.files import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.frames import open_shot
 from hybrid.memory import parse_size, plan_rows
 from hybrid.plan import plan_shot
@@ -133,6 +133,36 @@ def test_what_a_killed_process_has_left_is_removed_and_nothing_else(tmp_path):
         path.touch()
     remove_leftovers(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(others)
+
+
+LONG = """
+import pathlib, sys, time
+from hybrid.files import temporary_folder
+with temporary_folder(pathlib.Path(sys.argv[1])) as folder:
+    (folder / "shot.0001.exr").touch()
+    print("begun", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_the_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
+    """Folders between passes used to bear names that no later run knew."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    words = [sys.executable, "-c", LONG, str(tmp_path / "pass1")]
+    child = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "begun\n"
+    with temporary_folder(tmp_path / "pass1") as ours:
+        assert len(list(tmp_path.iterdir())) == 2
+        child.kill()
+        child.communicate()
+        remove_leftovers(tmp_path)
+        assert list(tmp_path.iterdir()) == [ours]
+        (ours / "shot.0001.exr").touch()
+        remove_unfinished()  # as Ctrl-C does where Python does not hear it
+        assert list(tmp_path.iterdir()) == []
+    with temporary_folder(tmp_path / "pass1") as ours:
+        (ours / "shot.0001.exr").touch()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_two_threads_may_write_one_file(tmp_path):
