@@ -9,6 +9,9 @@ import numpy as np
 
 from flow.motion import forward_backward_error
 
+# Difference of albedo (norm over channels) at which the confidence falls to 1/e.
+_ALBEDO_SIGMA = 0.1
+
 
 def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray, first_row: int) -> np.ndarray:
     """Sundaram's test: 1 where going there and back ends near the start."""
@@ -18,7 +21,7 @@ def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray, first_row: in
     return error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5
 
 
-def _agree_albedo(albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: np.ndarray | float) -> np.ndarray:
+def _agree_albedo(albedo: np.ndarray, warped: np.ndarray) -> np.ndarray:
     """exp(-d² / σ²) of the difference, relative where the albedo is above 1 (emitters, sky)."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.atleast_3d(albedo - warped)
@@ -26,12 +29,10 @@ def _agree_albedo(albedo: np.ndarray, warped: np.ndarray, sigma: float, noise: n
         planes = (image[..., c] for image in map(np.atleast_3d, (albedo, warped)) for c in range(image.shape[-1]))
         greatest = reduce(np.maximum, planes)
         scale = np.square(np.maximum(greatest, 1))
-        # Two noisy values differ by √2 times their noise; twice that costs no more than 1/e.
-        tolerated = np.square(sigma) + 8 * np.square(noise) / scale
-        return np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * tolerated))
+        return np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * _ALBEDO_SIGMA**2))
 
 
-def _agree_normal(normal: np.ndarray, warped: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
+def _agree_normal(normal: np.ndarray, warped: np.ndarray) -> np.ndarray:
     """clamp((n·n' - 0.8) / 0.2) of the directions; 1 where neither has a surface, 0 where only one has."""
     square, warped_square, product = (
         np.einsum("yxc,yxc->yx", a, b) for a, b in ((normal, normal), (warped, warped), (normal, warped))
@@ -39,8 +40,7 @@ def _agree_normal(normal: np.ndarray, warped: np.ndarray, noise: np.ndarray | fl
     # Below a tenth of the samples on a surface, the direction is that of a stray sample.
     surface, warped_surface = square > 0.01, warped_square > 0.01
     cosine = product / np.sqrt(np.maximum(square * warped_square, 1e-4))
-    # Noise of deviation σ per component turns each of the two by about √2 σ, and lowers the cosine by 2 σ².
-    agreement = np.clip((cosine + 2 * np.square(noise) - 0.8) / 0.2, 0, 1)
+    agreement = np.clip((cosine - 0.8) / 0.2, 0, 1)
     return np.where(surface & warped_surface, agreement, surface == warped_surface)
 
 
@@ -53,11 +53,6 @@ def estimate_confidence(
     warped_albedo: np.ndarray | None = None,
     normal: np.ndarray | None = None,
     warped_normal: np.ndarray | None = None,
-    depth: np.ndarray | None = None,
-    warped_depth: np.ndarray | None = None,
-    albedo_noise: np.ndarray | float = 0.0,
-    normal_noise: np.ndarray | float = 0.0,
-    albedo_sigma: float = 0.1,
     first_row: int = 0,
 ) -> np.ndarray:
     """Estimate how far each pixel of a warped neighbour shows what the centre shows.
@@ -72,16 +67,9 @@ def estimate_confidence(
         (H, W, 2) float, neighbour to centre, or None. Of the whole frame, also where all else is of some of its rows.
     albedo, warped_albedo
         (H, W) or (H, W, C) float, of the centre and of the warped neighbour. One may come with the other only; so
-        for the next two pairs.
+        for the normals.
     normal, warped_normal
         (H, W, 3) float, any one space; any length, 0 where there is no surface.
-    depth, warped_depth
-        (H, W) float > 0, any unit. Only for motion that hardly changes the distance.
-    albedo_noise, normal_noise
-        Standard deviation of a component, scalar or (H, W): under depth of field guides are noisy, and differ
-        without being wrong. `flow.guide.estimate_noise` gives it.
-    albedo_sigma
-        Difference (norm over channels) at which the confidence falls to 1/e.
     first_row
         The frame's row that the first row of `flow` belongs to.
 
@@ -97,10 +85,9 @@ def estimate_confidence(
 
     Notes
     -----
-    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / σ_a²) · clamp((n·n′ − 0.8) / 0.2)
-    · clamp((0.2 − |Δd| / max(d, d′)) / 0.1), then the minimum of 3 x 3 pixels, because what surrounds an
-    occlusion is mixed into its border. Δa is divided by the albedo where that is above 1. What moves without the
-    geometry (shadows, reflections) is invisible here.
+    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2),
+    then the minimum of 3 x 3 pixels, because what surrounds an occlusion is mixed into its border. Δa is divided by
+    the albedo where that is above 1. What moves without the geometry (shadows, reflections) is invisible here.
 
     References
     ----------
@@ -110,7 +97,7 @@ def estimate_confidence(
     shape = flow.shape[:2]
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
-    pairs = {"albedo": (albedo, warped_albedo), "normal": (normal, warped_normal), "depth": (depth, warped_depth)}
+    pairs = {"albedo": (albedo, warped_albedo), "normal": (normal, warped_normal)}
     for name, (centre, warped) in pairs.items():
         if (centre is None) != (warped is None):
             raise ValueError(f"{name} and warped_{name} come together, got only one of them")
@@ -124,13 +111,9 @@ def estimate_confidence(
         confidence *= _agree_forward_backward(flow, reverse, first_row)
     with np.errstate(invalid="ignore"):
         if albedo is not None and warped_albedo is not None:
-            confidence *= _agree_albedo(albedo, warped_albedo, albedo_sigma, albedo_noise)
+            confidence *= _agree_albedo(albedo, warped_albedo)
         if normal is not None and warped_normal is not None:
-            confidence *= _agree_normal(normal, warped_normal, normal_noise)
-        if depth is not None and warped_depth is not None:
-            farther = np.maximum(np.abs(depth), np.abs(warped_depth))
-            relative = np.abs(depth - warped_depth) / np.maximum(farther, np.finfo(np.float32).tiny)
-            confidence *= np.clip((0.2 - relative) / 0.1, 0, 1)
+            confidence *= _agree_normal(normal, warped_normal)
     confidence = np.nan_to_num(confidence, nan=0.0).astype(np.float32)
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
 

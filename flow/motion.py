@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import check_rows, warp
+from flow.warp import warp
 
 # Longer than any frame is wide: renderers write 1e9, 1e10 or similar where they know no motion.
 ABSURD_LENGTH = 1e4
@@ -73,19 +73,15 @@ def compose_flow(
     *,
     first_valid: np.ndarray | None = None,
     second_valid: np.ndarray | None = None,
-    first_row: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chain the flow from t to t' with that from t' to t'', giving the flow from t to t''.
 
     Parameters
     ----------
     first, second
-        (H, W, 2) float, finite, pixels; `second` belongs to the frame that `first` points to. `first` may be of some
-        of the rows only.
+        (H, W, 2) float, finite, pixels; `second` belongs to the frame that `first` points to.
     first_valid, second_valid
         (H, W) bool; missing: all True.
-    first_row
-        The frame's row that the first row of `first` belongs to.
 
     Returns
     -------
@@ -94,13 +90,19 @@ def compose_flow(
     valid
         (H, W) bool: `first` is valid, lands in the frame, and every vector of `second` it mixes is valid.
 
+    Raises
+    ------
+    ValueError
+        The shapes do not agree.
+
     Notes
     -----
     f₂(x) = f₁(x) + f₁'(x + f₁(x)), f₁' sampled bilinearly, with its edge value outside the frame.
     """
-    check_rows(first, second.shape, first_row)
+    if first.shape != second.shape:
+        raise ValueError(f"first has shape {first.shape}, expected that of second, {second.shape}")
     known = np.ones(first.shape[:2], bool) if second_valid is None else second_valid
-    sampled, inside = warp(np.dstack([second, ~known]), first, first_row=first_row)
+    sampled, inside = warp(np.dstack([second, ~known]), first)
     # The last channel is the share of invalid vectors in the bilinear mix: any at all is too much.
     valid = inside & (sampled[..., 2] == 0)
     if first_valid is not None:

@@ -138,7 +138,7 @@ def warp(
         raise ValueError(f"interpolation is {interpolation!r}, expected one of {', '.join(_KERNELS)}")
     if image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"image has shape {image.shape}, expected a non-empty (H, W) or (H, W, C)")
-    check_rows(flow, image.shape[:2], first_row)
+    _check_rows(flow, image.shape[:2], first_row)
     source = np.ascontiguousarray(image, np.float32).reshape(*image.shape[:2], -1)
     shape = flow.shape[:2]
     warped = np.empty((*shape, source.shape[2]), np.float32)
@@ -147,7 +147,7 @@ def warp(
     return warped.reshape(*shape, *image.shape[2:]), inside
 
 
-def check_rows(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> None:
+def _check_rows(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> None:
     """Raise ValueError unless `flow` has the width of a frame of this shape, and rows that the frame has too."""
     rows = shape[0] - first_row
     if flow.ndim != 3 or flow.shape[1:] != (shape[1], 2) or not 0 < flow.shape[0] <= rows <= shape[0]:

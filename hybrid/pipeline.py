@@ -65,7 +65,6 @@ def denoise_shot(
     *,
     radius: int = 2,
     estimate: Estimate = None,
-    interpolation: str = "bilinear",
     attributes: Mapping[str, str] | None = None,
     rows: int | None = None,
     resume: bool = False,
@@ -87,8 +86,6 @@ def denoise_shot(
         Frames on each side of the centre.
     estimate : function, CleanGuides or Preset, optional
         Where the estimates of single frames come from (`hybrid.estimates`).
-    interpolation : str
-        Of the warp.
     attributes : mapping of str to str, optional
         Written to the header of each file.
     rows : int, optional
@@ -114,9 +111,7 @@ def denoise_shot(
     processes have left half written is removed.
     """
     timings = timings or Timings()
-    aligner = Aligner(
-        shot, plan.effects, radius=radius, interpolation=interpolation, estimate=estimate, timings=timings
-    )
+    aligner = Aligner(shot, plan.effects, radius=radius, estimate=estimate, timings=timings)
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)

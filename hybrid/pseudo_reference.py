@@ -314,8 +314,6 @@ class Aligner:
         Which stages to run; see `hybrid.plan`.
     radius : int
         Frames on each side of the centre; the window has 2 · radius + 1.
-    interpolation : str
-        Of the warp, "bilinear" or "bicubic".
     estimate : function, CleanGuides or Preset, optional
         Where the estimates of single frames come from (`hybrid.estimates`). A function is called once per frame. A
         preset's estimate is made from each frame's own window, so a window of them draws on twice its radius
@@ -332,7 +330,6 @@ class Aligner:
         effects: Collection[str],
         *,
         radius: int = 2,
-        interpolation: str = "bilinear",
         estimate: Estimate = None,
         refine: Callable[..., Array] = refine_flow,
         timings: Timings | None = None,
@@ -341,7 +338,6 @@ class Aligner:
         self.effects = frozenset(effects)
         self.estimate = estimate
         self.radius = radius
-        self.interpolation = interpolation
         self.refine = refine
         self.timings = timings or Timings()
         self._frames: dict[int, PreparedFrame] = {}
@@ -564,7 +560,7 @@ class Aligner:
             return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
         warped = {}
         for name, layer in ((name, layers[name]) for name in wanted):
-            warped[name], inside = warp(layer, flow, interpolation=self.interpolation, first_row=rows.start)
+            warped[name], inside = warp(layer, flow, first_row=rows.start)
         return warped, inside
 
     def _novelty(self, flow: Array) -> Array | float:

@@ -106,6 +106,11 @@ def test_composition_needs_every_vector_it_mixes() -> None:
     np.testing.assert_array_equal(np.argwhere(~valid), [[3, 3]])
 
 
+def test_flows_of_different_sizes_are_not_chained() -> None:
+    with pytest.raises(ValueError, match=r"first has shape \(3, 6, 2\), expected that of second, \(6, 6, 2\)"):
+        compose_flow(translation(3, 6, 0, 0), translation(6, 6, 0, 0))
+
+
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (0.4, 0.25)])
 def test_inverse_of_a_translation(shift: tuple[float, float]) -> None:
     inverse, arrived = invert_flow(translation(12, 15, *shift))

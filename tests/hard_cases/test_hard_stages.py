@@ -134,7 +134,7 @@ def test_confidence_is_between_nought_and_one(drawn):
     other = np.roll(guide, 1, axis=1)
     confidence = estimate_confidence(
         flows(rng, shape), inside=rng.random(shape) < 0.9, reverse=flows(rng, shape), albedo=guide, warped_albedo=other,
-        normal=other, warped_normal=guide, depth=guide[..., 0], warped_depth=other[..., 0],
+        normal=other, warped_normal=guide,
     )  # fmt: skip
     assert ((confidence >= 0) & (confidence <= 1)).all()
     # Whatever is not finite is not trusted, nor are its neighbours; nor does it spread further.
