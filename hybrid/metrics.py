@@ -125,11 +125,6 @@ def mean_bias(image: Array, reference: Array) -> float:
     return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
 
 
-def flip(image: Array, reference: Array) -> float:
-    """Mean HDR-FLIP error, 0 at best and 1 at worst: the mean of `flip_map`."""
-    return float(flip_map(image, reference).mean(dtype=np.float64))
-
-
 def flip_map(image: Array, reference: Array) -> NDArray[np.float32]:
     """HDR-FLIP error of each pixel, 0 at best and 1 at worst, by the authors' own code.
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-
+# How many robust scales above the median an outlier lies.
+_FAR_ABOVE = np.float32(16)
 # How far beyond the limit two or four pixels together are no highlight either. The non-local means would smear them:
 # a 2×2 cluster of 1e6 left 1000 times the light three pixels away.
 _SPARK = np.float32(100)
@@ -80,7 +81,7 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
     return _robust_average(*check_window(window, weight))
 
 
-def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) -> tuple[Floats, Mask]:
+def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     """Replace fireflies: values far above everything around them in space and time.
 
     Parameters
@@ -89,8 +90,6 @@ def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) 
         Aligned frames, in any unit; the centre is ``T // 2``.
     weight : (T, H, W) float32
         Trust in each pixel of each frame; where it is 0 the pixel is neither evidence nor replaced.
-    threshold : float
-        How many robust scales above the median an outlier lies.
 
     Returns
     -------
@@ -102,13 +101,13 @@ def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) 
     Raises
     ------
     ValueError
-        If the shapes do not fit each other, T is even, or `threshold` is not positive.
+        If the shapes do not fit each other, or T is even.
 
     Notes
     -----
     In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
     largest value, n the number of frames trusted at that pixel (at least 2, and beyond the firefly itself).
-    A value is an outlier where it exceeds m + `threshold` · (u − m) and eight times the mean of the others.
+    A value is an outlier where it exceeds m + 16 (u − m) and eight times the mean of the others.
     A light that is there in every frame, even one pixel wide, is among the n largest and stays; a firefly is
     in one frame, and warping spreads it over no more than four pixels. In the centre, which is not warped, it is
     a single pixel: one with two such neighbours is an object, a moving highlight say, and stays too, unless it is no
@@ -122,10 +121,7 @@ def reject_outliers(window: Floats, weight: Floats, *, threshold: float = 16.0) 
     by less than 0.1 %; with them by 0.3 to 1.2 %; and by 2 % (the centre by 6 %) where two samples in three
     are 0: there much of what is lost is ordinary noise.
     """
-    if not threshold > 0:
-        raise ValueError(f"threshold: expected a positive number, got {threshold!r}")
-    window, weight = check_window(window, weight)
-    return _reject_outliers(window, weight, np.float32(threshold))
+    return _reject_outliers(*check_window(window, weight))
 
 
 def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
@@ -241,7 +237,7 @@ def _robust_average(window, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
+def _reject_outliers(window, weight):  # type: ignore[no-untyped-def]
     T, H, W, C = window.shape
     cleaned, mask = window.copy(), np.zeros((T, H, W), np.bool_)
     level = np.empty((T, H, W), np.float32)
@@ -293,7 +289,7 @@ def _reject_outliers(window, weight, threshold):  # type: ignore[no-untyped-def]
             for i in range(n):
                 lit += ordered[i] > 0
             # where few pixels have found the light, each of them is far above the others
-            limit = median + threshold * max(upper - median, np.float32(0)) * np.float32(n) / np.float32(max(lit, 1))
+            limit = median + _FAR_ABOVE * max(upper - median, np.float32(0)) * np.float32(n) / np.float32(max(lit, 1))
             if not (highest > limit and upper > 0):
                 continue
             mean[:] = 0

@@ -22,7 +22,6 @@ def guided_filter(
     radius: int,
     eps: float = 1e-2,
     subsample: int = 1,
-    weight: Floats | None = None,
     moments: NDArray[np.float64] | None = None,
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
@@ -40,8 +39,6 @@ def guided_filter(
         Regularisation ε as a share of each guide's variance: structure fainter than its root is smoothed.
     subsample : int
         1, 2 or 4: the coefficients are found on an image so many times smaller.
-    weight : (H, W) float32, optional
-        Trust in each pixel of the image, at least 0.
     moments : (2, G) float64, optional
         Means and standard deviations to take for the guide's own, from `measure_guide`: those of the whole frame,
         where image and guide are a part of it.
@@ -74,8 +71,6 @@ def guided_filter(
         raise ValueError(
             f"guide: expected (height, width, channels) as large as the image's {image.shape}, got {guide.shape}"
         )
-    if weight is not None and weight.shape != image.shape[:2]:
-        raise ValueError(f"weight: expected shape {image.shape[:2]}, got {weight.shape}")
     if radius < 1:
         raise ValueError(f"radius: expected at least 1, got {radius}")
     if not eps > 0:
@@ -85,11 +80,10 @@ def guided_filter(
     if moments is not None and moments.shape != (2, guide.shape[2]):
         raise ValueError(f"moments: expected shape {(2, guide.shape[2])}, got {moments.shape}")
     image, missing = replace_nonfinite(image)
-    trust = (~missing).astype(np.float32) if weight is None else np.where(missing, np.float32(0), weight)
     guide = np.ascontiguousarray(replace_nonfinite(guide)[0])
     guide = _standardise(guide, measure_guide(guide) if moments is None else moments)
 
-    image, trust = np.ascontiguousarray(image), np.asarray(trust[..., None], np.float32)
+    image, trust = np.ascontiguousarray(image), (~missing[..., None]).astype(np.float32)
     small_image, small_guide, small_trust = image, guide, trust
     if subsample > 1:
         small_image, small_guide, small_trust = (_shrink(full, subsample) for full in (image * trust, guide, trust))

@@ -41,8 +41,6 @@ def joint_nlm(
     radius: int = 3,
     patch_radius: int = 3,
     k: float = 0.5,
-    k_features: float = 1.0,
-    time_radius: int | None = None,
 ) -> Floats:
     """Average the pixels of an aligned window whose patches differ by no more than noise.
 
@@ -64,10 +62,6 @@ def joint_nlm(
         Of the search, and of the patches that are compared, in pixels.
     k : float
         Strength of the colour distance: more smooths more.
-    k_features : float
-        The same of the feature distance.
-    time_radius : int, optional
-        Frames to either side that are searched; all if not given.
 
     Returns
     -------
@@ -85,7 +79,7 @@ def joint_nlm(
     For pixels p of the centre and q of the window, u the values and V their variance::
 
         d(p, q) = ((u_p − u_q)² − (V_p + min(V_p, V_q))) / (k² (V_p + V_q))    averaged over patch and channels
-        f(p, q) = max over features ((f_p − f_q)² − 2 V_p) / (k_f² max(V_p, |∇f_p|², 1e-3))
+        f(p, q) = max over features ((f_p − f_q)² − 2 V_p) / max(V_p, |∇f_p|², 1e-3)
         w(p, q) = confidence_q · exp(−max(d, f, 0))
 
     A share of u² (1e-6 / k²) is added to V: no division by 0, and the filter stays scale equivariant. In a
@@ -101,7 +95,7 @@ def joint_nlm(
     window = np.ascontiguousarray(window, np.float32)
     if window.ndim != 4 or window.shape[0] % 2 == 0:
         raise ValueError(f"window: expected (odd frames, height, width, channels), got {window.shape}")
-    frames, height, width, _ = window.shape
+    _, height, width, _ = window.shape
     if features is None:
         features = np.empty((height, width, 0), np.float32)
     if feature_variance is None:
@@ -117,33 +111,15 @@ def joint_nlm(
     ):
         if array.shape != shape:
             raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
-    if time_radius is None:
-        time_radius = frames // 2
-    for name, number, low, high in (
-        ("radius", radius, 0, max(height, width)),
-        ("patch_radius", patch_radius, 0, max(height, width)),
-        ("time_radius", time_radius, 0, frames // 2),
-    ):
-        if not low <= number <= high:
-            raise ValueError(f"{name}: expected {low} to {high}, got {number}")
-    for name, strength in (("k", k), ("k_features", k_features)):
-        if not strength > 0:
-            raise ValueError(f"{name}: expected a positive number, got {strength}")
+    for name, number in (("radius", radius), ("patch_radius", patch_radius)):
+        if not 0 <= number <= max(height, width):
+            raise ValueError(f"{name}: expected 0 to {max(height, width)}, got {number}")
+    if not k > 0:
+        raise ValueError(f"k: expected a positive number, got {k}")
     variance, features, feature_variance, confidence = (
         np.ascontiguousarray(array, np.float32) for array in (variance, features, feature_variance, confidence)
     )
-    return _filter(
-        window,
-        variance,
-        features,
-        feature_variance,
-        confidence,
-        time_radius,
-        radius,
-        patch_radius,
-        np.float32(k),
-        np.float32(k_features),
-    )
+    return _filter(window, variance, features, feature_variance, confidence, radius, patch_radius, np.float32(k))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
@@ -219,7 +195,7 @@ def _load_frame(u, a, trust, window, variance, confidence, k, top, left):  # typ
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_features(f, noise, scale, features, variance, k, top, left):  # type: ignore[no-untyped-def]
+def _load_features(f, noise, scale, features, variance, top, left):  # type: ignore[no-untyped-def]
     """Load the centre's features `f`, and what turns a squared difference into a distance."""
     planes, h, w = f.shape
     height, width = features.shape[:2]
@@ -235,11 +211,11 @@ def _load_features(f, noise, scale, features, variance, k, top, left):  # type: 
                 v = variance[top + y, sx, c]
                 noise[c, y, x] = 2 * v
                 tolerance = max(v, np.float32(0.25) * (gx * gx + gy * gy), np.float32(_FEATURE_FLOOR))
-                scale[c, y, x] = 1 / (k * k * tolerance)
+                scale[c, y, x] = 1 / tolerance
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
-def _filter(window, variance, features, feature_variance, confidence, frames, radius, patch, k, k_features):  # type: ignore[no-untyped-def]
+def _filter(window, variance, features, feature_variance, confidence, radius, patch, k):  # type: ignore[no-untyped-def]
     T, H, W, C = window.shape
     F = features.shape[2]
     centre = T // 2
@@ -263,9 +239,9 @@ def _filter(window, variance, features, feature_variance, confidence, frames, ra
         ring = np.empty((2 * patch + 1, pw), np.float32)
         column, wrow, frow = np.empty(pw, np.float32), np.empty(tw, np.float32), np.empty(tw, np.float32)
         _load_frame(pu, pa, trust, window[centre], variance, confidence[centre], k, top, left)
-        _load_features(pf, fn, fs, features, feature_variance, k_features, y0, x0)
+        _load_features(pf, fn, fs, features, feature_variance, y0, x0)
         _load(qf, features, top, left)
-        for t in range(centre - frames, centre + frames + 1):
+        for t in range(T):
             _load_frame(qu, qa, trust, window[t], variance, confidence[t], k, top, left)
             for dy in range(-radius, radius + 1):
                 for dx in range(-radius, radius + 1):

@@ -254,14 +254,12 @@ def test_prefiltered_guides_are_in_range(drawn):
 @anything
 @given(images(3, wrong=True), images(4, wrong=True, negative=True), st.sampled_from([1, 2, 4]), st.sampled_from([1, 3]))
 def test_the_guided_filter_stays_in_range(drawn, guides, subsample, radius):
-    image, rng = drawn
+    image, _ = drawn
     guide = np.resize(guides[0], (*image.shape[:2], 4))
     good = np.isfinite(image).all(axis=-1)
-    weight = rng.choice([np.zeros(image.shape[:2]), rng.random(image.shape[:2])]).astype(np.float32)
-    for trust in (None, weight):
-        out = guided_filter(image, guide, radius=radius, subsample=subsample, weight=trust)
-        low, high = (image[good].min(), image[good].max()) if good.any() else (0, 0)
-        assert between(out, low, high)
+    out = guided_filter(image, guide, radius=radius, subsample=subsample)
+    low, high = (image[good].min(), image[good].max()) if good.any() else (0, 0)
+    assert between(out, low, high)
 
 
 @anything
