@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.files import replace_file
 from hybrid.frames import Shot, open_shot, output_path
+from hybrid.pictures import encode_srgb, write_png
 from hybrid.transfer import measure_exposure
 from nlm.average import replace_nonfinite
 
@@ -102,8 +101,8 @@ def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> 
     noisy, _ = replace_nonfinite(shot.read(number).color)
     exposure = np.float32(measure_exposure(noisy) / 0.18)
     rows = [
-        [_encode(image / exposure) for image in (noisy, denoised.color)],
-        [_encode(denoised.aovs[name] / exposure) for name in layers[:frames]],
+        [encode_srgb(image / exposure) for image in (noisy, denoised.color)],
+        [encode_srgb(denoised.aovs[name] / exposure) for name in layers[:frames]],
         [np.repeat(np.clip(denoised.aovs[name], 0, 1), 3, axis=-1) for name in layers[frames:]],
     ]
     height, width = noisy.shape[:2]
@@ -113,13 +112,4 @@ def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> 
     white = np.ones((size[1], size[0], 3), np.float32)
     small = [[cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in row] for row in rows]
     sheet = np.vstack([np.hstack(row + [white] * (columns - len(row))) for row in small])
-    _, data = cv2.imencode(".png", np.round(sheet[..., ::-1] * 255).astype(np.uint8))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data.tobytes())
-
-
-def _encode(linear: NDArray[Any]) -> Array:
-    """Clip to [0, 1] and encode as sRGB."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
+    write_png(path, sheet)

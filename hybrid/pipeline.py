@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.exr import ExrError, read_exr
-from hybrid.files import remove_leftovers, replace_file
+from hybrid.files import remove_leftovers
 from hybrid.frames import Shot, open_shot, output_path
+from hybrid.pictures import encode_srgb, write_png
 from hybrid.plan import Plan
 from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate, frames_needed
 from hybrid.timing import Timings
@@ -188,10 +188,4 @@ def write_preview(shot: Shot, output: str | Path, path: Path) -> None:
     finished = open_shot(output_path(output, shot, number))
     denoised = finished.read(finished.numbers[0]).color
     exposure = measure_exposure(noisy) / 0.18
-    pair = np.concatenate([noisy, denoised], axis=1) / np.float32(exposure)
-    pair = np.clip(pair, 0, 1)
-    encoded = np.where(pair <= 0.0031308, 12.92 * pair, 1.055 * pair ** (1 / 2.4) - 0.055)
-    _, data = cv2.imencode(".png", np.round(encoded[..., ::-1] * 255).astype(np.uint8))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    write_png(path, encode_srgb(np.concatenate([noisy, denoised], axis=1) / np.float32(exposure)))
