@@ -31,7 +31,7 @@ from rich.table import Table
 from flow.motion import forward_backward_error, normalize_motion
 from flow.warp import warp
 from hybrid.frames import Frame, Shot
-from hybrid.methods import METHODS, AbsentError, Method
+from hybrid.methods import METHODS, Method
 from hybrid.metrics import (
     Reference,
     flip_map,
@@ -201,7 +201,7 @@ def time_methods(
                 with _apart() as pool:
                     keep = folder if turn == 0 else None
                     run = pool.submit(run_method, methods[name], shot, name, keep).result()
-            except (ImportError, AbsentError) as error:
+            except ImportError as error:
                 absent[name] = str(error)
             except BrokenProcessPool:
                 absent[name] = "its process died, out of memory perhaps"

@@ -43,10 +43,6 @@ Maps = Callable[[Shot], Iterator[tuple[int, dict[str, Array]]]]
 Estimator = Callable[[AlignedWindow], Array]
 
 
-class AbsentError(Exception):
-    """A method cannot run here; the message is the reason that the report gives."""
-
-
 @dataclass(frozen=True)
 class Method:
     """What a comparison runs.
@@ -54,7 +50,7 @@ class Method:
     Attributes
     ----------
     run : from a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process: a module's
-        function, or a `functools.partial` of one. An `ImportError` or `AbsentError` lists it as absent.
+        function, or a `functools.partial` of one. An `ImportError` lists it as absent.
     family : what the chart draws alike.
     maps : from a shot to (number, (H, W) maps in [0, 1] by title), to be looked at.
     cost : seconds where they are not measured: 0 for what is there anyway, None where they are not known.
@@ -157,11 +153,7 @@ def _denoiser(preset: str, tile: int, precision: str, threshold: float | None) -
     """The network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
-    try:
-        weights = neural.shipped_weights(preset)
-    except ValueError as error:
-        raise AbsentError(f"no weights are shipped: {error}") from None
-    return neural.Denoiser(weights, tile=tile, precision=precision, threshold=threshold)
+    return neural.Denoiser(neural.shipped_weights(preset), tile=tile, precision=precision, threshold=threshold)
 
 
 def network(

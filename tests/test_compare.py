@@ -26,7 +26,7 @@ from hybrid.compare import (
     spread_seconds,
 )
 from hybrid.frames import Frame
-from hybrid.methods import METHODS, AbsentError, Frames, Method, external, noisy
+from hybrid.methods import METHODS, Frames, Method, external, noisy
 from hybrid.metrics import mean_bias, psnr, relmse
 from hybrid.oidn import denoise_oidn
 
@@ -96,11 +96,6 @@ def hungry(shot: MemoryShot, *, megabytes: int) -> Iterator[tuple[int, Array]]:
         yield number, shot.read(number).color + 0 * np.ones(megabytes * 2**18, np.float32)[0]
 
 
-def without_weights(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
-    raise AbsentError("no weights are shipped")
-    yield
-
-
 def with_maps(shot: MemoryShot) -> Iterator[tuple[int, dict[str, Array]]]:
     for number in shot.numbers:
         yield number, {"Confidence": np.full(SIZE, 0.5, np.float32)}
@@ -119,7 +114,7 @@ NOISY = {"noisy": METHODS["noisy"]}
 
 def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
     shot, reference = make_shots()
-    methods = NOISY | ways(perfect=perfect, gone=not_installed, weightless=without_weights, dead=killed, again=noisy)
+    methods = NOISY | ways(perfect=perfect, gone=not_installed, dead=killed, again=noisy)
     results = {r.name: r for r in compare_shot(shot, reference, methods, measures=QUICK, folder=tmp_path).results}
     assert list(results) == list(methods)
 
@@ -131,7 +126,6 @@ def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
     assert results["again"].metrics == measured
     assert results["perfect"].metrics["psnr"].mean == results["perfect"].metrics["temporal_psnr"].mean == np.inf
     assert results["gone"].absent_reason == "needs the package unheard-of"
-    assert results["weightless"].absent_reason == "no weights are shipped"
     assert "died" in (results["dead"].absent_reason or "")
     assert not results["gone"].metrics
     np.testing.assert_array_equal(load_frame(tmp_path, "noisy", 5), shot.read(5).color)

@@ -13,7 +13,7 @@ from conftest import Scene
 
 from hybrid import methods
 from hybrid.frames import Shot, open_shot
-from hybrid.methods import METHODS, AbsentError, aligned_average, window_maps
+from hybrid.methods import METHODS, aligned_average, window_maps
 from hybrid.metrics import psnr
 from hybrid.plan import EFFECTS, plan_shot
 from hybrid.pseudo_reference import Aligner, estimate
@@ -29,7 +29,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
     return open_shot(SCENE.write(tmp_path_factory.mktemp("shot")))
 
 
-@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("noisy", "tKPCN")])
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "noisy"])
 def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) -> None:
     for word, package in NEEDS.items():
         if word in name and find_spec(package) is None:
@@ -39,12 +39,6 @@ def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) ->
     assert image.shape == noisy.shape
     assert np.isfinite(image).all()
     assert psnr(image, truth) > psnr(noisy, truth)
-
-
-def test_a_network_without_weights_is_absent_with_its_reason(shot: Shot) -> None:
-    pytest.importorskip("torch")
-    with pytest.raises(AbsentError, match=r"no weights are shipped: preset is 'unheard-of'"):
-        next(methods.network(shot, preset="unheard-of"))
 
 
 def test_noise_of_a_tone_mapped_frame_is_found() -> None:

