@@ -6,6 +6,7 @@ from functools import reduce
 
 import cv2
 import numpy as np
+from numba import njit, prange
 
 from flow.motion import forward_backward_error
 
@@ -118,7 +119,9 @@ def estimate_confidence(
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
 
 
-def mix_centre(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+def mix_centre(
+    warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray | None = None
+) -> np.ndarray:
     """Put the centre in the place of a warped neighbour where that cannot be trusted.
 
     Parameters
@@ -127,6 +130,8 @@ def mix_centre(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray) -
         (H, W) or (H, W, C) float, any unit.
     confidence
         (H, W) float in [0, 1].
+    out
+        float32, contiguous, the shape of `centre`: where the result is written. Without: a new one.
 
     Returns
     -------
@@ -138,7 +143,19 @@ def mix_centre(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray) -
         raise ValueError(
             f"warped has shape {warped.shape}, confidence {confidence.shape}, expected those of centre, {centre.shape}"
         )
-    weight = np.asarray(confidence, np.float32).reshape(*confidence.shape, *(1,) * (centre.ndim - 2))
-    with np.errstate(invalid="ignore", over="ignore"):
-        mixed = weight * np.asarray(warped, np.float32) + (1 - weight) * np.asarray(centre, np.float32)
-    return np.where(weight > 0, mixed, np.asarray(centre, np.float32))
+    mixed = np.empty(centre.shape, np.float32) if out is None else out
+    planes = (*centre.shape[:2], -1)
+    warped, centre, confidence = (np.asarray(layer, np.float32) for layer in (warped, centre, confidence))
+    _mix(warped.reshape(planes), centre.reshape(planes), confidence, mixed.reshape(planes))
+    return mixed
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def _mix(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray) -> None:
+    for y in prange(out.shape[0]):
+        for x in range(out.shape[1]):
+            weight = confidence[y, x]
+            for channel in range(out.shape[2]):
+                out[y, x, channel] = centre[y, x, channel]
+                if weight > 0:
+                    out[y, x, channel] = weight * warped[y, x, channel] + (np.float32(1) - weight) * out[y, x, channel]

@@ -175,8 +175,10 @@ class AlignedWindow:
 
     def mixed(self, layer: Array) -> Array:
         """Mix the centre into the side frames of `layer` (T, H, W, C), in inverse proportion to confidence."""
-        centre = layer[self.centre]
-        return np.stack([mix_centre(warped, centre, c) for warped, c in zip(layer, self.confidence, strict=True)])
+        mixed = np.empty(layer.shape, np.float32)
+        for warped, confidence, out in zip(layer, self.confidence, mixed, strict=True):
+            mix_centre(warped, layer[self.centre], confidence, out)
+        return mixed
 
 
 @dataclass(frozen=True)
