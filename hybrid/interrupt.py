@@ -52,10 +52,13 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     watcher.start()
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        # Within numba's dispatcher it comes as a SystemError that it has caused.
+        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
         left.set()
         report()
-        raise
+        raise KeyboardInterrupt from None
     finally:
         left.set()
         signal.set_wakeup_fd(previous)

@@ -82,7 +82,7 @@ def test_identical_frames_are_one_frame():
     one = frame(MIDDLE)
     still = spoil(one, motion=np.zeros_like(one.motion))
     window, image = denoise([spoil(still, number=n) for n in range(5)])
-    assert (window.confidence == 1).all()
+    assert window.confidence.min() > 1 - 1e-6  # the cosine of a normal with itself, in float32
     assert within_range(window, image)
 
 

@@ -15,7 +15,7 @@ from safetensors.torch import save_file  # noqa: E402
 
 from hybrid.cli import main  # noqa: E402
 from hybrid.neural import shipped_weights  # noqa: E402
-from network.checkpoint import describe, load_model, save_model  # noqa: E402
+from network.checkpoint import VERSION, describe, load_model, save_model  # noqa: E402
 from network.models import fast, paper, unet  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -31,7 +31,12 @@ def good(tmp_path_factory):
 def write(path, model=None, **metadata):
     """A file with the tensors of a model and any metadata; None leaves an entry out."""
     model = model or fast()
-    entries = {"format": "ravg-network", "version": "2", "description": json.dumps(describe(model)), "notes": "{}"}
+    entries = {
+        "format": "ravg-network",
+        "version": str(VERSION),
+        "description": json.dumps(describe(model)),
+        "notes": "{}",
+    }
     entries = {name: value for name, value in (entries | metadata).items() if value is not None}
     save_file({name: value.half().contiguous() for name, value in model.state_dict().items()}, path, entries)
     return path
@@ -88,7 +93,7 @@ def test_pickles_are_not_opened(tmp_path):
     [
         ({"format": None}, "format"),
         ({"format": "somebody-elses"}, "format"),
-        ({"version": "1"}, "version 2, got 1"),
+        ({"version": "1"}, f"version {VERSION}, got 1"),
         ({"version": "one"}, "version"),
         ({"description": None}, "description"),
         ({"description": "not json"}, "Expecting value"),
