@@ -147,6 +147,7 @@ def pseudoref(
     _spare_input(opened, output, preview=preview)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
+    _spare_input(opened, output, source.files)
     if source.estimate is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -235,6 +236,7 @@ def denoise(
         mode = "oidn-clean" if weights is not None else MODE_OF[preset]
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
         source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
+        _spare_input(opened, output, source.files)
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
     else:
@@ -482,12 +484,14 @@ def _plan(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Pl
     return plan_shot(shot).force(_split(on), _split(off))
 
 
-def _spare_input(shot: Shot, output: str, **pictures: Path | None) -> None:
-    """Refuse to write over a frame of the shot, before anything is made."""
+def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictures: Path | None) -> None:
+    """Refuse to write over a frame of the shot, or of estimates, before anything is made."""
     from hybrid.frames import output_path
 
     for number in shot.numbers:
-        output_path(output, shot, number)
+        frame = output_path(output, shot, number)
+        if estimates is not None and estimates.reads(frame):
+            raise ValueError(f"output {str(frame)!r} would overwrite a frame of the estimate")
     for option, path in pictures.items():
         if path is not None and shot.reads(path):
             raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")

@@ -44,11 +44,14 @@ class EstimateSource:
         What an `Aligner` takes: a function, a preset of our own, or None for none.
     reason : str
         Why this one.
+    files : Shot or None
+        The finished sequence it is read from, if it is one.
     """
 
     name: str
     estimate: Estimate
     reason: str
+    files: Shot | None = None
 
 
 def choose_estimate(
@@ -107,7 +110,7 @@ def _choose(spec: str, shot: Shot, own: Preset, kept: str | None, mode: str) -> 
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
-    return EstimateSource("sequence", partial(_read_sequence, sequence), "asked for")
+    return EstimateSource("sequence", partial(_read_sequence, sequence), "asked for", sequence)
 
 
 def _has_oidn() -> bool:

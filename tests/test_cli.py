@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,6 +118,17 @@ def test_the_input_is_not_overwritten(shot_folder, capsys):
     before = {path: path.read_bytes() for path in shot_folder.iterdir()}
     assert "overwrite" in one_line_error(capsys, "pseudoref", shot_folder, "-o", shot_folder)
     assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("command", ["pseudoref", pytest.param("denoise", marks=pytest.mark.neural)])
+def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, command):
+    if command == "denoise":
+        pytest.importorskip("torch")
+    theirs = Path(shutil.copytree(shot_folder, tmp_path / "theirs"))
+    before = {path: path.read_bytes() for path in theirs.iterdir()}
+    words = (command, shot_folder, "--estimate", theirs, "-o", theirs)
+    assert "would overwrite a frame of the estimate" in one_line_error(capsys, *words)
+    assert {path: path.read_bytes() for path in theirs.iterdir()} == before
 
 
 @pytest.mark.neural
