@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,10 +130,12 @@ class AlignedWindow:
         In [0, 1]; the centre's is 1 wherever its own color was finite.
     modulation : (H, W, 3) array
         What irradiance is multiplied by to give radiance: the centre's prefiltered albedo plus the floor, or 1.
-    guide : (H, W, G) array or None
-        The centre's albedo and normal, prefiltered.
-    variance : (H, W, 3) array
-        Of the centre's `color`, smoothed.
+    clean_albedo : (H, W, 3) array or None
+        The centre's albedo, prefiltered where the plan has it.
+    trust : (T, H, W) array
+        Confidence by geometry alone, with which guides are prefiltered.
+    rendered_variance : (H, W, 3) array or None
+        Of the centre's `color`, where the file tells it.
     estimate : (T, H, W, 3) array or None
         The estimates that were asked for, aligned, as irradiance; the centre's where a frame shows nothing.
     aovs : dict of str to (T, H, W, C) array
@@ -157,8 +160,9 @@ class AlignedWindow:
     normal: Array | None
     confidence: Array
     modulation: Array
-    guide: Array | None
-    variance: Array
+    clean_albedo: Array | None
+    trust: Array
+    rendered_variance: Array | None
     estimate: Array | None
     aovs: dict[str, Array]
     repaired: int
@@ -167,6 +171,24 @@ class AlignedWindow:
     moments: NDArray[np.float64]
     inner: slice
     effects: frozenset[str]
+
+    @cached_property
+    def guide(self) -> Array | None:
+        """The centre's albedo and normal, prefiltered, (H, W, G).
+
+        Made when asked for: averages of estimates need none.
+        """
+        clean = [] if self.clean_albedo is None else [self.clean_albedo]
+        if self.normal is not None:
+            clean.append(_clean(self.normal, self.trust, self.effects))
+        return np.concatenate(clean, axis=-1) if clean else None
+
+    @cached_property
+    def variance(self) -> Array:
+        """Of the centre's `color`, smoothed, (H, W, 3). Made when asked for, as the guide is."""
+        if self.rendered_variance is None:
+            return variance_from_window(self.color, self.confidence)
+        return smooth_variance(self.rendered_variance)
 
     @property
     def centre(self) -> int:
@@ -616,12 +638,11 @@ class Aligner:
         if "outliers" in self.effects:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected[:, inner]))
-        guides = [layer for layer in (albedo, normal) if layer is not None]
-        noisy = "prefilter" in self.effects
-        clean: list[Array] = [prefilter_guide(g, confidence) if noisy else g[middle] for g in guides]
+        trust = confidence
+        clean = None if albedo is None else _clean(albedo, trust, self.effects)
         modulation = np.ones_like(color[0])
-        if albedo is not None and centre.demodulated:
-            modulation = remodulate(modulation, clean[0])
+        if clean is not None and centre.demodulated:
+            modulation = remodulate(modulation, clean)
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
             estimates = estimates / modulation
@@ -631,7 +652,6 @@ class Aligner:
             confidence = np.maximum(confidence * gate if "gate" in self.effects else confidence, floor) * (seen > 0)
         elif "gate" in self.effects:
             confidence = confidence * color_gate(window.pop("light"), color[middle], lit.exposure)
-        given = centre.variance
         return AlignedWindow(
             number=centre.number,
             color=color,
@@ -639,8 +659,9 @@ class Aligner:
             normal=normal,
             confidence=confidence,
             modulation=modulation,
-            guide=np.concatenate(clean, axis=-1) if clean else None,
-            variance=variance_from_window(color, confidence) if given is None else smooth_variance(given),
+            clean_albedo=clean,
+            trust=trust,
+            rendered_variance=centre.variance,
             estimate=estimates,
             aovs={name: window[f"aov {name}"] for name in centre.aovs},
             repaired=centre.repaired,
@@ -650,6 +671,11 @@ class Aligner:
             inner=inner,
             effects=self.effects,
         )
+
+
+def _clean(layer: Array, trust: Array, effects: Collection[str]) -> Array:
+    """The centre of a guide (T, H, W, C), prefiltered if the plan has it."""
+    return prefilter_guide(layer, trust) if "prefilter" in effects else layer[len(layer) // 2]
 
 
 def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
