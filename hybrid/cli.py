@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from hybrid.interrupt import INTERRUPTED, interruptible, is_interrupt
 from hybrid.simulate.command import simulate_command
 from hybrid.training import prepare_command, train_command
 
@@ -574,8 +575,6 @@ def _last_pass(job: _Job, passes: int) -> Iterator[_Job]:
 
 def _run(job: _Job) -> None:
     """Denoise the shot; stopped by Ctrl-C, say what is finished."""
-    from hybrid.interrupt import INTERRUPTED, interruptible
-
     done: list[int] = []
 
     def report() -> None:
@@ -700,8 +699,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         app(args=None if argv is None else list(argv), prog_name="ravg")
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
-        return 130
+    except (KeyboardInterrupt, SystemError) as error:
+        if not is_interrupt(error):
+            raise
+        return INTERRUPTED
     except ModuleNotFoundError:
         raise  # a broken installation, not something optional that is missing
     except (ValueError, OSError, ImportError) as error:

@@ -17,6 +17,13 @@ INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
 PATIENCE = 1.0
 
 
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether this is Ctrl-C. Within numba's dispatcher it comes as a SystemError, or several, that it has caused."""
+    while isinstance(error, SystemError):
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
+
+
 @contextmanager
 def interruptible(report: Callable[[], None]) -> Iterator[None]:
     """Let Ctrl-C, or SIGTERM, end the process within about a second, whatever it is doing.
@@ -53,8 +60,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, SystemError) as error:
-        # Within numba's dispatcher it comes as a SystemError that it has caused.
-        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+        if not is_interrupt(error):
             raise
         left.set()
         report()

@@ -215,8 +215,10 @@ def test_a_frame_made_in_parts_is_the_frame(tall, effects, record_property):
 def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
     """C code that finds an exception where it expects none raises a SystemError with that as its cause."""
     said = []
+    inner, outer = (SystemError("returned a result with an exception set") for _ in range(2))
+    inner.__cause__ = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt), interruptible(lambda: said.append("3 of 5")):
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        raise outer from inner
     assert said == ["3 of 5"]
     with pytest.raises(SystemError), interruptible(lambda: said.append("never")):
         raise SystemError("something else") from ValueError()
