@@ -145,10 +145,9 @@ def pseudoref(
 
     chosen = _choose(PRESETS, preset, "preset")
     opened = _open(shot, frames, layer, max_pixels=max_pixels)
-    _spare_input(opened, output, preview=preview)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
-    _spare_input(opened, output, source.files)
+    _spare_input(opened, output, source.files, preview=preview)
     if source.estimate is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -183,7 +182,8 @@ def denoise(
     ] = None,
     weights: Annotated[Path | None, typer.Option(help="a weights file of your own, instead of a preset")] = None,
     threshold: Annotated[
-        float | None, typer.Option(help="of the kernels, from 0 to 1 times 1/K; higher stays closer to the input")
+        float | None,
+        typer.Option(help="from 0 to 1: higher keeps fewer frames or taps: closer to the one frame"),
     ] = None,
     estimate: EstimateOption = "auto",
     keep_estimates: KeepOption = None,
@@ -223,7 +223,6 @@ def denoise(
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = _open(shot, frames, layer, aov, max_pixels=max_pixels)
-    _spare_input(opened, output, preview=preview, breakdown=breakdown)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -237,11 +236,11 @@ def denoise(
         mode = "oidn-clean" if weights is not None else MODE_OF[preset]
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
         source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
-        _spare_input(opened, output, source.files)
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
     else:
         raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
+    _spare_input(opened, output, source.files, preview=preview, breakdown=breakdown)
     settings = {
         "layer": layer,
         "estimate": estimate,

@@ -743,7 +743,7 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
             irradiance = robust_average(aligned.color, aligned.confidence)
     else:
         # A frame of a few pixels is searched as a whole.
-        most = max(aligned.variance.shape[:2])
+        most = max(aligned.color.shape[1:3])
         with timings.stage("nlm"):
             irradiance = joint_nlm(
                 aligned.color,
@@ -753,22 +753,23 @@ def estimate(aligned: AlignedWindow, preset: Preset = BALANCED, *, timings: Timi
                 radius=min(preset.nlm_radius, most),
                 patch_radius=min(preset.nlm_patch_radius, most),
             )
-    guides = [] if aligned.guide is None else [aligned.guide]
-    if preset.nlm_radius:
-        # Edges of shadows and highlights are in no guide, but in what the non-local means have made of the light.
-        # Without this channel the filter lost 2 dB on a sunlit shot.
-        light = irradiance.mean(axis=-1, keepdims=True)
-        guides.append(compress(light, aligned.exposure))
-    if preset.guided_radius and guides:
+    if preset.guided_radius:
         with timings.stage("guided"):
-            guide = np.concatenate(guides, axis=-1)
-            irradiance = guided_filter(
-                irradiance,
-                guide,
-                radius=preset.guided_radius,
-                eps=preset.guided_eps,
-                moments=aligned.moments[:, : guide.shape[-1]],
-            )
+            guides = [] if aligned.guide is None else [aligned.guide]
+            if preset.nlm_radius:
+                # Edges of shadows and highlights are in no guide, but in what the non-local means have made of the
+                # light. Without this channel the filter lost 2 dB on a sunlit shot.
+                light = irradiance.mean(axis=-1, keepdims=True)
+                guides.append(compress(light, aligned.exposure))
+            if guides:
+                guide = np.concatenate(guides, axis=-1)
+                irradiance = guided_filter(
+                    irradiance,
+                    guide,
+                    radius=preset.guided_radius,
+                    eps=preset.guided_eps,
+                    moments=aligned.moments[:, : guide.shape[-1]],
+                )
     return irradiance * aligned.modulation
 
 
