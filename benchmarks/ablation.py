@@ -23,6 +23,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import torch
 
@@ -136,6 +137,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--only", choices=("paper", "unet"), help="one half of it")
     options = parser.parse_args(argv)
     torch.set_num_threads(options.threads)
+    numba.set_num_threads(min(options.threads, numba.get_num_threads()))
     options.out.mkdir(parents=True, exist_ok=True)
     training, test = split_by_shot(open_clips(options.clips), options.test)
     built = networks(training.frames, options.width, options.blocks, options.activation)

@@ -18,12 +18,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numba
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from hybrid.memory import keep_freed_memory
 from network.blocks import RobustAverage, outermost_first, ravg
 from network.kernels import apply_kernels, predict_kernel, threshold_kernel
 from network.losses import relmse
@@ -104,6 +106,8 @@ def parts(tile: int) -> Iterator[tuple[str, Callable[[], object], int]]:
         yield f"threshold_kernel{name}", mode(lambda x: threshold_kernel(x, centre=62), weights), size**2
         yield f"apply_kernels{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights), size**2
         yield f"apply_kernels, unfolded{name}", mode(lambda x, f=frames: unfolded(x, f), weights), size**2
+        weights, frames = torch.rand(1, 125, 540, 960), torch.rand(1, 5, 3, 540, 960)
+        yield f"apply_kernels, 960×540{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights), 540 * 960
 
 
 def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], object], int]]:
@@ -137,7 +141,9 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
 
 def main(argv: list[str]) -> int:
     options = parse_arguments(argv)
+    keep_freed_memory()  # as the commands do
     torch.set_num_threads(options.threads)
+    numba.set_num_threads(min(options.threads, numba.get_num_threads()))
     results = {}
     for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.presets)):
         seconds = measure(function, options.repeats)

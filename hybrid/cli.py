@@ -595,12 +595,14 @@ def _denoise(job: _Job, done: list[int]) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Table
 
-    from hybrid.memory import parse_size, plan_rows
+    from hybrid.memory import keep_freed_memory, parse_size, plan_rows
     from hybrid.pipeline import denoise_shot
     from hybrid.plan import Plan
 
     shot, source, timings = job.shot, job.source, job.timings
     limit = None if job.max_memory is None else parse_size(job.max_memory)
+    if limit is None:
+        keep_freed_memory()
     fit = (
         partial(plan_rows, limit, shot, estimate=source.estimate, radius=job.radius, neural=job.neural)
         if limit

@@ -31,6 +31,7 @@ from rich.table import Table
 from flow.motion import forward_backward_error, normalize_motion
 from flow.warp import warp
 from hybrid.frames import Frame, Shot
+from hybrid.memory import keep_freed_memory
 from hybrid.methods import METHODS, Method
 from hybrid.metrics import (
     Reference,
@@ -170,7 +171,7 @@ def _apart() -> ProcessPoolExecutor:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])  # once, and not for every method
-    return ProcessPoolExecutor(1, mp_context=context)
+    return ProcessPoolExecutor(1, mp_context=context, initializer=keep_freed_memory)
 
 
 def time_methods(

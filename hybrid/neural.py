@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -338,7 +339,7 @@ def train_network(
     validation : sequence of str
         Shots kept out of training.
     threads : int, optional
-        Of torch.
+        Of torch and numba.
     resume, log
         As for `network.train.train`.
     crop, sets
@@ -365,6 +366,7 @@ def train_network(
     config = TrainConfig(seed=seed, sampler=SamplerConfig(crop=crop, sets=sets), **settings)
     if threads is not None:
         torch.set_num_threads(threads)
+        numba.set_num_threads(min(threads, numba.get_num_threads()))
     training, kept_out = split_by_shot(open_clips(clips), validation)
     if init is None:
         if preset not in PRESETS:

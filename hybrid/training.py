@@ -100,6 +100,7 @@ def prepare_command(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hybrid.frames import open_shot
+    from hybrid.memory import keep_freed_memory
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -115,6 +116,7 @@ def prepare_command(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
     output.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         task = progress.add_task("prepare", total=sum(len(next(iter(shot.values()))) for _, shot, _ in found))
@@ -185,7 +187,7 @@ def train_command(
     sets: Annotated[int, typer.Option(help="disjoint sets of clips, one an epoch")] = 10,
     seed: Annotated[int, typer.Option(help="of initial weights and samples")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
-    threads: Annotated[int | None, typer.Option(help="of torch")] = None,
+    threads: Annotated[int | None, typer.Option(help="of torch and numba")] = None,
     workers: Annotated[int, typer.Option(help="processes that read clips")] = 0,
     float32: Annotated[bool, typer.Option("--float32", help="no bfloat16")] = False,
     compile: Annotated[bool, typer.Option("--compile", help="compile the network; pays on a GPU")] = False,

@@ -15,15 +15,13 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import torch
+from numba import njit, prange
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-Slices = tuple[slice, slice]
-
-#: Bytes of frames that one operation of `apply_kernels` goes over: what stays in a core's cache from tap to tap. Those
-#: are some rows of large frames, and several small frames, or starting the operations would take longer than they do.
-TOGETHER = 1 << 21
+_PROCESSOR = "cpu"  # where compiled loops run; elsewhere torch's own operations
 
 
 def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
@@ -157,7 +155,7 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     Notes
     -----
     Taps outside the image count in neither sum, so that dividing renormalises what is left of a kernel at the
-    border. Both directions accumulate shifted planes in place: unfolding would write each frame K·K times.
+    border. Both directions accumulate in place, in float32 or float64: unfolding would write each frame K·K times.
     """
     if frames.ndim != 5 or kernels.ndim != 4 or kernels.shape[0] != frames.shape[0]:
         raise ValueError(
@@ -171,9 +169,15 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
         raise ValueError(
             f"kernels: expected the frames' size {tuple(frames.shape[3:])}, got {tuple(kernels.shape[2:])}"
         )
-    numerators: Tensor
-    denominators: Tensor
-    numerators, denominators = _ApplyKernels.apply(kernels, frames)
+    dtype = torch.promote_types(kernels.dtype, frames.dtype)
+    working = dtype if dtype == torch.float64 else torch.float32
+    # A further channel of ones, which has the denominators for numerators; the margin around the image is zero.
+    (n, t, c, h, w), margin = frames.shape, size // 2
+    padded = frames.new_zeros((n, t, c + 1, h + 2 * margin, w + 2 * margin), dtype=working)
+    padded[:, :, :c, margin : margin + h, margin : margin + w] = frames
+    padded[:, :, c, margin : margin + h, margin : margin + w] = 1
+    sums: Tensor = _ApplyKernels.apply(kernels.to(working), padded, size)
+    numerators, denominators = sums.to(dtype).split((c, 1), 2)
     return numerators, denominators
 
 
@@ -351,54 +355,107 @@ class _Threshold(torch.autograd.Function):
 
 
 class _ApplyKernels(torch.autograd.Function):
-    """Shifted accumulation over the taps; see `apply_kernels`."""
+    """Sums of every frame over its taps, ``(N, T, C, H, W)``, of frames with a margin; see `apply_kernels`."""
 
     @staticmethod
-    def forward(ctx: Any, kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
-        n, t, c, h, w = frames.shape
-        dtype = torch.promote_types(kernels.dtype, frames.dtype)
-        kernels, frames = kernels.to(dtype), frames.to(dtype)
-        numerators = frames.new_zeros(n, t, c, h, w)
-        denominators = frames.new_zeros(n, t, 1, h, w)
-        of_frame = kernels.unflatten(1, (t, -1))
-        for some, tap, here, there in _taps(kernels, frames):
-            weight = of_frame[:, some, tap : tap + 1, *here]
-            numerators[:, some, :, *here].addcmul_(weight, frames[:, some, :, *there])
-            denominators[:, some, :, *here].add_(weight)
-        ctx.save_for_backward(kernels, frames)
-        return numerators, denominators
+    def forward(ctx: Any, kernels: Tensor, padded: Tensor, size: int) -> Tensor:
+        kernels = kernels.unflatten(1, (-1, size * size)).contiguous()
+        sums = padded.new_zeros(*padded.shape[:3], *kernels.shape[3:])
+        if padded.device.type == _PROCESSOR:
+            _add_taps(_planes(kernels), _planes(padded), _planes(sums), tuple(range(size)))
+        else:
+            for tap, window in _windows(padded, size):
+                sums.addcmul_(kernels[:, :, tap, None], window)
+        ctx.save_for_backward(kernels, padded)
+        ctx.size = size
+        return sums
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, to_numerators: Tensor, to_denominators: Tensor) -> tuple[Tensor | None, ...]:
-        kernels, frames = ctx.saved_tensors
-        t, c = frames.shape[1:3]
-        to_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[0] else None
-        to_frames = torch.zeros_like(frames) if ctx.needs_input_grad[1] else None
-        for some, tap, here, there in _taps(kernels, frames):
+    def backward(ctx: Any, to_sums: Tensor) -> tuple[Tensor | None, ...]:
+        kernels, padded = ctx.saved_tensors
+        to_kernels = torch.empty_like(kernels) if ctx.needs_input_grad[0] else None
+        to_padded = torch.zeros_like(padded) if ctx.needs_input_grad[1] else None
+        to_sums = to_sums.contiguous()
+        if padded.device.type == _PROCESSOR:
             if to_kernels is not None:
-                gradient = to_kernels.unflatten(1, (t, -1))[:, some, tap, *here]
-                gradient.copy_(to_denominators[:, some, 0, *here])
-                for channel in range(c):
-                    gradient.addcmul_(to_numerators[:, some, channel, *here], frames[:, some, channel, *there])
-            if to_frames is not None:
-                weight = kernels.unflatten(1, (t, -1))[:, some, tap : tap + 1, *here]
-                to_frames[:, some, :, *there].addcmul_(weight, to_numerators[:, some, :, *here])
-        return to_kernels, to_frames
+                _to_taps(_planes(to_sums), _planes(padded), _planes(to_kernels), ctx.size)
+            if to_padded is not None:
+                _to_frames(_planes(to_sums), _planes(kernels), _planes(to_padded), ctx.size)
+        else:
+            for tap, window in _windows(padded, ctx.size):
+                if to_kernels is not None:
+                    torch.sum(to_sums * window, 2, out=to_kernels[:, :, tap])
+            if to_padded is not None:
+                for tap, window in _windows(to_padded, ctx.size):
+                    window.addcmul_(kernels[:, :, tap, None], to_sums)
+        return None if to_kernels is None else to_kernels.flatten(1, 2), to_padded, None
 
 
-def _taps(kernels: Tensor, frames: Tensor) -> Iterator[tuple[slice, int, Slices, Slices]]:
-    """Some of the frames, a tap, the pixels for which it is inside the image, and the pixels it reads there."""
-    count, height, width = frames.shape[1], *frames.shape[3:]
-    size = math.isqrt(kernels.shape[1] // count)
-    radius = size // 2
-    band = max(1, TOGETHER // (frames[:, 0, :, 0].numel() * frames.element_size()))
-    together = max(1, band // height)
-    for first, top in product(range(0, count, together), range(0, height, band)):
-        for tap, (dy, dx) in enumerate(product(range(-radius, radius + 1), repeat=2)):
-            start, stop = max(top, -dy), min(top + band, height - max(0, dy))
-            columns = slice(max(0, -dx), max(0, width - max(0, dx)))
-            from_columns = slice(max(0, dx), max(0, width + min(0, dx)))
-            if start < stop:
-                here, there = (slice(start, stop), columns), (slice(start + dy, stop + dy), from_columns)
-                yield slice(first, first + together), tap, here, there
+def _windows(padded: Tensor, size: int) -> Iterator[tuple[int, Tensor]]:
+    """Each tap of a kernel, and the view of the frames that it reads."""
+    height, width = padded.shape[3] - size + 1, padded.shape[4] - size + 1
+    for tap, (top, left) in enumerate(product(range(size), repeat=2)):
+        yield tap, padded[..., top : top + height, left : left + width]
+
+
+def _planes(tensor: Tensor) -> NDArray[Any]:
+    """Planes of each frame, ``(N·T, planes, H, W)``, for compiled code."""
+    planes: NDArray[Any] = tensor.detach().flatten(0, 1).numpy()
+    return planes
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def _add_taps(
+    kernels: NDArray[Any], padded: NDArray[Any], sums: NDArray[Any], columns: tuple[int, ...]
+) -> None:  # pragma: no cover - compiled
+    """Add the taps' products to the sums. The number of columns is known to the compiler, which unrolls them."""
+    size, (count, channels, height, width) = len(columns), sums.shape
+    for job in prange(count * height):
+        frame, y = job // height, job % height
+        for row in range(size):
+            for channel in range(channels):
+                for x in range(width):
+                    total = sums[frame, channel, y, x]
+                    for column in range(len(columns)):
+                        tap = row * size + column
+                        total += kernels[frame, tap, y, x] * padded[frame, channel, y + row, x + column]
+                    sums[frame, channel, y, x] = total
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def _to_taps(
+    to_sums: NDArray[Any], padded: NDArray[Any], to_kernels: NDArray[Any], size: int
+) -> None:  # pragma: no cover - compiled
+    """Gradient of the kernels."""
+    count, channels, height, width = to_sums.shape
+    for job in prange(count * height):
+        frame, y = job // height, job % height
+        for tap in range(size * size):
+            row, column = tap // size, tap % size
+            gradient = to_kernels[frame, tap, y]
+            gradient[:] = 0
+            for channel in range(channels):
+                # Rows as arrays of their own, or no loop over x becomes vector instructions.
+                given = to_sums[frame, channel, y]
+                read = padded[frame, channel, y + row, column : column + width]
+                for x in range(width):
+                    gradient[x] += given[x] * read[x]
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def _to_frames(
+    to_sums: NDArray[Any], kernels: NDArray[Any], to_padded: NDArray[Any], size: int
+) -> None:  # pragma: no cover - compiled
+    """Gradient of the frames, added up where the taps have read: a frame at a time, as rows overlap."""
+    count, channels, height, width = to_sums.shape
+    for frame in prange(count):
+        for y in range(height):
+            for tap in range(size * size):
+                row, column = tap // size, tap % size
+                weight = kernels[frame, tap, y]
+                for channel in range(channels):
+                    given = to_sums[frame, channel, y]
+                    gradient = to_padded[frame, channel, y + row, column : column + width]
+                    for x in range(width):
+                        gradient[x] += weight[x] * given[x]

@@ -165,16 +165,25 @@ def test_gradient_of_applying_kernels(shape: tuple[int, int]) -> None:
     assert torch.autograd.gradcheck(apply_kernels, (kernels, frames))
 
 
-@pytest.mark.parametrize("rows", [1, 2, 5])
-def test_in_how_many_pieces_kernels_are_applied_changes_nothing(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    kernels, frames = uniform(2, 50, 7, 6).requires_grad_(), uniform(2, 2, 3, 7, 6, seed=1).requires_grad_()
+@pytest.mark.parametrize(("size", "shape"), [(1, (4, 5)), (3, (4, 5)), (5, (37, 6)), (7, (2, 20))])
+def test_what_other_devices_compute_is_what_processors_do(size, shape, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    kernels = uniform(2, 2 * size * size, *shape).requires_grad_()
+    frames = uniform(2, 2, 3, *shape, seed=1).requires_grad_()
     found = []
-    for pieces in (network.kernels.TOGETHER, rows * 2 * 3 * 6 * 8):  # of both samples, three channels, six columns
-        monkeypatch.setattr(network.kernels, "TOGETHER", pieces)
+    for device in ("cpu", "other"):
+        monkeypatch.setattr(network.kernels, "_PROCESSOR", device)
         sums = apply_kernels(kernels, frames)
         found.append([*sums, *torch.autograd.grad([s.square().sum() for s in sums], (kernels, frames))])
-    for whole, parts in zip(*found, strict=True):
-        torch.testing.assert_close(parts, whole)
+    for here, there in zip(*found, strict=True):
+        torch.testing.assert_close(there, here)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_halves_are_summed_in_float32(dtype: torch.dtype) -> None:
+    kernels, frames = uniform(1, 50, 6, 5).to(dtype), uniform(1, 2, 3, 6, 5, seed=1).to(dtype)
+    for got, expected in zip(apply_kernels(kernels, frames), by_loops(kernels.double(), frames.double()), strict=True):
+        assert got.dtype == dtype
+        torch.testing.assert_close(got, expected.to(dtype))
 
 
 def test_an_impulse_shows_where_each_tap_reads() -> None:

@@ -273,6 +273,28 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
         )
 
 
+FAULTS = """
+import resource
+from hybrid.memory import keep_freed_memory
+
+def page_faults() -> int:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(2**26)  # written, and freed
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+first, again = page_faults(), page_faults()
+keep_freed_memory()
+page_faults()
+print(first, again, page_faults())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator is spoken to")
+def test_memory_that_is_kept_is_not_fetched_page_by_page():
+    first, again, kept = (int(word) for word in run_alone("-c", FAULTS).stdout.split())
+    assert min(first, again) > 10 * max(kept, 1)
+
+
 def test_one_thread_or_two_give_the_same_bytes(tmp_path):
     folder = Scene(height=80, width=96).write(tmp_path / "in")
     for count in ("1", "2"):
