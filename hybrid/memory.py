@@ -31,9 +31,9 @@ _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 def keep_freed_memory() -> None:
     """Let this process keep the memory it frees, where its C library is glibc; elsewhere do nothing.
 
-    glibc gives blocks above 32 MiB back to the kernel at once, and the kernel hands out zeroed pages one by one when
-    the next is written: a sixth of the CPU time of `denoise` at 1280×720, and two fifths of a network's with kernels
-    (`benchmarks/bench_pages.py`). Peak memory grows by a tenth, as what is free is in pieces.
+    glibc gives blocks above 32 MiB back to the kernel at once, which hands out zeroed pages one by one when the next is
+    written: a sixth of the CPU time of `denoise` at 1280×720 and at 1920×1080. Peak memory grows, by a tenth and a
+    quarter there, as what is free is in pieces (`benchmarks/bench_memory.py --limits 1T` compares).
     """
     adjust = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if adjust is not None:
