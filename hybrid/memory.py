@@ -1,4 +1,4 @@
-"""How much of a frame may be worked on at a time, for a given amount of memory.
+"""How much of a frame may be worked on at a time, for a given amount of memory; and keeping what is freed without one.
 
 The frames of a window are held as a whole; what is made of them while they are aligned and filtered, which is several
 times as much, only for some rows. So memory has a lower bound, and what is asked for below it is refused.
