@@ -203,7 +203,10 @@ def denoise(
     layer: LayerOption = None,
     effects: OnOption = None,
     no_effects: OffOption = None,
-    tile: Annotated[int, typer.Option(help="pixels on a side that the network sees at once")] = 384,
+    tile: Annotated[
+        int | None,
+        typer.Option(help="pixels on a side that the network sees at once; without: 640, with --max-memory 384"),
+    ] = None,
     precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
     resume: ResumeOption = False,
     max_memory: MemoryOption = None,
@@ -229,6 +232,8 @@ def denoise(
     if budget is not None:
         preset = _fitting(opened, budget, estimate, _plan(opened, effects, no_effects), precision)
     path = weights or neural.shipped_weights(preset)
+    if tile is None:
+        tile = neural.TILE if max_memory is None else neural.SMALL_TILE
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.

@@ -17,7 +17,7 @@ from hybrid.pseudo_reference import MARGIN, CleanGuides, Estimate, frames_needed
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
 # What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
-BASE, BASE_NEURAL = 230 * 2**20, 560 * 2**20
+BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
 # What OIDN takes for itself, if the estimates are its own.
 OIDN = 1400 * 2**20
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.

@@ -157,7 +157,7 @@ def _denoiser(preset: str, tile: int, precision: str, threshold: float | None) -
 
 
 def network(
-    shot: Shot, *, preset: str, tile: int = 384, precision: str = "auto", threshold: float | None = None, **window: Any
+    shot: Shot, *, preset: str, tile: int = 640, precision: str = "auto", threshold: float | None = None, **window: Any
 ) -> Iterator[tuple[int, Array]]:
     """A network with the weights of a preset; the rest goes to `_windows`."""
     denoiser = _denoiser(preset, tile, precision, threshold)
@@ -173,7 +173,7 @@ def classical_maps(shot: Shot, *, estimator: Estimator, **window: Any) -> Iterat
 
 def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
     """The same of a network."""
-    denoiser = _denoiser(preset, 384, "float32", None)  # the difference of two runs must not be rounding
+    denoiser = _denoiser(preset, 640, "float32", None)  # the difference of two runs must not be rounding
     for aligned in _windows(shot, radius=denoiser.radius, **window):
         yield aligned.number, window_maps(aligned, lambda seen: denoiser(seen).color)
 

@@ -111,14 +111,14 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
     def blank(index, layers):
         layers["ViewLayer.Combined"][:, 40:] = 0
 
-    scene = Scene(height=40, width=200, frames=5)  # wide enough for tiles whose halo holds no edge
+    scene = Scene(height=40, width=320, frames=5)  # wide enough for tiles whose halo holds no edge
     shot = open_shot(scene.write(tmp_path, edit=blank))
     denoiser = Denoiser(weights, tile=16, precision="float32")
     aligners = [Aligner(shot, EFFECTS | extra, estimate=DRAFT) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
     np.testing.assert_allclose(images[1], images[0], atol=1e-6)
     assert images[1][:, 60:].max() < 1e-3
-    assert (images[1][:, 160:] == 0).all()  # exactly what was there
+    assert (images[1][:, 240:] == 0).all()  # exactly what was there
 
 
 def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
