@@ -29,7 +29,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid.metrics import ssim
+from hybrid.comparison.metrics import ssim
 from network.checkpoint import load_model, load_notes
 from network.clips import Clips, SamplerConfig, open_clips, split_by_shot, whole_frames
 from network.losses import tone_mapped_psnr

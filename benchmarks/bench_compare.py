@@ -15,10 +15,10 @@ import os
 import tempfile
 from pathlib import Path
 
-from hybrid.compare import spread_seconds, time_methods
-from hybrid.exr import read_exr, write_layers
-from hybrid.frames import open_shot
-from hybrid.methods import METHODS
+from hybrid.comparison.compare import spread_seconds, time_methods
+from hybrid.comparison.methods import METHODS
+from hybrid.files.exr import read_exr, write_layers
+from hybrid.files.frames import open_shot
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 FRAMES = (10, 11, 12)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid.exr import read_exr, write_layers
+from hybrid.files.exr import read_exr, write_layers
 from hybrid.memory import parse_size
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"

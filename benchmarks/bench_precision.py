@@ -25,13 +25,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.comparison.metrics import psnr
 from hybrid.estimates import choose_estimate
-from hybrid.frames import open_shot
-from hybrid.metrics import psnr
-from hybrid.neural import Denoiser, shipped_weights
+from hybrid.files.frames import open_shot
+from hybrid.neural.denoiser import Denoiser, shipped_weights
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import FINAL, AlignedWindow, Aligner, estimate
-from hybrid.transfer import measure_exposure
+from hybrid.pseudo_reference import FINAL, filter_window
 from nlm.guided import guided_filter
 
 Array = NDArray[np.float32]
@@ -67,14 +68,14 @@ def half(window: AlignedWindow) -> AlignedWindow:
     return replace(window, color=window.color.astype(np.float16).astype(np.float32))
 
 
-def in_bands(shot: object, effects: frozenset[str], number: int, rows: int) -> Array:
+def in_bands(shot: object, stages: frozenset[str], number: int, rows: int) -> Array:
     """The classical estimate, so many rows at a time."""
-    aligner = Aligner(shot, effects)  # type: ignore[arg-type]
+    aligner = Aligner(shot, stages)  # type: ignore[arg-type]
     parts = []
     height = shot.shape[0]  # type: ignore[attr-defined]
     for top in range(0, height, rows):
         aligned = aligner.align(number, slice(top, min(top + rows, height)))
-        parts.append(estimate(aligned, FINAL)[aligned.inner])
+        parts.append(filter_window(aligned, FINAL)[aligned.inner])
     return np.concatenate(parts)
 
 
@@ -83,9 +84,9 @@ def measure(number: int) -> list[Row]:
     shot = open_shot(SHOT / "noisy.####.exr")
     reference = open_shot(SHOT / "reference.####.exr").read(number).color
     exposure = 1 / measure_exposure(reference)
-    effects = plan_shot(shot).effects
-    window = Aligner(shot, effects).align(number)
-    given = Aligner(shot, effects, estimate=choose_estimate("nlm", shot).estimate).align(number)
+    stages = plan_shot(shot).stages
+    window = Aligner(shot, stages).align(number)
+    given = Aligner(shot, stages, estimates=choose_estimate("nlm", shot).estimates).align(number)
     rows = []
 
     def add(shortcut: str, exact: str, fast: Callable[[], Array], slow: Callable[[], Array]) -> None:
@@ -103,9 +104,12 @@ def measure(number: int) -> list[Row]:
         denoiser = Denoiser(weights, precision="float32", tile=tile)
         add(f"network in tiles of {tile}", "in one", lambda d=denoiser: d(given).color, lambda: whole(given).color)
     add(
-        "window stored in float16", "in float32", lambda: estimate(half(window), FINAL), lambda: estimate(window, FINAL)
+        "window stored in float16",
+        "in float32",
+        lambda: filter_window(half(window), FINAL),
+        lambda: filter_window(window, FINAL),
     )
-    picture = estimate(window, FINAL)
+    picture = filter_window(window, FINAL)
     add(
         "picture written as half (saves space, not time)",
         "as float",
@@ -118,7 +122,7 @@ def measure(number: int) -> list[Row]:
         add(f"guided filter at 1/{subsample} of the resolution", "at full resolution",
             lambda s=subsample: guided(window, light, s), lambda: guided(window, light, 1))  # fmt: skip
     for height in (64, 128):
-        parts = partial(in_bands, shot, effects, number)
+        parts = partial(in_bands, shot, stages, number)
         add(f"bands of {height} rows (--max-memory)", "whole frame", partial(parts, height), partial(parts, 10**6))
     return rows
 

@@ -1,6 +1,6 @@
 """Seconds and peak memory of whole runs at film size, as JSON.
 
-    python benchmarks/bench_shot.py [--frames 6] [--commands "pseudoref --preset balanced" "denoise"]
+    python benchmarks/bench_shot.py [--frames 6] [--commands "pseudoref --preset standard" "denoise"]
 
 The bundled shot is tiled 6×6 to 1920×1080 (its motion is then that of a film frame, with seams in it), and each command
 runs on it in a process of its own, as a user would run it. Peak memory is the operating system's count.
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid.exr import read_exr, write_layers
+from hybrid.files.exr import read_exr, write_layers
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 REPEAT = 6
@@ -37,7 +37,7 @@ def tile_shot(folder: Path, frames: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=6)
-    parser.add_argument("--commands", nargs="+", default=["pseudoref --preset balanced", "denoise"])
+    parser.add_argument("--commands", nargs="+", default=["pseudoref --preset standard", "denoise"])
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -151,7 +151,7 @@ DAMAGES: dict[str, Callable[[bytes, np.random.Generator], bytes]] = {
 def run_case(source: Path, folder: Path) -> Outcome:
     """Run the command on one file in a process of its own."""
     from hybrid.cli import main
-    from hybrid.exr import read_exr
+    from hybrid.files.exr import read_exr
 
     output, said = folder / "out", folder / "said"
     child = os.fork()

@@ -34,7 +34,7 @@ import cv2
 import numpy as np
 
 from hybrid.cli import main as ravg
-from hybrid.exr import write_layers
+from hybrid.files.exr import write_layers
 
 FRAMES = 6
 NOBODY = 65534
@@ -253,7 +253,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", default="pseudoref --preset balanced")
+    parser.add_argument("--command", default="pseudoref --preset standard")
     parser.add_argument("--json", type=Path, help="write the result there too")
     options = parser.parse_args(argv)
     cv2.setNumThreads(0)

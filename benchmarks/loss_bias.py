@@ -22,7 +22,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid.frames import open_shot
+from hybrid.files.frames import open_shot
 from network.inputs import window_exposure
 from network.losses import ImageLoss, l1, relmse, smape
 from network.perceptual import Perceptual, load_vgg19

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid.frames import open_shot
+from hybrid.files.frames import open_shot
 from nlm.average import replace_nonfinite
 
 BRIGHTEST = 1e-3  # part of the pixels

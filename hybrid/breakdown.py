@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.frames import Shot, open_shot, output_path
-from hybrid.pictures import encode_srgb, write_png
-from hybrid.transfer import measure_exposure
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.files.frames import Shot, open_shot, output_path
+from hybrid.files.pictures import encode_srgb, write_png
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]

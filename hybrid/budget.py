@@ -8,10 +8,10 @@ from collections.abc import Callable, Collection, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 
-from hybrid.estimates import MODE_OF, choose_estimate
-from hybrid.frames import Frame, Shot
-from hybrid.pipeline import Estimator
-from hybrid.pseudo_reference import Aligner
+from hybrid.alignment.align import Aligner
+from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
+from hybrid.files.frames import Frame, Shot
+from hybrid.pipeline import DenoiseWindow
 
 # Pixels on a side of the part that is measured: large enough that threads have work, small enough for seconds.
 SIDE = 512
@@ -49,7 +49,7 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot, effects: Collection[str], estimate: str, load: Callable[[str], tuple[Estimator, int]]
+    shot: Shot, stages: Collection[str], estimate: str, load: Callable[[str], tuple[DenoiseWindow, int]]
 ) -> Iterator[Measured]:
     """Measure the presets on the middle of the shot, the most accurate first.
 
@@ -57,7 +57,7 @@ def measure_presets(
     ----------
     shot : Shot
         Its middle frames are read.
-    effects : collection of str
+    stages : collection of str
         The plan's.
     estimate : str
         As for `hybrid.estimates.choose_estimate`.
@@ -86,8 +86,8 @@ def measure_presets(
         denoise, radius = load(preset)
         source = choose_estimate(estimate, part, mode=MODE_OF[preset])
         # A sequence's pictures are whole; what is measured is a part.
-        given = (lambda frame: frame.color) if source.name == "sequence" else source.estimate
-        aligner = Aligner(part, effects, radius=radius, estimate=given)
+        given = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
+        aligner = Aligner(part, stages, radius=radius, estimates=given)
         for number in numbers:
             start = time.perf_counter()
             denoise(aligner.align(number))

@@ -7,7 +7,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,12 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.frames import Frame, Shot, open_shot, output_path
-from hybrid.oidn import denoise_oidn
-from hybrid.pseudo_reference import FINAL, CleanGuides, Estimate, Preset
+from hybrid.alignment.align import Aligner, Estimates
+from hybrid.files.frames import Frame, Shot, open_shot, output_path
+from hybrid.oidn import HOLDS, denoise_oidn
+from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
+
+# Frames on each side that guides are prefiltered with; two on each side gain less than 0.01 dB.
+GUIDE_RADIUS = 1
 
 OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn": {"quality": "high"},
@@ -33,6 +37,100 @@ MODE_OF = {"fast": "oidn-fast", "balanced": "oidn", "quality": "oidn-clean"}
 
 
 @dataclass(frozen=True)
+class OfFrames:
+    """Estimates that are a function of the frame alone.
+
+    Attributes
+    ----------
+    function : callable
+        From a frame to its denoised radiance (H, W, 3), or None where it has none.
+    holds : int
+        Bytes that it takes for itself.
+    """
+
+    function: Callable[[Frame], Array | None]
+    holds: int = 0
+    from_noisy = False
+
+    def reach(self, radius: int, stages: Collection[str]) -> int:
+        """See `hybrid.alignment.align.Estimates`."""
+        return radius
+
+    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
+        """See `hybrid.alignment.align.Estimates`."""
+
+        def seen(frame: Frame) -> None:
+            with aligner.timings.stage("estimate"):
+                aligner.estimates[frame.number] = _checked(self.function(frame), frame)
+
+        aligner.load(numbers, seen)
+
+
+@dataclass(frozen=True)
+class OfCleanGuides:
+    """Estimates by a denoiser that can rely on its guides, which are prefiltered for it where they have noise.
+
+    Attributes
+    ----------
+    function : callable
+        From a frame (number, color, albedo and normal alone, all finite) to its denoised radiance (H, W, 3).
+    holds : int
+        Bytes that it takes for itself.
+    """
+
+    function: Callable[[Frame], Array]
+    holds: int = 0
+    from_noisy = False
+
+    def reach(self, radius: int, stages: Collection[str]) -> int:
+        """See `hybrid.alignment.align.Estimates`."""
+        return radius + self._guide_radius(stages)
+
+    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
+        """See `hybrid.alignment.align.Estimates`."""
+        ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
+        radius = self._guide_radius(aligner.stages)
+        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, radius))}))
+        for n in ahead:
+            frame = aligner.frame(n)
+            if frame is None:
+                continue
+            guides = aligner.clean_guides(n, radius) if radius else (frame.albedo, frame.normal)
+            alone = Frame(n, frame.radiance, *guides)
+            with aligner.timings.stage("estimate"):
+                aligner.estimates[n] = _checked(self.function(alone), alone)
+
+    def _guide_radius(self, stages: Collection[str]) -> int:
+        return GUIDE_RADIUS if "prefilter" in stages else 0
+
+
+@dataclass(frozen=True)
+class OfWindows:
+    """Our own estimates, each made from the window of noisy frames around it; a window of them reaches twice as far.
+
+    Attributes
+    ----------
+    preset : ClassicalPreset
+        How much work to put in.
+    """
+
+    preset: ClassicalPreset
+    holds = 0
+    from_noisy = True
+
+    def reach(self, radius: int, stages: Collection[str]) -> int:
+        """See `hybrid.alignment.align.Estimates`."""
+        return 2 * radius
+
+    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
+        """See `hybrid.alignment.align.Estimates`."""
+        ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
+        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, aligner.radius))}))
+        for n in ahead:
+            aligner.estimates[n] = filter_window(aligner.align_noisy(n), self.preset, timings=aligner.timings)
+
+
+@dataclass(frozen=True)
 class EstimateSource:
     """Where the estimates of a shot come from.
 
@@ -40,8 +138,8 @@ class EstimateSource:
     ----------
     name : str
         What was taken; written to the header of the output.
-    estimate : Estimate
-        What an `Aligner` takes: a function, a preset of our own, or None for none.
+    estimates : Estimates or None
+        What an `Aligner` takes; None for none.
     reason : str
         Why this one.
     files : Shot or None
@@ -49,13 +147,13 @@ class EstimateSource:
     """
 
     name: str
-    estimate: Estimate
+    estimates: Estimates | None
     reason: str
     files: Shot | None = None
 
 
 def choose_estimate(
-    spec: str, shot: Shot, *, own: Preset = FINAL, kept: str | None = None, mode: str = "oidn-clean"
+    spec: str, shot: Shot, *, own: ClassicalPreset = FINAL, kept: str | None = None, mode: str = "oidn-clean"
 ) -> EstimateSource:
     """Find the estimates that are asked for.
 
@@ -68,7 +166,7 @@ def choose_estimate(
         finished sequence of the same frames.
     shot : Shot
         The noisy shot.
-    own : Preset
+    own : ClassicalPreset
         Of our own estimate.
     mode : str
         Of OIDN, for "auto".
@@ -91,17 +189,17 @@ def choose_estimate(
     return source
 
 
-def _choose(spec: str, shot: Shot, own: Preset, kept: str | None, mode: str) -> EstimateSource:
+def _choose(spec: str, shot: Shot, own: ClassicalPreset, kept: str | None, mode: str) -> EstimateSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
-            return EstimateSource("file", _from_file, "the file holds a denoised picture")
+            return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if _has_oidn():
             return EstimateSource(mode, _oidn(mode, shot, kept), "OIDN is installed")
-        return EstimateSource("nlm", own, "no denoised picture in the file, and pyoidn is not installed")
+        return EstimateSource("nlm", OfWindows(own), "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
     if spec == "nlm":
-        return EstimateSource("nlm", own, "asked for")
+        return EstimateSource("nlm", OfWindows(own), "asked for")
     if spec in OIDN_MODES:
         if not _has_oidn():
             raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
@@ -110,19 +208,28 @@ def _choose(spec: str, shot: Shot, own: Preset, kept: str | None, mode: str) -> 
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
-    return EstimateSource("sequence", partial(_read_sequence, sequence), "asked for", sequence)
+    return EstimateSource("sequence", OfFrames(partial(_read_sequence, sequence)), "asked for", sequence)
 
 
 def _has_oidn() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
-def _oidn(mode: str, shot: Shot, kept: str | None) -> Estimate:
+def _oidn(mode: str, shot: Shot, kept: str | None) -> Estimates:
     run: Callable[[Frame], Array] = partial(estimate_oidn, **OIDN_MODES[mode])
     if kept is not None:
         output_path(kept, shot, shot.numbers[0], beside=True)  # refuses one name for several frames before any is made
         run = partial(_run_or_read, run=run, shot=shot, kept=kept)
-    return CleanGuides(run) if OIDN_MODES[mode].get("clean") else run
+    return OfCleanGuides(run, HOLDS) if OIDN_MODES[mode].get("clean") else OfFrames(run, HOLDS)
+
+
+def _checked(found: Array | None, frame: Frame) -> Array | None:
+    """An estimate that fits its frame and is finite."""
+    if found is None:
+        return None
+    if found.shape != frame.color.shape:
+        raise ValueError(f"the estimate of frame {frame.number} has shape {found.shape}, expected {frame.color.shape}")
+    return np.maximum(replace_nonfinite(found)[0], 0)
 
 
 def _from_file(frame: Frame) -> Array | None:

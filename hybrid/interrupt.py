@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from hybrid.files import remove_unfinished
+from hybrid.files.replace import remove_unfinished
 
 INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
 # How long Python is given to come back from compiled code and to unwind by itself, seconds.

@@ -10,16 +10,14 @@ import ctypes
 import re
 import sys
 
-from hybrid.frames import Shot
+from hybrid.alignment.align import MARGIN, Estimates
+from hybrid.files.frames import Shot
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import MARGIN, CleanGuides, Estimate, frames_needed
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
 # What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
 BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
-# What OIDN takes for itself, if the estimates are its own.
-OIDN = 1400 * 2**20
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
 SHARE = 0.92
 # Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process.
@@ -56,7 +54,7 @@ def parse_size(words: str) -> int:
 
 
 def plan_rows(
-    limit: int, shot: Shot, plan: Plan, estimate: Estimate = None, *, radius: int = 2, neural: bool
+    limit: int, shot: Shot, plan: Plan, estimates: Estimates | None = None, *, radius: int = 2, neural: bool
 ) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
 
@@ -68,7 +66,7 @@ def plan_rows(
         Its headers are read.
     plan : Plan
         Which stages run.
-    estimate : function, CleanGuides or Preset, optional
+    estimates : Estimates, optional
         Where the estimates of single frames come from.
     radius : int
         Frames on each side of the centre.
@@ -91,9 +89,9 @@ def plan_rows(
     is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
     """
     height, width = shot.shape
-    kept, passing, worked = _planes(shot, plan, estimate, radius, neural)
+    kept, passing, worked = _planes(shot, plan, estimates, radius, neural)
     plane = 4 * height * width
-    base = (BASE_NEURAL if neural else BASE) + (OIDN if callable(estimate) or isinstance(estimate, CleanGuides) else 0)
+    base = (BASE_NEURAL if neural else BASE) + (0 if estimates is None else estimates.holds)
 
     def needed(rows: int) -> int:
         return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))
@@ -112,26 +110,28 @@ def plan_rows(
     return rows
 
 
-def _planes(shot: Shot, plan: Plan, estimate: Estimate, radius: int, neural: bool) -> tuple[float, float, float]:
+def _planes(
+    shot: Shot, plan: Plan, estimates: Estimates | None, radius: int, neural: bool
+) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
     aovs = sum(len(header.layer(name).channels) for name in shot.aovs)
-    if layers.alpha is not None and "alpha" in plan.effects:
+    if layers.alpha is not None and "alpha" in plan.stages:
         aovs += 1
     guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
-    light = 3 if "gate" in plan.effects or estimate is not None else 0
+    light = 3 if "gate" in plan.stages or estimates is not None else 0
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     frame = 3 + light + guides + motion + (layers.depth is not None) + 3 * (layers.variance is not None) + aovs + 0.25
-    reach = frames_needed(estimate, radius, plan.effects)
+    reach = radius if estimates is None else estimates.reach(radius, plan.stages)
     frames = min(2 * reach + 1, shot.count)
     kept = frames * frame + 3 + aovs  # and the result
-    if "warp" in plan.effects:
+    if "warp" in plan.stages:
         kept += 2.25 * 4 * max(radius - 1, 0)
-        if plan.effects & {"refine", "dense-flow"} or layers.motion_convention == "backward":
+        if plan.stages & {"refine", "dense-flow"} or layers.motion_convention == "backward":
             kept += 2.25 * 2 * (frames - 1)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = len(header.channel_names) + frame + 14
-    if plan.effects & {"refine", "dense-flow"}:
+    if plan.stages & {"refine", "dense-flow"}:
         passing = max(passing, 45)
     window = (2 * radius + 1) * (3 + light + guides + aovs + 1)
     worked = 2.0 * window + 40

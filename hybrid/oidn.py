@@ -15,6 +15,8 @@ Quality = Literal["high", "balanced", "fast"]
 # About what OIDN may take for itself; above about 1000×1000 pixels it works in tiles, which overlap. Always the same,
 # or its pictures would depend on the memory that somebody happens to allow.
 MEMORY_MB = 1024
+# Bytes that it then takes, its code and buffers included, by measurement.
+HOLDS = 1400 * 2**20
 
 
 def denoise_oidn(

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.exr import ExrError, read_exr
-from hybrid.files import remove_leftovers
-from hybrid.frames import Shot, open_shot, output_path
-from hybrid.pictures import encode_srgb, write_png
+from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.frames import Shot, open_shot, output_path
+from hybrid.files.pictures import encode_srgb, write_png
+from hybrid.files.replace import remove_leftovers
 from hybrid.plan import Plan
-from hybrid.pseudo_reference import AlignedWindow, Aligner, Estimate, frames_needed
 from hybrid.timing import Timings
-from hybrid.transfer import measure_exposure
 from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
@@ -41,7 +41,7 @@ class Denoised:
     extra: Mapping[str, Array] = field(default_factory=dict)
 
 
-Estimator = Callable[[AlignedWindow], Denoised]
+DenoiseWindow = Callable[[AlignedWindow], Denoised]
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class Finished:
 def denoise_shot(
     shot: Shot,
     output: str | Path,
-    estimator: Estimator,
+    denoise: DenoiseWindow,
     plan: Plan,
     *,
     radius: int = 2,
-    estimate: Estimate = None,
+    estimates: Estimates | None = None,
     attributes: Mapping[str, str] | None = None,
     rows: int | None = None,
     resume: bool = False,
@@ -78,13 +78,13 @@ def denoise_shot(
         What to denoise.
     output : str or Path
         Where to write: a pattern with a placeholder for the frame number, or a folder.
-    estimator : callable
+    denoise : callable
         From `AlignedWindow` to `Denoised`.
     plan : Plan
         Which stages to run.
     radius : int
         Frames on each side of the centre.
-    estimate : function, CleanGuides or Preset, optional
+    estimates : Estimates, optional
         Where the estimates of single frames come from (`hybrid.estimates`).
     attributes : mapping of str to str, optional
         Written to the header of each file.
@@ -107,21 +107,21 @@ def denoise_shot(
 
     Notes
     -----
-    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace_file`). What earlier
-    processes have left half written is removed.
+    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). What
+    earlier processes have left half written is removed.
     """
     timings = timings or Timings()
-    aligner = Aligner(shot, plan.effects, radius=radius, estimate=estimate, timings=timings)
+    aligner = Aligner(shot, plan.stages, radius=radius, estimates=estimates, timings=timings)
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    reach = frames_needed(estimate, radius, plan.effects)
+    reach = radius if estimates is None else estimates.reach(radius, plan.stages)
     for number, path in paths.items():
         if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
             yield Finished(number, path, 0, 0, 0, 0, resumed=True)
             continue
-        denoised, repaired, outliers = _denoise_frame(aligner, number, estimator, rows or shot.shape[0])
+        denoised, repaired, outliers = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
         with timings.stage("write"):
             images = {"color": denoised.color, **denoised.aovs}
             clamped = shot.write(path, number, images, denoised.extra, attributes)
@@ -130,7 +130,7 @@ def denoise_shot(
         yield finished
 
 
-def _denoise_frame(aligner: Aligner, number: int, estimator: Estimator, rows: int) -> tuple[Denoised, int, int]:
+def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, int, int]:
     """Denoise a frame, so many rows at a time; count the pixels that were repaired, and rejected as fireflies."""
     height, width = aligner.shot.shape
     whole: dict[tuple[str, str], Array] = {}
@@ -138,7 +138,7 @@ def _denoise_frame(aligner: Aligner, number: int, estimator: Estimator, rows: in
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
         aligned = aligner.align(number, band)
-        part = estimator(aligned)
+        part = denoise(aligned)
         outliers, repaired = outliers + aligned.outliers, aligned.repaired
         named = {("color", ""): part.color}
         named |= {("aovs", name): layer for name, layer in part.aovs.items()}

@@ -1,6 +1,6 @@
 """The plan: what a shot calls for, measured before anything runs.
 
-No effect is paid for that the shot does not have, and nothing is skipped silently: each decision carries the
+No stage is paid for that the shot does not have, and nothing is skipped silently: each decision carries the
 figure that was measured, the threshold it was held against, and the reason in words.
 """
 
@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.warp import warp
-from hybrid.frames import Shot
-from hybrid.pseudo_reference import Aligner, PreparedFrame, prepare, rendered_flow
-from hybrid.transfer import compress, measure_exposure
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
+from hybrid.alignment.transfer import compress, measure_exposure
+from hybrid.files.frames import Shot
 from nlm.average import reject_outliers
 from nlm.gate import color_gate
 
 Array = NDArray[np.float32]
 
-EFFECTS = {
+STAGES = {
     "demodulate": "filter light instead of light times texture",
     "outliers": "reject fireflies",
     "warp": "move side frames along the motion",
@@ -63,8 +64,8 @@ class Decision:
 
     Attributes
     ----------
-    effect : str
-        A key of `EFFECTS`.
+    stage : str
+        A key of `STAGES`.
     on : bool
         Whether the stage runs.
     figure : float or None
@@ -77,7 +78,7 @@ class Decision:
         True where the user, not the figure, decided.
     """
 
-    effect: str
+    stage: str
     on: bool
     figure: float | None
     threshold: float
@@ -92,9 +93,9 @@ class Plan:
     decisions: tuple[Decision, ...]
 
     @property
-    def effects(self) -> frozenset[str]:
+    def stages(self) -> frozenset[str]:
         """Names of the stages that run."""
-        return frozenset(decision.effect for decision in self.decisions if decision.on)
+        return frozenset(decision.stage for decision in self.decisions if decision.on)
 
     def force(self, on: Collection[str] = (), off: Collection[str] = ()) -> Plan:
         """Switch stages on or off whatever was measured.
@@ -102,17 +103,17 @@ class Plan:
         Raises
         ------
         ValueError
-            An effect that does not exist, or one that is to be both on and off.
+            An stage that does not exist, or one that is to be both on and off.
         """
         for name in [*on, *off]:
-            if name not in EFFECTS:
-                raise ValueError(f"effect is {name!r}, expected one of {', '.join(EFFECTS)}")
+            if name not in STAGES:
+                raise ValueError(f"stage is {name!r}, expected one of {', '.join(STAGES)}")
         if both := set(on) & set(off):
-            raise ValueError(f"effect {sorted(both)[0]!r} is both forced on and forced off")
+            raise ValueError(f"stage {sorted(both)[0]!r} is both forced on and forced off")
         return Plan(
             tuple(
-                replace(d, on=d.effect in on, forced=True, reason=f"forced; measured: {d.reason}")
-                if d.effect in on or d.effect in off
+                replace(d, on=d.stage in on, forced=True, reason=f"forced; measured: {d.reason}")
+                if d.stage in on or d.stage in off
                 else d
                 for d in self.decisions
             )
@@ -154,7 +155,7 @@ def plan_shot(shot: Shot) -> Plan:
     Returns
     -------
     Plan
-        One decision for each of `EFFECTS`.
+        One decision for each of `STAGES`.
     """
     figures = [_measure(pair) for pair in _sample_pairs(shot)]
     single = not figures
@@ -240,8 +241,8 @@ def _measure(pair: _Pair) -> _Figures:
     )
 
 
-def _decide(effect: str, figure: float, threshold: float, words: str) -> Decision:
-    return Decision(effect, figure > threshold, figure, threshold, words.format(figure))
+def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision:
+    return Decision(stage, figure > threshold, figure, threshold, words.format(figure))
 
 
 def _decide_demodulate(spread: float | None) -> Decision:

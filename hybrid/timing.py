@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from hybrid.files import replace_file
+from hybrid.files.replace import replace_file
 
 
 @dataclass

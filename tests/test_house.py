@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,31 @@ def test_packages_of_arrays_import_none_of_ours(package):
 def test_only_neural_imports_torch_and_the_network():
     files = [path for package in ("flow", "nlm", "hybrid") for path in (ROOT / package).rglob("*.py")]
     assert len(files) > 10
-    assert [path.name for path in files if imports(path) & {"torch", "network", "safetensors"}] == ["neural.py"]
+    learned = {path for path in files if imports(path) & {"torch", "network", "safetensors"}}
+    assert learned
+    assert {path.parent for path in learned} == {ROOT / "hybrid" / "neural"}
+
+
+def modules_of_hybrid() -> dict[str, set[str]]:
+    """Modules of `hybrid`, and which of them each imports, wherever in it."""
+    paths = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in (ROOT / "hybrid").rglob("*.py")}
+    paths = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+    graph: dict[str, set[str]] = {}
+    for name, path in paths.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+        graph[name] = {other for other in found if other in paths and other != name}
+    return graph
+
+
+def test_no_module_imports_in_a_circle():
+    graph = modules_of_hybrid()
+    assert graph["hybrid.cli"]
+    tuple(TopologicalSorter(graph).static_order())  # raises where there is a circle
 
 
 def test_the_core_imports_no_peer_at_start():

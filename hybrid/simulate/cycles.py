@@ -1,4 +1,4 @@
-"""Render a shot with Cycles: the process that does the work, started by `hybrid.simulate.command`.
+"""Render a shot with Cycles: the process that does the work, started by `hybrid.simulate.run`.
 
 Blender keeps state between scenes and can fall over, so each shot is rendered in a process of its own:
 `python -m hybrid.simulate.cycles JOB`, JOB being JSON. It answers in lines of JSON on standard output: first

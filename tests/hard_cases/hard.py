@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from conftest import Scene
 
-from hybrid.frames import Frame
-from hybrid.pseudo_reference import PRESETS, AlignedWindow, Aligner, estimate
+from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.files.frames import Frame
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
+from tests.scenes import Scene
 
-EFFECTS = frozenset({"demodulate", "outliers", "warp", "gate", "prefilter"})
+STAGES = frozenset({"demodulate", "outliers", "warp", "gate", "prefilter"})
 SCENE = Scene(frames=5)
 MIDDLE = 2
 # Pixels around one whose value depends on it: search of the non-local means (5 in "final"), and the guided filter's box
@@ -83,17 +84,15 @@ def spoil(one: Frame, **layers: np.ndarray | None) -> Frame:
 
 
 def align(
-    frames: Iterable[Frame], number: int = MIDDLE, effects: Collection[str] = EFFECTS, **options: object
+    frames: Iterable[Frame], number: int = MIDDLE, stages: Collection[str] = STAGES, **options: object
 ) -> AlignedWindow:
-    return Aligner(Reel(frames), effects, **options).align(number)  # type: ignore[arg-type]
+    return Aligner(Reel(frames), stages, **options).align(number)  # type: ignore[arg-type]
 
 
-def denoise(
-    frames: Iterable[Frame], preset: str = "balanced", number: int = MIDDLE, effects: Collection[str] = EFFECTS
-):
+def denoise(frames: Iterable[Frame], preset: str = "standard", number: int = MIDDLE, stages: Collection[str] = STAGES):
     """The aligned window, and the picture made of it."""
-    window = align(frames, number, effects)
-    return window, estimate(window, PRESETS[preset])
+    window = align(frames, number, stages)
+    return window, filter_window(window, CLASSICAL_PRESETS[preset])
 
 
 def itself(one: Frame) -> np.ndarray:

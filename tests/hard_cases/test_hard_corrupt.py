@@ -2,12 +2,26 @@
 
 import numpy as np
 import pytest
-from conftest import Scene
-from hard import EFFECTS, MIDDLE, SCENE, SUPPORT, align, denoise, frame, itself, shot, spoil, truth, within_range
 
 from hybrid.cli import main
-from hybrid.metrics import psnr
-from hybrid.pseudo_reference import BALANCED, FINAL, estimate
+from hybrid.comparison.metrics import psnr
+from hybrid.estimates import OfFrames
+from hybrid.pseudo_reference import FINAL, STANDARD, filter_window
+from tests.hard_cases.hard import (
+    MIDDLE,
+    SCENE,
+    STAGES,
+    SUPPORT,
+    align,
+    denoise,
+    frame,
+    itself,
+    shot,
+    spoil,
+    truth,
+    within_range,
+)
+from tests.scenes import Scene
 
 VALUES = {"nan": np.nan, "inf": np.inf, "minus-inf": -np.inf}
 PLACES = {
@@ -55,14 +69,14 @@ def test_the_picture_is_finite_and_in_range(layer, value, record_property):
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
 def test_the_network_is_finite(value, precision, record_property):
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
     denoiser = Denoiser(shipped_weights("fast"), precision=precision)
     frames = with_variance()
     for place in PLACES.values():
         for which in WHICH.values():
             for layer in ("color", "together"):
-                image = denoiser(align(corrupted(frames, layer, value, place, which), estimate=itself)).color
+                image = denoiser(align(corrupted(frames, layer, value, place, which), estimates=OfFrames(itself))).color
                 assert np.isfinite(image).all()
                 assert (image >= 0).all()
     record_property("cases", 2 * len(PLACES) * len(WHICH))
@@ -117,12 +131,12 @@ def test_damage_stays_within_the_support(layer, value, record_property):
     record_property("cases", 2)
 
 
-@pytest.mark.parametrize("preset", [BALANCED, FINAL])
+@pytest.mark.parametrize("preset", [STANDARD, FINAL])
 def test_a_lost_frame_is_made_of_its_neighbours(preset):
     """It came out black: the filter compared the neighbours with the zeros that had been filled in."""
     frames = shot()
     frames[MIDDLE] = spoil(frames[MIDDLE], color=np.full_like(frames[MIDDLE].color, np.nan))
-    image = estimate(align(frames), preset)
+    image = filter_window(align(frames), preset)
     inner = slice(4, -4), slice(6, -6)  # where the neighbours see the same
     assert psnr(image[inner], truth()[inner]) > psnr(frame(MIDDLE).color[inner], truth()[inner]) + 3
 
@@ -149,5 +163,5 @@ def test_infinities_of_both_signs_raise_no_warning(recwarn):
     """Their sum is NaN, which numpy remarked on."""
     frames = corrupted(shot(), "color", np.inf, PLACES["pixel"], (MIDDLE,))
     frames[MIDDLE].color[3, 3] = -np.inf
-    denoise(frames, effects=EFFECTS)
+    denoise(frames, stages=STAGES)
     assert not recwarn.list

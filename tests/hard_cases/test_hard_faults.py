@@ -13,17 +13,19 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from conftest import Scene
-from test_hard_files import ROOT, run_alone
 
+from hybrid.alignment.align import Aligner
 from hybrid.cli import main
-from hybrid.exr import read_exr
-from hybrid.files import remove_leftovers, remove_unfinished, replace_file, temporary_folder
-from hybrid.frames import open_shot
+from hybrid.estimates import OfWindows
+from hybrid.files.exr import read_exr
+from hybrid.files.frames import open_shot
+from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.interrupt import interruptible
 from hybrid.memory import parse_size, plan_rows
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import PRESETS, Aligner, estimate
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
+from tests.hard_cases.test_hard_files import ROOT, run_alone
+from tests.scenes import Scene
 
 
 def test_kills_at_random_moments_lose_nothing(record_property):
@@ -70,7 +72,7 @@ def test_resume_makes_only_what_is_missing_damaged_or_outdated(tmp_path, capsys)
     assert {path.name: path.read_bytes() for path in out.glob("*.exr")} == whole
     # other settings, other pixels: the wall moves, so the plan has what is forced off here
     assert len(made_again("--no-effects", "warp")) == 3
-    assert len(made_again("--preset", "balanced")) == 3
+    assert len(made_again("--preset", "standard")) == 3
     assert len(made_again()) == 3
     # a frame that was rendered again changes itself and its neighbours
     later = time.time() + 5
@@ -95,7 +97,7 @@ def test_resume_of_the_network_gives_the_same_bytes(tmp_path):
 
 BUSY = """
 import hashlib, pathlib, sys
-from hybrid.files import replace_file
+from hybrid.files.replace import replace_file
 from hybrid.interrupt import interruptible
 try:
     with interruptible(lambda: print("2 of 5", flush=True)), replace_file(pathlib.Path(sys.argv[1])) as temporary:
@@ -138,7 +140,7 @@ def test_what_a_killed_process_has_left_is_removed_and_nothing_else(tmp_path):
 
 LONG = """
 import pathlib, sys, time
-from hybrid.files import temporary_folder
+from hybrid.files.replace import temporary_folder
 with temporary_folder(pathlib.Path(sys.argv[1])) as folder:
     (folder / "shot.0001.exr").touch()
     print("begun", flush=True)
@@ -194,22 +196,20 @@ def tall(tmp_path_factory):
     return TALL.write(tmp_path_factory.mktemp("tall"))
 
 
-@pytest.mark.parametrize(
-    "effects", [{"demodulate", "outliers", "warp", "gate", "prefilter"}, {"warp", "refine"}, set()]
-)
-def test_a_frame_made_in_parts_is_the_frame(tall, effects, record_property):
+@pytest.mark.parametrize("stages", [{"demodulate", "outliers", "warp", "gate", "prefilter"}, {"warp", "refine"}, set()])
+def test_a_frame_made_in_parts_is_the_frame(tall, stages, record_property):
     """The promise is 1e-5; the classical chain keeps every bit."""
     shot, number = open_shot(tall), TALL.first + 2
-    for preset in PRESETS.values():
-        whole = estimate(Aligner(shot, effects).align(number), preset)
+    for preset in CLASSICAL_PRESETS.values():
+        whole = filter_window(Aligner(shot, stages).align(number), preset)
         for rows in (64, 128, 320):
-            aligner = Aligner(shot, effects)
+            aligner = Aligner(shot, stages)
             parts = []
             for top in range(0, TALL.height, rows):
                 aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
-                parts.append(estimate(aligned, preset)[aligned.inner])
+                parts.append(filter_window(aligned, preset)[aligned.inner])
             np.testing.assert_array_equal(np.concatenate(parts), whole)
-    record_property("cases", 3 * len(PRESETS))
+    record_property("cases", 3 * len(CLASSICAL_PRESETS))
 
 
 def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
@@ -229,13 +229,13 @@ def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
 @pytest.mark.parametrize("rows", [64, 192])
 def test_the_network_in_parts_is_the_network(tall, rows):
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
     shot, number = open_shot(tall), TALL.first + 2
     denoiser = Denoiser(shipped_weights("fast"), precision="float32")
-    effects = {"demodulate", "outliers", "warp"}
-    whole = denoiser(Aligner(shot, effects, estimate=PRESETS["draft"]).align(number)).color
-    aligner = Aligner(shot, effects, estimate=PRESETS["draft"])
+    stages = {"demodulate", "outliers", "warp"}
+    whole = denoiser(Aligner(shot, stages, estimates=OfWindows(CLASSICAL_PRESETS["draft"])).align(number)).color
+    aligner = Aligner(shot, stages, estimates=OfWindows(CLASSICAL_PRESETS["draft"]))
     parts = []
     for top in range(0, TALL.height, rows):
         aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
@@ -274,6 +274,7 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
 
 FAULTS = """
 import resource
+from hybrid.estimates import OfWindows
 from hybrid.memory import keep_freed_memory
 
 def page_faults() -> int:

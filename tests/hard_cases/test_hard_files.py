@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from conftest import Scene
 
 import hybrid
 from hybrid.cli import main
-from hybrid.exr import read_exr, write_exr, write_layers
-from hybrid.frames import open_shot, output_path
+from hybrid.files.exr import read_exr, write_exr, write_layers
+from hybrid.files.frames import open_shot, output_path
+from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
 

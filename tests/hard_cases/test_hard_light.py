@@ -3,11 +3,24 @@
 import cv2
 import numpy as np
 import pytest
-from conftest import Scene
-from hard import EFFECTS, MIDDLE, REACH, align, constant, denoise, frame, shot, spoil, truth, within_range
 
-from hybrid.metrics import psnr
-from hybrid.pseudo_reference import BALANCED, PRESETS
+from hybrid.comparison.metrics import psnr
+from hybrid.estimates import OfWindows
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
+from tests.hard_cases.hard import (
+    MIDDLE,
+    REACH,
+    STAGES,
+    align,
+    constant,
+    denoise,
+    frame,
+    shot,
+    spoil,
+    truth,
+    within_range,
+)
+from tests.scenes import Scene
 
 SCALES = [1e-6, 1e-3, 1e3, 1e6]
 
@@ -15,12 +28,12 @@ SCALES = [1e-6, 1e-3, 1e3, 1e6]
 @pytest.fixture(scope="module")
 def network():
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
     return {p: Denoiser(shipped_weights("fast"), precision=p) for p in ("float32", "bfloat16")}
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", CLASSICAL_PRESETS)
 def test_the_estimate_scales_with_the_light(preset, record_property):
     _, plain = denoise(shot(), preset)
     for scale in SCALES:
@@ -32,9 +45,9 @@ def test_the_estimate_scales_with_the_light(preset, record_property):
 
 @pytest.mark.neural
 def test_the_network_scales_with_the_light(network, record_property):
-    plain = network["float32"](align(shot(), estimate=BALANCED)).color
+    plain = network["float32"](align(shot(), estimates=OfWindows(STANDARD))).color
     for scale in SCALES:
-        image = network["float32"](align(shot(scale=scale), estimate=BALANCED)).color
+        image = network["float32"](align(shot(scale=scale), estimates=OfWindows(STANDARD))).color
         assert np.abs(image / np.float32(scale) - plain).max() < 1e-3 * plain.mean()
     record_property("cases", len(SCALES))
 
@@ -45,7 +58,7 @@ def test_the_network_scales_with_the_light(network, record_property):
 def test_next_to_no_light_is_finite(network, precision, scale):
     """The reciprocal of a denormal exposure was infinite, and the picture NaN."""
     frames = shot(scale=scale)
-    for image in (denoise(frames)[1], network[precision](align(frames, estimate=BALANCED)).color):
+    for image in (denoise(frames)[1], network[precision](align(frames, estimates=OfWindows(STANDARD))).color):
         assert np.isfinite(image).all()
         assert (image >= 0).all()
         assert image.max() <= 10 * max(f.color.max() for f in frames)
@@ -63,7 +76,7 @@ def test_a_spark_in_next_to_no_light_is_finite():
     assert within_range(window, image)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", CLASSICAL_PRESETS)
 @pytest.mark.parametrize("value", [1e-6, 0.7, 1e4])
 def test_a_constant_picture_is_kept(preset, value):
     _, image = denoise(constant(value), preset)
@@ -73,7 +86,7 @@ def test_a_constant_picture_is_kept(preset, value):
 @pytest.mark.neural
 def test_the_network_keeps_a_constant_picture(network):
     for precision, model in network.items():
-        image = model(align(constant(0.7), estimate=BALANCED)).color
+        image = model(align(constant(0.7), estimates=OfWindows(STANDARD))).color
         # Kernels are float32 and sum to one in either precision; 125 taps of rounding.
         np.testing.assert_allclose(image, 0.7, rtol=1e-6 if precision == "float32" else 1e-5)
 
@@ -128,7 +141,7 @@ def burn(frames, value, size, which):
 @pytest.mark.parametrize("value", [6.5e4, 1e6])
 @pytest.mark.parametrize("which", [(MIDDLE,), (MIDDLE - 1,), (MIDDLE - 1, MIDDLE)], ids=["centre", "side", "both"])
 def test_a_firefly_leaves_neither_hole_nor_halo(value, which, record_property):
-    for preset in PRESETS:
+    for preset in CLASSICAL_PRESETS:
         plain = denoise(shot(), preset)[1]
         image = denoise(burn(shot(), value, 1, which), preset)[1]
         clean = truth()
@@ -142,7 +155,7 @@ def test_a_firefly_leaves_neither_hole_nor_halo(value, which, record_property):
             noise = 4 * 0.3 / np.sqrt(5 * ring.sum())
             error = abs(image[ring].mean() / clean[ring].mean() - 1)
             assert error < abs(plain[ring].mean() / clean[ring].mean() - 1) + noise
-    record_property("cases", 4 * len(PRESETS))
+    record_property("cases", 4 * len(CLASSICAL_PRESETS))
 
 
 def ring_error(image, clean, size, near, far):
@@ -157,25 +170,25 @@ def ring_error(image, clean, size, near, far):
 @pytest.mark.parametrize("which", [(MIDDLE,), (MIDDLE - 1,)], ids=["centre", "side"])
 def test_four_fireflies_together_leave_no_halo(value, which, record_property):
     """They passed for an object, and the non-local means left a thousand times the light three pixels away."""
-    for preset in PRESETS:
+    for preset in CLASSICAL_PRESETS:
         image = denoise(burn(shot(), value, 2, which), preset)[1]
         for near, far in ((0, 2), (2, 4), (4, 7)):
             error, noise = ring_error(image, truth(), 2, near, far)
             assert error < noise
-    record_property("cases", 3 * len(PRESETS))
+    record_property("cases", 3 * len(CLASSICAL_PRESETS))
 
 
 @pytest.mark.parametrize("value", [6.5e4, 1e6])
 def test_what_may_be_an_object_does_not_leak_beyond_the_reach(value, record_property):
     """Nine bright pixels, or four in two frames, stay; a little of them is smeared over the reach of the filters."""
-    for preset in PRESETS:
+    for preset in CLASSICAL_PRESETS:
         for size, which in ((3, (MIDDLE,)), (3, (MIDDLE - 1,)), (2, (MIDDLE, MIDDLE + 1))):
             window, image = denoise(burn(shot(), value, size, which), preset)
             assert np.isfinite(image).all()
             assert within_range(window, image)
             error, noise = ring_error(image, truth(), size, REACH, REACH + 3)
             assert error < noise
-    record_property("cases", 3 * len(PRESETS))
+    record_property("cases", 3 * len(CLASSICAL_PRESETS))
 
 
 @pytest.mark.neural
@@ -184,7 +197,7 @@ def test_the_network_survives_fireflies(network, precision, record_property):
     for value in (6.5e4, 1e6):
         for size in (1, 2, 3):
             frames = burn(shot(), value, size, (MIDDLE - 1, MIDDLE))
-            image = network[precision](align(frames, estimate=BALANCED)).color
+            image = network[precision](align(frames, estimates=OfWindows(STANDARD))).color
             assert np.isfinite(image).all()
             assert (image >= 0).all()
     record_property("cases", 6)
@@ -235,7 +248,7 @@ GUIDES = {
 
 
 @pytest.mark.parametrize("changes", GUIDES.values(), ids=GUIDES)
-@pytest.mark.parametrize("preset", ["draft", "balanced"])
+@pytest.mark.parametrize("preset", ["draft", "standard"])
 def test_guides_that_tell_nothing_do_no_harm(changes, preset):
     frames = [spoil(f, **{name: change(f) for name, change in changes.items()}) for f in shot()]
     window, image = denoise(frames, preset)
@@ -247,7 +260,7 @@ def test_guides_that_tell_nothing_do_no_harm(changes, preset):
 @pytest.mark.neural
 def test_alpha_of_nought_stays_nought(network):
     frames = [spoil(f, alpha=np.zeros(f.color.shape[:2], np.float32)) for f in shot()]
-    window = align(frames, effects=EFFECTS | {"alpha"}, estimate=BALANCED)
+    window = align(frames, stages=STAGES | {"alpha"}, estimates=OfWindows(STANDARD))
     done = network["float32"](window)
     assert (done.aovs["alpha"] == 0).all()
     assert np.isfinite(done.color).all()

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from hard import EFFECTS, SCENE, denoise, frame, shot, spoil, truth, within_range
 
-from hybrid.metrics import psnr
+from hybrid.comparison.metrics import psnr
+from tests.hard_cases.hard import SCENE, STAGES, denoise, frame, shot, spoil, truth, within_range
 
 SHAPE = (SCENE.height, SCENE.width, 4)
 
@@ -42,8 +42,8 @@ VECTORS = {
 @pytest.mark.parametrize("vectors", VECTORS.values(), ids=VECTORS)
 def test_wrong_vectors_cost_no_more_than_time(vectors, refine):
     frames = [spoil(f, motion=vectors(f)) for f in shot()]
-    effects = EFFECTS | {"refine"} if refine else EFFECTS
-    window, image = denoise(frames, effects=effects)
+    stages = STAGES | {"refine"} if refine else STAGES
+    window, image = denoise(frames, stages=stages)
     assert np.isfinite(window.color).all()
     assert ((window.confidence >= 0) & (window.confidence <= 1)).all()
     assert within_range(window, image)

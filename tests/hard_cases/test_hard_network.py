@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch")
 
-from hybrid import metrics  # noqa: E402
+from hybrid.comparison import metrics  # noqa: E402
 from hybrid.estimates import MODE_OF  # noqa: E402
-from hybrid.neural import shipped_weights  # noqa: E402
+from hybrid.neural.denoiser import shipped_weights  # noqa: E402
 from network import losses  # noqa: E402
 from network.blocks import ravg  # noqa: E402
 from network.checkpoint import load_model  # noqa: E402

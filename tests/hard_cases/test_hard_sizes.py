@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from hard import EFFECTS, Reel, align, constant, denoise, itself, spoil
 
 from flow.tvl1 import dense_flow, refine_flow
+from hybrid.estimates import OfFrames
 from hybrid.plan import plan_shot
-from hybrid.pseudo_reference import PRESETS
+from hybrid.pseudo_reference import CLASSICAL_PRESETS
+from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 
 SIZES = [(1, 1), (1, 2), (2, 1), (1, 17), (17, 1), (2, 3), (3, 3), (5, 5), (7, 11), (13, 31), (31, 13), (16, 16)]
 
@@ -23,24 +24,24 @@ def noisy(size, frames=5):
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_any_size_works(size, record_property):
     frames = noisy(size)
-    for effects in (EFFECTS, EFFECTS | {"refine"}, EFFECTS - {"warp"}):
-        for preset in PRESETS:
-            window, image = denoise(frames, preset, effects=effects)
+    for stages in (STAGES, STAGES | {"refine"}, STAGES - {"warp"}):
+        for preset in CLASSICAL_PRESETS:
+            window, image = denoise(frames, preset, stages=stages)
             assert image.shape == (*size, 3)
             assert np.isfinite(image).all()
             light = image / window.modulation
             assert window.color.min() * 0.9999 <= light.min()
             assert light.max() <= window.color.max() * 1.0001
-    record_property("cases", 3 * len(PRESETS))
+    record_property("cases", 3 * len(CLASSICAL_PRESETS))
 
 
 @pytest.mark.neural
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_the_network_takes_any_size(size):
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimate=itself)).color
+    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimates=OfFrames(itself))).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
 
@@ -55,7 +56,7 @@ def test_motion_is_looked_for_in_any_size(size):
 
 @pytest.mark.parametrize("size", [(3, 33_000), (33_000, 3)], ids=["wide", "tall"])
 def test_more_than_32767_pixels_on_a_side(size):
-    window, image = denoise(noisy(size, 3), number=1, effects=EFFECTS | {"refine"})
+    window, image = denoise(noisy(size, 3), number=1, stages=STAGES | {"refine"})
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
     assert (window.confidence[1:4, 1:-1, 1:-1] > 0).any()
@@ -64,9 +65,9 @@ def test_more_than_32767_pixels_on_a_side(size):
 @pytest.mark.neural
 def test_more_than_32767_pixels_through_the_network():
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, estimate=itself)).color
+    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, estimates=OfFrames(itself))).color
     assert image.shape == (3, 33_000, 3)
     assert np.isfinite(image).all()
 
@@ -83,9 +84,9 @@ def test_a_plan_is_made_for_any_size(size):
 def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
     """Relative to the mean. In bfloat16 features have 8 bits, and rounding depends on where a tile begins."""
     pytest.importorskip("torch")
-    from hybrid.neural import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-    window = align(noisy((150, 170)), estimate=itself)
+    window = align(noisy((150, 170)), estimates=OfFrames(itself))
     whole, *tiled = (
         Denoiser(shipped_weights("fast"), tile=tile, precision=precision)(window).color for tile in (256, 32, 64, 100)
     )

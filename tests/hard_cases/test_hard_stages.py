@@ -12,7 +12,7 @@ from flow.guide import estimate_noise, prefilter_guide
 from flow.motion import compose_flow, forward_backward_error, invert_flow, normalize_motion
 from flow.tvl1 import dense_flow, refine_flow, select_flow
 from flow.warp import warp
-from hybrid.transfer import compress, demodulate, expand, measure_exposure, remodulate
+from hybrid.alignment.transfer import compress, demodulate, expand, measure_exposure, remodulate
 from nlm import variance as variances
 from nlm.average import average, reject_outliers, replace_nonfinite, robust_average
 from nlm.gate import color_gate

@@ -7,14 +7,15 @@ import pickle
 from contextlib import suppress
 
 import pytest
-from conftest import Scene
+
+from tests.scenes import Scene
 
 torch = pytest.importorskip("torch")
 
 from safetensors.torch import save_file  # noqa: E402
 
 from hybrid.cli import main  # noqa: E402
-from hybrid.neural import shipped_weights  # noqa: E402
+from hybrid.neural.denoiser import shipped_weights  # noqa: E402
 from network.checkpoint import VERSION, describe, load_model, save_model  # noqa: E402
 from network.models import fast, paper, unet  # noqa: E402
 

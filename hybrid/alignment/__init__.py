@@ -1,0 +1,1 @@
+"""Frames made safe to filter, and windows of them aligned to their centre."""

@@ -1,0 +1,514 @@
+"""Windows of frames, aligned to their centre.
+
+`Aligner.align` is the hinge of the toolkit. It runs once per frame; the classical filters and the network
+both read the `AlignedWindow` that it returns, and nothing after it warps again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.confidence import estimate_confidence, mix_centre
+from flow.guide import prefilter_guide as prefilter_flow_guide
+from flow.motion import compose_flow, forward_backward_error
+from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.warp import warp
+from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
+from hybrid.alignment.transfer import measure_exposure, remodulate
+from hybrid.files.frames import Frame, Shot
+from hybrid.timing import Timings
+from nlm.average import average, reject_outliers
+from nlm.gate import color_gate
+from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Of estimates that agree in color, geometry can take away no more than all but this: outlines, whose albedo and normals
+# are mixed anew in each frame, flicker most. Worth 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB
+# at 6 to 10, where more (0.5) would be better yet.
+AGREEING = 0.3
+# With one seed for all frames a neighbour's noise is the centre's until the picture has moved so far, pixels: a
+# bilinear sample half a pixel away still shares its noise, one and a half pixels away hardly.
+SAME_NOISE, OTHER_NOISE = 0.5, 1.5
+# Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
+HIDDEN = 3.0
+# Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, then
+# the network's context. Whole strips of the guided filter (64 rows): it then sums in the order it would in the frame.
+MARGIN = 128
+
+
+@dataclass(frozen=True)
+class AlignedWindow:
+    """A window of 2k + 1 frames, every one warped to the centre; or some rows of it.
+
+    What is measured over a whole frame (`exposure`, `moments`) was measured before: all that is done with a window
+    afterwards is local, so that a part of it gives what the whole would have given there.
+
+    Attributes
+    ----------
+    number : int
+        The centre frame's number.
+    color : (T, H, W, 3) array
+        Irradiance. A missing frame holds the centre's, with confidence 0.
+    albedo, normal : (T, H, W, 3) array or None
+        Guides.
+    confidence : (T, H, W) array
+        In [0, 1]; the centre's is 1 wherever its own color was finite.
+    modulation : (H, W, 3) array
+        What irradiance is multiplied by to give radiance: the centre's prefiltered albedo plus the floor, or 1.
+    clean_albedo : (H, W, 3) array or None
+        The centre's albedo, prefiltered where the plan has it.
+    trust : (T, H, W) array
+        Confidence by geometry alone, with which guides are prefiltered.
+    rendered_variance : (H, W, 3) array or None
+        Of the centre's `color`, where the file tells it.
+    estimate : (T, H, W, 3) array or None
+        The estimates that were asked for, aligned, as irradiance; the centre's where a frame shows nothing.
+    aovs : dict of str to (T, H, W, C) array
+        Further layers, warped and demodulated like the color.
+    repaired : int
+        Pixels of the centre frame that were not finite.
+    outliers : int
+        Pixels of the window, within `inner`, that were rejected as fireflies.
+    exposure : float
+        Brightness of the centre's irradiance.
+    moments : (2, G + 1) array
+        Mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light.
+    inner : slice
+        The rows that were asked for. Those around them are there because the result depends on them.
+    stages : frozenset of str
+        The stages that made it.
+    """
+
+    number: int
+    color: Array
+    albedo: Array | None
+    normal: Array | None
+    confidence: Array
+    modulation: Array
+    clean_albedo: Array | None
+    trust: Array
+    rendered_variance: Array | None
+    estimate: Array | None
+    aovs: dict[str, Array]
+    repaired: int
+    outliers: int
+    exposure: float
+    moments: NDArray[np.float64]
+    inner: slice
+    stages: frozenset[str]
+
+    @cached_property
+    def guide(self) -> Array | None:
+        """The centre's albedo and normal, prefiltered, (H, W, G).
+
+        Made when asked for: averages of estimates need none.
+        """
+        clean = [] if self.clean_albedo is None else [self.clean_albedo]
+        if self.normal is not None:
+            clean.append(_clean(self.normal, self.trust, self.stages))
+        return np.concatenate(clean, axis=-1) if clean else None
+
+    @cached_property
+    def variance(self) -> Array:
+        """Of the centre's `color`, smoothed, (H, W, 3). Made when asked for, as the guide is."""
+        if self.rendered_variance is None:
+            return variance_from_window(self.color, self.confidence)
+        return smooth_variance(self.rendered_variance)
+
+    @property
+    def centre(self) -> int:
+        """Index of the centre frame."""
+        return len(self.color) // 2
+
+    def mixed(self, layer: Array) -> Array:
+        """Mix the centre into the side frames of `layer` (T, H, W, C), in inverse proportion to confidence."""
+        mixed = np.empty(layer.shape, np.float32)
+        for warped, confidence, out in zip(layer, self.confidence, mixed, strict=True):
+            mix_centre(warped, layer[self.centre], confidence, out)
+        return mixed
+
+
+class Estimates(Protocol):
+    """Where the estimates of single frames come from; `hybrid.estimates` has the three kinds.
+
+    Attributes
+    ----------
+    holds : int
+        Bytes that the denoiser takes for itself while it works.
+    from_noisy : bool
+        Whether they are made from windows of noisy frames, for which the gate needs the light of each
+        (`PreparedFrame.light`); else the gate compares the estimates.
+    """
+
+    @property
+    def holds(self) -> int:
+        """Bytes that the denoiser takes for itself."""
+
+    @property
+    def from_noisy(self) -> bool:
+        """Whether frames are prepared with their light."""
+
+    def reach(self, radius: int, stages: Collection[str]) -> int:
+        """How many frames on each side of the centre are read, for windows of `radius` frames on each side."""
+
+    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
+        """Load these frames (`Aligner.load`), and put an estimate of each that is there into `Aligner.estimates`."""
+
+
+class Aligner:
+    """Aligns the windows of one shot, keeping what neighbouring windows share while they slide.
+
+    Parameters
+    ----------
+    shot : Shot
+        Read lazily.
+    stages : collection of str
+        Which stages to run; see `hybrid.plan`.
+    radius : int
+        Frames on each side of the centre; the window has 2 · radius + 1.
+    estimates : Estimates, optional
+        Where the estimates of single frames come from (`hybrid.estimates`); each is made once.
+    refine : callable
+        What corrects vectors, `flow.tvl1.refine_flow` with other settings perhaps.
+    timings : Timings, optional
+        Where to count the stages "read", "prepare", "estimate", "flow", "warp" and "confidence".
+    """
+
+    def __init__(
+        self,
+        shot: Shot,
+        stages: Collection[str],
+        *,
+        radius: int = 2,
+        estimates: Estimates | None = None,
+        refine: Callable[..., Array] = refine_flow,
+        timings: Timings | None = None,
+    ) -> None:
+        self.shot = shot
+        self.stages = frozenset(stages)
+        self.source = estimates
+        self.radius = radius
+        self.refine = refine
+        self.timings = timings or Timings()
+        self._frames: dict[int, PreparedFrame] = {}
+        self.estimates: dict[int, Array | None] = {}
+        self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
+        self._chains: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
+
+    def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
+        """Align the window around frame `number`.
+
+        Parameters
+        ----------
+        number : int
+            A frame of the shot.
+        rows : slice, optional
+            Only these rows, and `MARGIN` around them; the whole frame without.
+
+        Returns
+        -------
+        AlignedWindow
+            The first and the last frames of a shot have neighbours of confidence 0.
+        """
+        numbers = self.around(number, self.radius)
+        if self.source is None:
+            self.load(numbers)
+        else:
+            self.source.make(self, numbers)
+        return self._assemble(number, numbers, rows, given=self.source is not None)
+
+    def align_noisy(self, number: int) -> AlignedWindow:
+        """Align the window around a frame without estimates; all of its frames are loaded already."""
+        return self._assemble(number, self.around(number, self.radius), None, given=False)
+
+    def around(self, number: int, radius: int) -> list[int]:
+        """Numbers of the window around a frame, ascending, whether or not these frames are there."""
+        step = self.shot.step
+        return list(range(number - radius * step, number + radius * step + 1, step))
+
+    def load(self, numbers: Collection[int], seen: Callable[[Frame], None] = lambda frame: None) -> None:
+        """Read and prepare these frames, where they are there, and forget all others.
+
+        Parameters
+        ----------
+        numbers : collection of int
+            Of the frames.
+        seen : callable
+            Called with each frame as it is read.
+        """
+        # What no window from here on needs is dropped, so that memory does not grow with the shot.
+        self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
+        self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
+        self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in numbers}
+        # Where estimates of single frames are given, the gate compares those.
+        light = self.source is None or self.source.from_noisy
+        stages = self.stages if light else self.stages - {"gate"}
+        for n in numbers:
+            if n not in self._frames and self.shot.has(n):
+                with self.timings.stage("read"):
+                    frame = self.shot.read(n)
+                with self.timings.stage("prepare"):
+                    self._frames[n] = prepare(frame, stages)
+                seen(frame)
+
+    def clean_guides(self, number: int, radius: int) -> tuple[Array | None, Array | None]:
+        """Albedo and normal of a loaded frame, prefiltered with those of `radius` frames on each side."""
+        frame = self._frames[number]
+        layers = {name: layer for name, layer in _layers(frame).items() if name in ("albedo", "normal", "valid")}
+        window, confidence, _ = self._gather(number, self.around(number, radius), layers, slice(0, len(frame.valid)))
+        clean = {name: prefilter_guide(layer, confidence) for name, layer in window.items()}
+        return clean.get("albedo"), clean.get("normal")
+
+    def frame(self, number: int) -> PreparedFrame | None:
+        """Frame `number` of the window loaded last, or None where the shot has no such frame."""
+        return self._frames.get(number)
+
+    def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
+        """Flow from frame `start` to frame `end`, chained over the frames between; None where one is missing."""
+        if (start, end) not in self._chains:
+            self._chains[start, end] = self._chain(start, end)
+        return self._chains[start, end]
+
+    def _chain(self, start: int, end: int) -> tuple[Array, Mask] | None:
+        step = self.shot.step if end > start else -self.shot.step
+        flow: Array | None = None
+        valid: Mask | None = None
+        for a in range(start, end, step):
+            link = self._step(a, a + step)
+            if link is None:
+                return None
+            if flow is None or valid is None:
+                flow, valid = link
+            else:
+                flow, valid = compose_flow(flow, link[0], first_valid=valid, second_valid=link[1])
+        return None if flow is None or valid is None else (flow, valid)
+
+    def _step(self, a: int, b: int) -> tuple[Array, Mask] | None:
+        """Flow between neighbouring frames, computed once."""
+        if (a, b) not in self._flows:
+            here, there = self.frame(a), self.frame(b)
+            if here is None or there is None:
+                return None
+            with self.timings.stage("flow"):
+                self._flows[a, b] = self._measure_step(here, there)
+        return self._flows[a, b]
+
+    def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask]:
+        shape = here.irradiance.shape[:2]
+        if "warp" not in self.stages:
+            return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
+        dense = "dense-flow" in self.stages
+        vectors = None if dense else rendered_flow(here, there)
+        if vectors is not None and "refine" not in self.stages:
+            return vectors
+        exposure = measure_exposure(here.radiance)
+        guide, noise = prefilter_flow_guide(here.radiance, here.albedo, exposure=exposure)
+        other, other_noise = prefilter_flow_guide(there.radiance, there.albedo, exposure=exposure)
+        noise = np.maximum(noise, other_noise)
+        if vectors is None:
+            return dense_flow(guide, other, noise=noise), np.ones(shape, bool)
+        flow, valid = vectors
+        back = rendered_flow(there, here)
+        # Hidden in the other frame: whatever matches there is another surface.
+        visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
+        refined = self.refine(guide, other, flow, noise=noise)
+        flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
+        return flow, valid
+
+    def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
+        self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
+        centre = self._frames[number]
+        height = len(centre.irradiance)
+        rows = slice(0, height) if rows is None else rows
+        outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
+        inner = slice(rows.start - outer.start, rows.stop - outer.start)
+        layers = {name: layer[outer] for name, layer in _layers(centre).items()}
+        if given:
+            layers.pop("light", None)
+        window, confidence, seen = self._gather(number, numbers, layers, outer)
+        estimates = self._gather_estimates(number, numbers, seen, outer) if given else None
+        with self.timings.stage("confidence"):
+            return self._finish(centre, window, estimates, confidence, seen, inner)
+
+    def _gather(
+        self, number: int, numbers: list[int], layers: dict[str, Array], rows: slice
+    ) -> tuple[dict[str, Array], Array, Array]:
+        """Warp the neighbours' layers to these rows of the centre, whose own are given.
+
+        Returns them, the confidence that geometry has in them, and what it could be at most: where they show anything.
+        """
+        shape = len(numbers), *layers["valid"].shape[:2]
+        window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
+        confidence, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        for index, neighbour in enumerate(numbers):
+            there, link, back = self.frame(neighbour), None, None
+            if neighbour != number:
+                link, back = self.flow(number, neighbour), self.flow(neighbour, number)
+            if there is None or link is None or back is None:
+                # The centre itself, or a frame that is missing.
+                for name, kept in window.items():
+                    kept[index] = layers[name]
+                if neighbour == number:
+                    confidence[index] = seen[index] = layers["valid"][..., 0]
+                continue
+            with self.timings.stage("warp"):
+                flow, known = link[0][rows], link[1][rows]
+                warped, inside = self._warp(there, layers, flow, rows)
+                for name, kept in window.items():
+                    kept[index] = warped[name]
+                # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
+                measured = known & inside & (warped["valid"][..., 0] > 0.999)
+                novelty = self._novelty(flow)
+                seen[index] = novelty * measured
+                confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
+        return window, confidence, seen
+
+    def _gather_estimates(self, number: int, numbers: list[int], seen: Array, rows: slice) -> Array:
+        """Warp the estimates of a window to these rows; the centre's where a frame shows or has none: not `seen`."""
+        alone = self.estimates[number]
+        if alone is None:
+            raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
+        estimates = np.repeat(alone[None, rows], len(numbers), axis=0)
+        for index, neighbour in enumerate(numbers):
+            link = None if neighbour == number else self.flow(number, neighbour)
+            if link is None:
+                continue
+            there = self.estimates.get(neighbour)
+            if there is None:
+                seen[index] = 0
+                continue
+            with self.timings.stage("warp"):
+                # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth up to
+                # 0.5 dB here.
+                moved = there[rows]
+                if "warp" in self.stages:
+                    moved, _ = warp(there, link[0][rows], interpolation="bicubic", first_row=rows.start)
+                np.copyto(estimates[index], moved, where=seen[index, ..., None] > 0)
+        return estimates
+
+    def _warp(
+        self, there: PreparedFrame, wanted: Collection[str], flow: Array, rows: slice
+    ) -> tuple[dict[str, Array], Mask]:
+        """Warp a neighbour's layers to these rows of the centre."""
+        layers = _layers(there)
+        if missing := set(wanted) - set(layers):
+            raise ValueError(
+                f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
+            )
+        if "warp" not in self.stages:
+            return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
+        warped = {}
+        for name, layer in ((name, layers[name]) for name in wanted):
+            warped[name], inside = warp(layer, flow, first_row=rows.start)
+        return warped, inside
+
+    def _novelty(self, flow: Array) -> Array | float:
+        """How much of a neighbour's noise is its own, in [0, 1]."""
+        if "fixed-noise" not in self.stages:
+            return 1.0
+        distance = np.hypot(flow[..., 0], flow[..., 1])
+        return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
+
+    def _trust(
+        self,
+        centre: dict[str, Array],
+        warped: dict[str, Array],
+        flow: Array,
+        measured: Mask,
+        back: Array,
+        first_row: int,
+    ) -> Array:
+        """Confidence in a warped neighbour, from geometry."""
+        return estimate_confidence(
+            flow,
+            inside=measured,
+            reverse=back if "warp" in self.stages else None,
+            albedo=centre.get("albedo"),
+            warped_albedo=warped.get("albedo"),
+            normal=centre.get("normal"),
+            warped_normal=warped.get("normal"),
+            first_row=first_row,
+        )
+
+    def _finish(
+        self,
+        centre: PreparedFrame,
+        window: dict[str, Array],
+        estimates: Array | None,
+        confidence: Array,
+        seen: Array,
+        inner: slice,
+    ) -> AlignedWindow:
+        color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
+        middle = len(color) // 2
+        gone = confidence[middle] == 0
+        if gone.any():
+            # What the neighbours in space made of it is good for a pixel, not for a block: first those in time.
+            pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
+            for layer in (color, *pictures, *([] if estimates is None else [estimates])):
+                layer[middle][gone] = average(layer, confidence)[gone]
+        there = [frame for n in self.around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
+        lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
+        outliers = 0
+        if "outliers" in self.stages:
+            color, rejected = reject_outliers(color, confidence)
+            outliers = int(np.count_nonzero(rejected[:, inner]))
+        trust = confidence
+        clean = None if albedo is None else _clean(albedo, trust, self.stages)
+        modulation = np.ones_like(color[0])
+        if clean is not None and centre.demodulated:
+            modulation = remodulate(modulation, clean)
+        if estimates is not None:
+            # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
+            estimates = estimates / modulation
+        if estimates is not None:
+            gate = color_gate(estimates, color[middle], lit.exposure)
+            floor = np.minimum(seen, AGREEING) * gate
+            confidence = np.maximum(confidence * gate if "gate" in self.stages else confidence, floor) * (seen > 0)
+        elif "gate" in self.stages:
+            confidence = confidence * color_gate(window.pop("light"), color[middle], lit.exposure)
+        return AlignedWindow(
+            number=centre.number,
+            color=color,
+            albedo=albedo,
+            normal=normal,
+            confidence=confidence,
+            modulation=modulation,
+            clean_albedo=clean,
+            trust=trust,
+            rendered_variance=centre.variance,
+            estimate=estimates,
+            aovs={name: window[f"aov {name}"] for name in centre.aovs},
+            repaired=centre.repaired,
+            outliers=outliers,
+            exposure=lit.exposure,
+            moments=lit.moments,
+            inner=inner,
+            stages=self.stages,
+        )
+
+
+def _clean(layer: Array, trust: Array, stages: Collection[str]) -> Array:
+    """The centre of a guide (T, H, W, C), prefiltered if the plan has it."""
+    return prefilter_guide(layer, trust) if "prefilter" in stages else layer[len(layer) // 2]
+
+
+def _layers(frame: PreparedFrame) -> dict[str, Array]:
+    """All layers of a frame that are warped."""
+    named = {
+        "color": frame.irradiance,
+        "light": frame.light,
+        "albedo": frame.albedo,
+        "normal": frame.normal,
+        **{f"aov {name}": layer for name, layer in frame.aovs.items()},
+        "valid": frame.valid[..., None].astype(np.float32),
+    }
+    return {name: layer for name, layer in named.items() if layer is not None}

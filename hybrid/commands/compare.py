@@ -1,0 +1,160 @@
+"""`ravg compare`: accuracy against time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybrid.commands.options import FramesOption, LayerOption, choose, open_input
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+    from hybrid.comparison.methods import Method
+
+
+def compare(
+    shot: Annotated[
+        str | None, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")
+    ] = None,
+    reference: Annotated[
+        list[str] | None,
+        typer.Option(help="the same frames at many samples; twice: two independent halves, whose noise cancels"),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="REPORT", help="folder for a page with chart and pictures")
+    ] = None,
+    methods: Annotated[str | None, typer.Option(help="names, separated by commas; all without")] = None,
+    external: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATTERN", help="frames that another denoiser has finished; may be repeated"),
+    ] = None,
+    sweep: Annotated[bool, typer.Option("--sweep", help="also vary stages and settings, one at a time")] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="runs of each method, in turns, whose median is the time")] = 3,
+    samples: Annotated[
+        float | None, typer.Option(help="per pixel of SHOT, where its files do not tell, as those of Cycles do")
+    ] = None,
+    level: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATTERN=SPP", help="SHOT at other samples per pixel, to measure how noise falls"),
+    ] = None,
+    exposure: Annotated[float, typer.Option(help="factor before the tone curve of the measures")] = 1.0,
+    clock: Annotated[
+        str, typer.Option(help="wall or cpu: the time that chart.png and the Markdown table show")
+    ] = "wall",
+    markdown: Annotated[bool, typer.Option("--markdown", help="print the table of the README")] = False,
+    name: Annotated[str | None, typer.Option(help="of the shot, in tables and on the page")] = None,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="REPORT", help="folder of a finished comparison of another shot, to be shown beside"),
+    ] = None,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
+    import tempfile
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from hybrid.comparison.compare import compare_shot, result_table
+    from hybrid.comparison.report import report_images, write_report
+    from hybrid.comparison.results import Comparison, Cost, join, markdown_table, read_comparison
+    from hybrid.comparison.samples import samples_of
+
+    costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
+    cost = choose(costs, clock, "clock")
+    others = [read_comparison(folder / "results.json") for folder in beside or ()]
+    if shot is None or not reference:
+        if not others or shot is not None or reference:
+            raise typer.BadParameter("expected SHOT and --reference, or --beside with finished comparisons")
+        joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
+        if output is not None:
+            typer.echo(f"wrote {write_report(output, joined, others=others, cost=cost)}", err=True)
+        _show(markdown, markdown_table(others, cost=cost), result_table(joined.results))
+        return
+    if len(reference) > 2:
+        raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
+    noisy, clean = open_input(shot, frames, layer), [open_input(spec, frames, None) for spec in reference]
+    chosen = _methods(methods, external, frames)
+    if sweep:
+        from hybrid.comparison.methods import METHODS
+        from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
+        from hybrid.plan import plan_shot
+
+        # Another object, since the frames it keeps would travel to every method's process.
+        plan = plan_shot(open_input(shot, frames, layer))
+        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
+    pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
+    levels = [(open_input(pattern, frames, None), _number(count, "--level")) for pattern, count in pairs]
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with tempfile.TemporaryDirectory() as folder, Progress(*columns, console=console) as progress:
+        task = progress.add_task("compare")
+        comparison = compare_shot(
+            noisy,
+            clean[0] if len(clean) == 1 else (clean[0], clean[1]),
+            chosen,
+            title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
+            exposure=exposure,
+            rounds=rounds,
+            samples=samples or samples_of(noisy),
+            reference_samples=samples_of(clean[0]),
+            levels=levels,
+            maps=output is not None,
+            folder=Path(folder),
+            progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+        )
+        if output is not None:
+            judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
+            progress.update(task, description="write the page")
+            images, truth = report_images(Path(folder), comparison, judged)
+            page = write_report(output, comparison, images, truth, judged, others=others, exposure=exposure, cost=cost)
+            console.print(f"wrote {page}", highlight=False)
+    _show(markdown, markdown_table([comparison, *others], cost=cost), result_table(comparison.results))
+
+
+def _show(markdown: bool, text: str, table: RichTable) -> None:
+    """Print results as Markdown for a file, or as a table for a terminal."""
+    from rich.console import Console
+
+    if markdown:
+        typer.echo(text, nl=False)
+    else:
+        Console().print(table)
+
+
+def _methods(names: str | None, external: Sequence[str] | None, frames: str | None) -> dict[str, Method]:
+    """The methods asked for, and sequences that others have finished."""
+    from hybrid.comparison.methods import METHODS
+    from hybrid.comparison.methods import external as finished
+
+    wanted = METHODS if names is None else {n.strip(): choose(METHODS, n.strip(), "methods") for n in names.split(",")}
+    chosen = dict(wanted)
+    for item in external or ():
+        name, pattern = _pair(item, "--external", "NAME=PATTERN")
+        if name in METHODS or name == "reference":
+            raise typer.BadParameter(f"--external is {item!r}, expected a name that no other method has")
+        chosen[name] = finished(open_input(pattern, frames, None))
+    return chosen
+
+
+def _pair(item: str, option: str, form: str) -> tuple[str, str]:
+    """Split at the last "=" for patterns that hold one, at the first otherwise."""
+    first, separator, second = item.rpartition("=") if form.startswith("PATTERN") else item.partition("=")
+    if not separator or not first or not second:
+        raise typer.BadParameter(f"{option} is {item!r}, expected {form}")
+    return first, second
+
+
+def _number(text: str, option: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise typer.BadParameter(f"{option} is {text!r}, expected a positive number")
+    return value

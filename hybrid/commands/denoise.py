@@ -1,0 +1,405 @@
+"""`ravg denoise` and `ravg pseudoref`: with the network, and without."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybrid.commands.options import (
+    AovOption,
+    EstimateOption,
+    FramesOption,
+    KeepOption,
+    LayerOption,
+    MemoryOption,
+    OffOption,
+    OnOption,
+    OutputOption,
+    PixelsOption,
+    PreviewOption,
+    ResumeOption,
+    ShotArgument,
+    choose,
+    import_neural,
+    open_input,
+    plan_input,
+)
+from hybrid.interrupt import INTERRUPTED, interruptible
+
+if TYPE_CHECKING:
+    from hybrid.estimates import EstimateSource
+    from hybrid.files.frames import Shot
+    from hybrid.pipeline import DenoiseWindow
+    from hybrid.plan import Plan
+    from hybrid.timing import Timings
+
+
+def pseudoref(
+    shot: ShotArgument,
+    output: OutputOption,
+    preset: Annotated[str, typer.Option(help="of our own estimate: draft, standard or final")] = "standard",
+    estimate: EstimateOption = "none",
+    keep_estimates: KeepOption = None,
+    preview: PreviewOption = None,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    stages: OnOption = None,
+    no_stages: OffOption = None,
+    resume: ResumeOption = False,
+    max_memory: MemoryOption = None,
+    max_pixels: PixelsOption = None,
+) -> None:
+    """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too.
+
+    With --estimate, pictures that are denoised already, each by itself, are made stable instead.
+    """
+    from hybrid.estimates import choose_estimate
+    from hybrid.pipeline import Denoised
+    from hybrid.pseudo_reference import CLASSICAL_PRESETS, gated_average
+    from hybrid.pseudo_reference import filter_window as estimate_centre
+    from hybrid.timing import Timings
+
+    chosen = choose(CLASSICAL_PRESETS, preset, "preset")
+    opened = open_input(shot, frames, layer, max_pixels=max_pixels)
+    timings = Timings()
+    source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
+    _spare_input(opened, output, source.files, preview=preview)
+    if source.estimates is None:
+        make = partial(estimate_centre, preset=chosen, timings=timings)
+    else:
+        make = partial(gated_average, timings=timings)
+    _run(
+        Job(
+            opened,
+            output,
+            lambda aligned: Denoised(make(aligned)),
+            timings,
+            source,
+            command="pseudoref",
+            preset=preset,
+            settings={"layer": layer, "estimate": estimate},
+            stages=(stages, no_stages),
+            resume=resume,
+            max_memory=max_memory,
+        )
+    )
+    _preview(opened, output, preview)
+
+
+def denoise(
+    shot: ShotArgument,
+    output: OutputOption,
+    preset: Annotated[
+        str, typer.Option(help="of the weights that come with ravg: fast, balanced, quality, or auto, with --budget")
+    ] = "fast",
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="per frame, such as 10s: the most accurate preset that fits it")
+    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="a weights file of your own, instead of a preset")] = None,
+    threshold: Annotated[
+        float | None,
+        typer.Option(help="from 0 to 1: higher keeps fewer frames or taps: closer to the one frame"),
+    ] = None,
+    estimate: EstimateOption = "auto",
+    keep_estimates: KeepOption = None,
+    passes: Annotated[
+        int,
+        typer.Option(
+            help="run again on the result: a wider window in time, a softer picture; --resume makes all passes again"
+        ),
+    ] = 1,
+    breakdown: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="a picture of what each frame contributes, with layers and figures of it"),
+    ] = None,
+    aov: AovOption = None,
+    preview: PreviewOption = None,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    stages: OnOption = None,
+    no_stages: OffOption = None,
+    tile: Annotated[
+        int | None,
+        typer.Option(help="pixels on a side that the network sees at once; without: 640, with --max-memory 384"),
+    ] = None,
+    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+    resume: ResumeOption = False,
+    max_memory: MemoryOption = None,
+    max_pixels: PixelsOption = None,
+) -> None:
+    """Denoise with the Robust Average network."""
+    neural = import_neural()
+    from rich.console import Console
+    from rich.table import Table
+
+    from hybrid.breakdown import Breakdown, write_breakdown
+    from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
+    from hybrid.timing import Timings
+
+    if passes < 1:
+        raise typer.BadParameter(f"--passes is {passes}, expected at least 1")
+    if breakdown is not None and max_memory is not None:
+        raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
+    opened = open_input(shot, frames, layer, aov, max_pixels=max_pixels)
+    timings = Timings()
+    if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
+        raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
+    if budget is not None:
+        preset = _fitting(opened, budget, estimate, plan_input(opened, stages, no_stages), precision)
+    path = weights or neural.shipped_weights(preset)
+    if tile is None:
+        tile = neural.TILE if max_memory is None else neural.SMALL_TILE
+    denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
+    if denoiser.takes_estimate:
+        # From the noisy frames alone, such a network works beside our own.
+        wanted = "nlm" if estimate == "none" else estimate
+        mode = "oidn-clean" if weights is not None else MODE_OF[preset]
+        made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
+        source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
+    elif estimate in ("auto", "none"):
+        source = EstimateSource("none", None, "this network takes none")
+    else:
+        raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
+    _spare_input(opened, output, source.files, preview=preview, breakdown=breakdown)
+    settings = {
+        "layer": layer,
+        "estimate": estimate,
+        "aov": aov,
+        "tile": tile,
+        "threshold": threshold,
+        "breakdown": breakdown is not None,
+        "precision": denoiser.precision,
+        "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+    }
+    job = Job(
+        opened,
+        output,
+        denoiser,
+        timings,
+        source,
+        command="denoise",
+        preset=preset if weights is None else path.name,
+        settings=settings,
+        stages=(stages, no_stages),
+        resume=resume,
+        max_memory=max_memory,
+        radius=denoiser.radius,
+        neural=True,
+    )
+    with _last_pass(job, passes) as last:
+        if breakdown is not None:
+            denoiser.breakdown = Breakdown()
+        _run(last)
+    _preview(opened, output, preview)
+    if breakdown is not None and denoiser.breakdown is not None:
+        write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
+        if denoiser.breakdown.pixels:
+            title = "Weights in the frames made by this run"
+            table = Table("frame", "average weight", "minimum", "maximum", title=title, title_justify="left")
+            for row in denoiser.breakdown.rows():
+                table.add_row(*row)
+            Console().print(table)
+        else:
+            typer.echo("no weights to print: all frames were finished already")
+        typer.echo(f"wrote {breakdown}")
+
+
+def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictures: Path | None) -> None:
+    """Refuse to write over a frame of the shot, or of estimates, before anything is made."""
+    from hybrid.files.frames import output_path
+
+    for number in shot.numbers:
+        frame = output_path(output, shot, number)
+        if estimates is not None and estimates.reads(frame):
+            raise ValueError(f"output {str(frame)!r} would overwrite a frame of the estimate")
+    for option, path in pictures.items():
+        if path is not None and shot.reads(path):
+            raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
+
+
+def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str) -> str:
+    """The most accurate preset that is measured to fit a time per frame, or the fastest; says what was measured."""
+    from hybrid.budget import measure_presets, parse_budget
+
+    neural, seconds = import_neural(), parse_budget(budget)
+
+    def load(preset: str) -> tuple[DenoiseWindow, int]:
+        denoiser = neural.Denoiser(neural.shipped_weights(preset), precision=precision)
+        return denoiser, denoiser.radius
+
+    tried = []
+    for measured in measure_presets(shot, plan.stages, "nlm" if estimate == "none" else estimate, load):
+        tried.append(f"{measured.preset} {measured.seconds:.2g} s")
+        fits = measured.seconds <= seconds
+        if fits:
+            break
+    typer.echo(f"preset: {measured.preset} ({', '.join(tried)} a frame; {budget} asked for)", err=True)
+    if not fits:
+        typer.echo("warning: not even the fastest preset fits", err=True)
+    return measured.preset
+
+
+@dataclass(frozen=True)
+class Job:
+    """What `pseudoref` and `denoise` have to say before frames can be made."""
+
+    shot: Shot
+    output: str
+    denoise: DenoiseWindow
+    timings: Timings
+    source: EstimateSource
+    command: str
+    preset: str
+    settings: Mapping[str, object]  # all options that the pixels depend on
+    stages: tuple[Sequence[str] | None, Sequence[str] | None]  # forced on, forced off
+    resume: bool
+    max_memory: str | None
+    radius: int = 2
+    neural: bool = False
+
+
+@contextmanager
+def _last_pass(job: Job, passes: int) -> Iterator[Job]:
+    """Make all passes but the last, in folders that go when the block ends; it is given what is left to run."""
+    from hybrid.estimates import EstimateSource, OfFrames
+    from hybrid.files.frames import output_path
+    from hybrid.files.replace import temporary_folder
+
+    command = job.command
+    home = output_path(job.output, job.shot, job.shot.numbers[0]).parent
+    with ExitStack() as stack:
+        for number in range(1, passes):
+            folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
+            made = job.shot.around(job.radius * (passes - number))  # what the windows of later passes reach
+            _run(replace(job, shot=made, output=str(folder), command=f"{command}, pass {number} of {passes}"))
+            job = replace(
+                job,
+                shot=job.shot.remade({n: output_path(folder, made, n) for n in made.numbers}),
+                source=EstimateSource("denoised", OfFrames(lambda frame: frame.color), "the pass before has made them"),
+                command=f"{command}, pass {passes} of {passes}",
+            )
+        yield job
+
+
+def _run(job: Job) -> None:
+    """Denoise the shot; stopped by Ctrl-C, say what is finished."""
+    done: list[int] = []
+
+    def report() -> None:
+        count = f"{len(done)} of {len(job.shot)} frames are finished"
+        last = f", the last is {done[-1]}" if done else ""
+        typer.echo(f"\nstopped: {count}{last}; --resume goes on from there", err=True)
+
+    try:
+        with interruptible(report):
+            _denoise(job, done)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _denoise(job: Job, done: list[int]) -> None:
+    """Denoise with a progress bar, say what was met on the way, and leave the timings beside the output."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.table import Table
+
+    from hybrid.memory import keep_freed_memory, parse_size, plan_rows
+    from hybrid.pipeline import denoise_shot
+    from hybrid.plan import Plan
+
+    shot, source, timings = job.shot, job.source, job.timings
+    limit = None if job.max_memory is None else parse_size(job.max_memory)
+    if limit is None:
+        keep_freed_memory()
+    fit = (
+        partial(plan_rows, limit, shot, estimates=source.estimates, radius=job.radius, neural=job.neural)
+        if limit
+        else None
+    )
+    if fit is not None:
+        fit(Plan(()))  # refuses what can never be enough before frames are read to make a plan
+    plan = plan_input(shot, *job.stages)
+    rows = None if fit is None else fit(plan)
+    console = Console(stderr=True)
+    console.print("stages: " + ", ".join(d.stage for d in plan.decisions if d.on), highlight=False)
+    for decision in plan.decisions:
+        if not decision.on:
+            console.print(f"  not run: {decision.stage} ({decision.reason})", highlight=False)
+    console.print(f"estimates: {source.name} ({source.reason})", highlight=False)
+    attributes = {
+        "ravg/command": job.command,
+        "ravg/preset": job.preset,
+        "ravg/estimate": source.name,
+        "ravg/stages": " ".join(sorted(plan.stages)),
+        "ravg/settings": json.dumps(job.settings, sort_keys=True),
+    }
+    pixels, outliers, resumed, finished = 0, 0, 0, None
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(job.command, total=len(shot))
+        frames = denoise_shot(
+            shot,
+            job.output,
+            job.denoise,
+            plan,
+            radius=job.radius,
+            estimates=source.estimates,
+            attributes=attributes,
+            rows=rows,
+            resume=job.resume,
+            timings=timings,
+        )
+        for finished in frames:
+            progress.advance(task)
+            done.append(finished.number)
+            resumed += finished.resumed
+            pixels += finished.pixels
+            outliers += finished.outliers
+            if finished.repaired:
+                console.print(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
+            if finished.clamped:
+                console.print(
+                    f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504"
+                )
+    if finished is None:
+        return
+    if resumed:
+        console.print(f"{resumed} of {len(shot)} frames were finished already")
+    table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
+    for row in timings.rows(pixels):
+        table.add_row(*row)
+    console.print(table)
+    folder = finished.path.parent
+    timings.write(
+        folder / "ravg.json",
+        command=job.command,
+        preset=job.preset,
+        estimate=source.name,
+        frames=len(shot),
+        resumed=resumed,
+        pixels=pixels,
+        outliers=outliers,
+        plan=[vars(decision) for decision in plan.decisions],
+    )
+    console.print(
+        escape(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}"),
+        highlight=False,
+    )
+
+
+def _preview(shot: Shot, output: str, path: Path | None) -> None:
+    """Write the preview if one is asked for, and say so."""
+    from hybrid.pipeline import write_preview
+
+    if path is not None:
+        write_preview(shot, output, path)
+        typer.echo(f"wrote {path}", err=True)

@@ -1,0 +1,1 @@
+"""Accuracy against time: methods run, judged and shown side by side."""

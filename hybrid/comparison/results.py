@@ -1,0 +1,463 @@
+"""What a comparison has measured: methods, measures, who is best, what ties, and tables of it as text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from hybrid.comparison.metrics import bootstrap_interval, mean_over_shots
+
+Cost = Literal["seconds_per_megapixel", "cpu_seconds_per_megapixel", "peak_bytes"]
+COSTS: dict[Cost, str] = {
+    "seconds_per_megapixel": "seconds per megapixel-frame",
+    "cpu_seconds_per_megapixel": "CPU seconds per megapixel-frame",
+    "peak_bytes": "peak memory",
+}
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One measure over the frames of one or more shots: its mean, range, and the interval that the mean is known to."""
+
+    mean: float
+    minimum: float
+    maximum: float
+    low: float
+    high: float
+    values: tuple[float, ...] = ()  # frame by frame, where known: paired differences then decide on ties
+    shots: tuple[int, ...] = ()  # how many of the values belong to each shot, where there are several
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a measure is called, read and printed."""
+
+    key: str
+    label: str
+    definition: str
+    unit: str = ""
+    digits: int = 2
+    better: Literal["higher", "lower", "zero"] = "higher"
+    logarithmic: bool = False  # on the chart; printed with three significant digits
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """What one method, with one choice of settings, has reached and cost on a shot.
+
+    `seconds_per_megapixel` is the median, `spread` the (low, high) of repeated runs; None where the time is not
+    known, 0 where nothing was run. `worth` is the number of times the noisy render's samples that would
+    bring it to the same error. Methods of one `family` share a marker. A point of a sweep names what is varied in
+    `sweep` and the method it varies in `base`; its settings are those in which it differs. `absent_reason`
+    says why a method that was asked for has no figures.
+    """
+
+    name: str
+    label: str
+    settings: Mapping[str, object] = field(default_factory=dict)
+    family: str = "Methods"
+    sweep: str = ""
+    base: str = ""
+    seconds_per_megapixel: float | None = None
+    spread: tuple[float, float] | None = None
+    cpu_seconds_per_megapixel: float | None = None
+    peak_bytes: int | None = None
+    metrics: Mapping[str, Statistic] = field(default_factory=dict)
+    worth: float | None = None
+    absent_reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What one shot has shown: the methods' results, and what to know about how they were measured."""
+
+    shot: str
+    results: tuple[MethodResult, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric(
+        "psnr",
+        "PSNR",
+        "Peak signal-to-noise ratio, −10 log₁₀ mean (T(x) − T(r))², on the tone curve T(x) = e·x / (1 + e·x) "
+        "at one exposure e for the whole shot. Mean over frames.",
+        unit="dB",
+    ),
+    Metric(
+        "temporal_psnr",
+        "Temporal PSNR",
+        "PSNR of what changes from frame to frame: the difference of each frame to the one before, warped onto "
+        "it, against the reference's own. Flicker lowers it; an error that stands still does not, so read "
+        "it beside the PSNR.",
+        unit="dB",
+    ),
+    Metric(
+        "ssim",
+        "SSIM",
+        "Mean structural similarity on the same tone curve: Gaussian window, σ = 1.5, K = (0.01, 0.03); 1 at best.",
+        digits=4,
+    ),
+    Metric(
+        "relmse",
+        "relMSE",
+        "Relative mean squared error, mean (x − r)² / (r² + 0.01), on linear radiance. One firefly can decide it.",
+        better="lower",
+        logarithmic=True,
+    ),
+    Metric(
+        "relmse_trimmed",
+        "relMSE, trimmed",
+        "relMSE without the 0.1 % of the pixels whose error is largest.",
+        better="lower",
+        logarithmic=True,
+    ),
+    Metric("smape", "SMAPE", "Mean |x − r| / (|x| + |r| + 0.01), in [0, 1].", digits=4, better="lower"),
+    Metric(
+        "flip",
+        "FLIP",
+        "Mean HDR-FLIP error: how different the two look when one flips between them, over the range of "
+        "exposures the reference calls for; 0 at best, 1 at worst.",
+        digits=4,
+        better="lower",
+    ),
+    Metric(
+        "mean_bias",
+        "Bias",
+        "Relative error of the mean radiance, mean x / mean r − 1: below zero where light was lost.",
+        digits=4,
+        better="zero",
+    ),
+    Metric(
+        "static_std",
+        "Static deviation",
+        "Standard deviation over time, on the tone curve, of the pixels that stand still: the vectors stay below a "
+        "twentieth of a pixel, and the reference's 9 × 9 means within 0.02. Frame by frame: √(n / (n − 1)) times "
+        "the root mean square distance to each pixel's own mean over the n frames. 0 is no flicker at all, which "
+        "blur reaches too.",
+        better="lower",
+        logarithmic=True,
+    ),
+)
+MARKDOWN_METRICS = ("psnr", "temporal_psnr")  # the columns of the README's table
+CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # those the chart offers, the first one first
+
+
+def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
+    """Summarize a measure taken frame by frame: mean, range, and the 95 % bootstrap interval of the mean.
+
+    Parameters
+    ----------
+    values : N ≥ 1 figures, one per frame.
+    shots : how many of them belong to each shot, if to several. The mean is then that of the shots' means.
+    """
+    if len(values) == 0:
+        raise ValueError("values must hold at least one frame, is empty")
+    data = np.asarray(values, np.float64)
+    return Statistic(
+        mean_over_shots(data, shots),
+        float(data.min()),
+        float(data.max()),
+        *bootstrap_interval(data, shots=shots),
+        tuple(float(v) for v in data),
+        tuple(shots),
+    )
+
+
+def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
+    """Put the results of several shots together: the methods that none of them lacks, points of sweeps left out.
+
+    Figures are means over shots, their intervals over frames and shots. Costs are means too (that of memory the
+    maximum), since shots call for different stages; worth is the geometric mean.
+    """
+    tables = [{r.name: r for r in c.results if r.absent_reason is None and not r.sweep} for c in comparisons]
+    joined = []
+    for name, first in tables[0].items() if tables else ():
+        each = [table[name] for table in tables if name in table]
+        if len(each) < len(tables):
+            continue
+        metrics = {}
+        for key in first.metrics:
+            parts = [r.metrics[key].values for r in each if key in r.metrics]
+            if len(parts) == len(each) and all(parts):
+                metrics[key] = summarize([v for part in parts for v in part], [len(part) for part in parts])
+        seconds = [r.seconds_per_megapixel for r in each if r.seconds_per_megapixel is not None]
+        cpu = [r.cpu_seconds_per_megapixel for r in each if r.cpu_seconds_per_megapixel is not None]
+        worths = [r.worth for r in each if r.worth is not None]
+        joined.append(
+            replace(
+                first,
+                settings={},
+                seconds_per_megapixel=float(np.mean(seconds)) if len(seconds) == len(each) else None,
+                spread=None,
+                cpu_seconds_per_megapixel=float(np.mean(cpu)) if len(cpu) == len(each) else None,
+                peak_bytes=max((r.peak_bytes for r in each if r.peak_bytes is not None), default=None),
+                metrics=metrics,
+                worth=math.exp(float(np.mean(np.log(worths)))) if len(worths) == len(each) else None,
+            )
+        )
+    return joined
+
+
+def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
+    """Name the best method by a measure, and those that cannot be told from it.
+
+    Returns
+    -------
+    (best, ties)
+        The best mean, None where no method has one; the names whose difference to it is a tie.
+
+    Notes
+    -----
+    Two methods tie where the bootstrap interval of their differences frame by frame contains 0; where the
+    values of the frames are not known, where the intervals of the means overlap.
+    """
+    rated = {r.name: r.metrics[metric.key] for r in results if metric.key in r.metrics}
+    rated = {name: s for name, s in rated.items() if not math.isnan(s.mean)}
+    if not rated:
+        return None, set()
+    best = max(rated, key=lambda name: _goodness(rated[name].mean, metric))
+    return best, {name for name in rated if name != best and _tied(rated[name], rated[best])}
+
+
+def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
+    """Name the methods that no other beats at the same cost or less, by rising cost.
+
+    Methods whose cost is not known, or whose measure is not finite, are left out.
+    """
+    points = [
+        (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
+        for r in results
+        if (spent := getattr(r, cost)) is not None
+        and metric.key in r.metrics
+        and math.isfinite(r.metrics[metric.key].mean)
+    ]
+    front: list[str] = []
+    least = math.inf
+    for _, badness, name in sorted(points):
+        if badness < least:
+            front.append(name)
+            least = badness
+    return front
+
+
+def markdown_table(
+    comparisons: Sequence[Comparison],
+    metrics: Sequence[Metric] = METRICS,
+    cost: Cost = "seconds_per_megapixel",
+) -> str:
+    """Return the README's table: PSNR and temporal PSNR on each shot, then the costs on the first.
+
+    The best of a column is bold, what ties with it is marked "≈"; absent methods follow with their reason.
+    Points of a sweep are left out.
+    """
+    columns = [m for m in metrics if m.key in MARKDOWN_METRICS]
+    tables = [{r.name: r for r in c.results if not r.sweep} for c in comparisons]
+    shown = [present_metrics(list(table.values()), columns) for table in tables]
+    verdicts = [
+        {m.key: best_and_ties(list(table.values()), m) for m in row} for table, row in zip(tables, shown, strict=True)
+    ]
+    heads = [f"{c.shot}: {' / '.join(map(column_title, row))}" for c, row in zip(comparisons, shown, strict=True)]
+    unit = {"cpu_seconds_per_megapixel": "CPU-s"}.get(cost, "s")
+    titles = ["method", *heads, f"{unit} per megapixel-frame", "peak memory", "worth in samples"]
+    lines = [titles, ["---", *("---" for _ in titles[1:])]]
+    missing = []
+    for name in dict.fromkeys(name for table in tables for name in table):
+        first = next(table[name] for table in tables if name in table)
+        if all(table[name].absent_reason is not None for table in tables if name in table):
+            missing.append([first.label, f"absent: {first.absent_reason}", *("" for _ in titles[2:])])
+            continue
+        cells = [first.label]
+        for table, row, verdict in zip(tables, shown, verdicts, strict=True):
+            figures = []
+            for m in row:
+                statistic = table[name].metrics.get(m.key) if name in table else None
+                text = "–" if statistic is None else format_value(statistic.mean, m)
+                best, ties = verdict[m.key]
+                figures.append(f"**{text}**" if name == best else f"≈ {text}" if name in ties else text)
+            cells.append(" / ".join(figures))
+        spent = first.cpu_seconds_per_megapixel if unit == "CPU-s" else first.seconds_per_megapixel
+        cells += [format_seconds(spent), format_bytes(first.peak_bytes)]
+        lines.append([*cells, format_worth(first.worth)])
+    return "".join(f"| {' | '.join(_markdown_cell(c) for c in line)} |\n" for line in [*lines, *missing])
+
+
+@dataclass(frozen=True)
+class StageValue:
+    """What one stage changes: figures with it minus figures without it."""
+
+    stage: str
+    base: str
+    on: bool  # in the plan
+    gains: Mapping[str, float]  # of PSNR and temporal PSNR
+    told: tuple[str, ...]  # those whose change is no tie
+    seconds: float | None
+    cpu_seconds: float | None
+
+
+def stage_values(results: Sequence[MethodResult], metrics: Sequence[Metric] = METRICS) -> list[StageValue]:
+    """What each stage buys and costs by the sweep named "Stages"; empty without one."""
+    by_name = {r.name: r for r in results if r.absent_reason is None}
+    values = []
+    for variant in by_name.values():
+        base = by_name.get(variant.base)
+        if variant.sweep != "Stages" or base is None:
+            continue
+        ((stage, state),) = variant.settings.items()
+        ways = (base, variant) if state == "off" else (variant, base)
+        gains, told = {}, []
+        for m in metrics:
+            if m.key in MARKDOWN_METRICS and m.key in base.metrics and m.key in variant.metrics:
+                gains[m.key] = ways[0].metrics[m.key].mean - ways[1].metrics[m.key].mean
+                if not _tied(ways[0].metrics[m.key], ways[1].metrics[m.key]):
+                    told.append(m.key)
+        seconds, cpu = (
+            None if ends[0] is None or ends[1] is None else ends[0] - ends[1]
+            for ends in (
+                [way.seconds_per_megapixel for way in ways],
+                [way.cpu_seconds_per_megapixel for way in ways],
+            )
+        )
+        values.append(StageValue(stage, base.label, state == "off", gains, tuple(told), seconds, cpu))
+    return values
+
+
+def _goodness(value: float, metric: Metric) -> float:
+    """A figure that is larger where the method is better."""
+    return {"higher": value, "lower": -value, "zero": -abs(value)}[metric.better]
+
+
+def _tied(a: Statistic, b: Statistic) -> bool:
+    if a.values and len(a.values) == len(b.values) and a.shots == b.shots:
+        with np.errstate(invalid="ignore"):  # two perfect scores: inf − inf
+            difference = np.subtract(a.values, b.values)
+        low, high = bootstrap_interval(np.where(np.equal(a.values, b.values), 0.0, difference), shots=a.shots)
+        return low <= 0 <= high
+    return a.low <= b.high and b.low <= a.high
+
+
+def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list[Metric]:
+    """Return those of the metrics that at least one result has."""
+    return [m for m in metrics if any(m.key in r.metrics for r in results)]
+
+
+def format_value(value: float, metric: Metric) -> str:
+    """Print a figure as its metric asks for, "–" for NaN."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
+    text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
+    return text.replace("-", "−")
+
+
+def format_seconds(value: float | None) -> str:
+    """Print seconds with three significant digits, "–" where not known."""
+    if value is None:
+        return "–"
+    return "0" if value == 0 else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def format_bytes(value: int | None) -> str:
+    """Print an amount of memory in MiB or GiB, "–" where not known."""
+    if value is None:
+        return "–"
+    return f"{value / 2**20:.0f} MiB" if value < 2**30 else f"{value / 2**30:.2f} GiB"
+
+
+def format_worth(value: float | None) -> str:
+    """Print how many times the samples a method is worth, "–" where not known."""
+    return "–" if value is None or math.isnan(value) else f"{value:.2g}×" if value < 10 else f"{value:.0f}×"
+
+
+def column_title(metric: Metric) -> str:
+    """Return the metric's label with its unit."""
+    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
+
+
+def _markdown_cell(text: str) -> str:
+    return re.sub(r"\s+", " ", text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+
+
+def settings_as_text(result: MethodResult) -> dict[str, str]:
+    """Print the settings for people: floats with four significant digits."""
+    return {
+        str(k).replace("_", " "): f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in result.settings.items()
+    }
+
+
+def plain(result: MethodResult) -> dict[str, object]:
+    """A result as plain dicts, settings as text: what they hold is the caller's business."""
+    # asdict copies mappings by their own type, which a MappingProxy does not survive.
+    metrics = {k: asdict(v) for k, v in result.metrics.items()}
+    values = {name: getattr(result, name) for name in result.__dataclass_fields__}
+    return {**values, "settings": settings_as_text(result), "metrics": metrics}
+
+
+def to_json(document: object, indent: int | None = None) -> str:
+    """JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read."""
+
+    def finite(value: object) -> object:
+        if isinstance(value, Mapping):
+            return {str(k): finite(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [finite(v) for v in value]
+        if isinstance(value, np.generic):
+            return finite(value.item())
+        if isinstance(value, float) and not math.isfinite(value):
+            return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+        return value
+
+    return json.dumps(finite(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
+    """One row per method: settings as JSON, five columns per measure."""
+    parts = ("mean", "minimum", "maximum", "low", "high")
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    facts = ["name", "label", "family", "sweep", "base", "absent_reason", "settings"]
+    costs = ["seconds_per_megapixel", "seconds_low", "seconds_high", "cpu_seconds_per_megapixel", "peak_bytes", "worth"]
+    writer.writerow([*facts, *costs, *(f"{m.key}_{part}" for m in metrics for part in parts)])
+    for r in results:
+        row: list[object] = [r.name, r.label, r.family, r.sweep, r.base, r.absent_reason]
+        row += [to_json(settings_as_text(r)).strip(), r.seconds_per_megapixel]
+        row += [*(r.spread or (None, None)), r.cpu_seconds_per_megapixel, r.peak_bytes, r.worth]
+        for m in metrics:
+            row += [getattr(r.metrics[m.key], p) if m.key in r.metrics else None for p in parts]
+        writer.writerow(row)
+    return out.getvalue()
+
+
+def read_comparison(path: Path) -> Comparison:
+    """Read the ``results.json`` that `hybrid.comparison.report.write_report` has left.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    """
+    document = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        results = []
+        for entry in document["results"]:
+            statistics = {}
+            for key, s in entry["metrics"].items():
+                mean, minimum, maximum, low, high = (
+                    float(s[end]) for end in ("mean", "minimum", "maximum", "low", "high")
+                )
+                values = tuple(map(float, s["values"]))
+                statistics[key] = Statistic(mean, minimum, maximum, low, high, values, tuple(s["shots"]))
+            spread = None if entry["spread"] is None else tuple(map(float, entry["spread"]))
+            worth = None if entry["worth"] is None else float(entry["worth"])
+            results.append(MethodResult(**{**entry, "metrics": statistics, "spread": spread, "worth": worth}))
+        return Comparison(document["shot"], tuple(results), document["facts"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is no result of a comparison: expected {error}") from None

@@ -1,0 +1,602 @@
+"""Read and write OpenEXR files: pixels and headers. `hybrid.files.layers` says which channels are what.
+
+A file is read whole: its channels are compressed together, and taking 3 of 40 channels costs two thirds of
+the time of taking all. `read_exr(path, pixels=False)` reads the headers alone, which takes no time.
+
+Channels go by *qualified* names: the name in the file, preceded in a multi-part file by the part's name
+unless the channel already starts with it, so that one scheme covers both kinds (``ViewLayer.Combined.R``).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import OpenEXR
+
+from hybrid.files.replace import replace_file
+
+# 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
+# that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
+MAX_PIXELS = 2**28
+_MAX_SIDE = 2**16
+_MAX_TILE = 2**13
+# All channels of all parts together. Allows 16 float channels at MAX_PIXELS, 500 at 4K.
+_MAX_BYTES_PER_PIXEL = 64
+
+HALF_MAX = 65504.0
+_MAGIC = b"\x76\x2f\x31\x01"
+
+
+class ExrError(ValueError):
+    """An OpenEXR file that cannot be used, or that lacks a layer. One line; names the file."""
+
+
+# --------------------------------------------------------------------------------------------------------
+# What is in a file
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Channels that belong together, all of one part.
+
+    `channels` are qualified names, in the order R G B A or X Y Z W, any others after those. `name` is what
+    they share (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file.
+    """
+
+    name: str
+    part: int
+    view: str | None
+    channels: tuple[str, ...]
+
+    def __str__(self) -> str:
+        components = [channel.rpartition(".")[2] for channel in self.channels]
+        joined = ("" if all(len(c) == 1 for c in components) else ",").join(components)
+        return f"{self.name}.{joined}" if self.name else joined
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One part of a file: its header as the binding gives it, and its channels under their own names."""
+
+    name: str
+    header: Mapping[str, Any]
+    channels: Mapping[str, OpenEXR.Channel]
+
+    @property
+    def view(self) -> str | None:
+        """The stereo view all of this part belongs to, if the part names one."""
+        return self.header.get("view")
+
+    @property
+    def data_window(self) -> tuple[int, int, int, int]:
+        """First column, first row, last column, last row of the pixels that are stored."""
+        low, high = self.header["dataWindow"]
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+    @property
+    def display_window(self) -> tuple[int, int, int, int]:
+        """First column, first row, last column, last row of the picture."""
+        low, high = self.header["displayWindow"]
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the data window."""
+        left, top, right, bottom = self.data_window
+        return bottom - top + 1, right - left + 1
+
+
+@dataclass(frozen=True, eq=False)
+class ExrImage:
+    """The parts, channels and layers of a file."""
+
+    path: Path
+    parts: tuple[Part, ...]
+
+    @cached_property
+    def views(self) -> tuple[str, ...]:
+        """Names of the stereo views, the default one first; () for an ordinary picture."""
+        named = self.parts[0].header.get("multiView") or [p.view for p in self.parts if p.view]
+        if not named:
+            tokens = {token for p in self.parts for c in p.channels for token in c.split(".")[:-1]}
+            named = ["left", "right"] if {"left", "right"} <= tokens else []
+        return tuple(dict.fromkeys(named))
+
+    @cached_property
+    def _origin(self) -> dict[str, tuple[int, str]]:
+        """Qualified name → (part, name in that part)."""
+        origin: dict[str, tuple[int, str]] = {}
+        for index, part in enumerate(self.parts):
+            for name in part.channels:
+                qualified = self._qualify(part, name)
+                if qualified in origin:  # parts "a" and "a.b" with channels "b.R" and "R"
+                    qualified = f"{index}.{qualified}"
+                origin[qualified] = index, name
+        return origin
+
+    def _qualify(self, part: Part, name: str) -> str:
+        """The name of a channel in the whole file; the same for single-part and multi-part stereo."""
+        if len(self.parts) == 1:
+            return name
+        base = part.name
+        if part.view:
+            # Part names are unique, so writers add the view to them: Blender "ViewLayer.Combined-left",
+            # with channels "ViewLayer.Combined.R"; others "rgba_left", with channels "R".
+            base = re.sub(rf"[-_.]{re.escape(part.view)}$", "", base)
+        *layer, component = name.split(".")
+        own = ".".join(layer)
+        layer = [own] if own == base or own.startswith(base + ".") else [base, *layer]
+        if part.view and part.view not in ".".join(layer).split("."):
+            layer.append(part.view)
+        return ".".join([*layer, component])
+
+    def own_name(self, channel: str) -> str:
+        """The name that a channel has in its part."""
+        return self._origin[channel][1]
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """All layers, in the order of the file."""
+        groups: dict[tuple[str, int], list[str]] = {}
+        for qualified, (part, _) in self._origin.items():
+            groups.setdefault((qualified.rpartition(".")[0], part), []).append(qualified)
+        return tuple(
+            Layer(name, part, self._view(name, part), tuple(sorted(channels, key=_component_order)))
+            for (name, part), channels in groups.items()
+        )
+
+    def _view(self, layer: str, part: int) -> str | None:
+        tokens = layer.split(".")
+        return self.parts[part].view or next((view for view in self.views if view in tokens), None)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Qualified names of all channels."""
+        return tuple(self._origin)
+
+    def part_of(self, name: str) -> Part:
+        """The part that holds a channel.
+
+        Raises
+        ------
+        ExrError
+            If there is no such channel.
+        """
+        if name not in self._origin:
+            raise ExrError(f"{self.path}: no channel {name!r}; {self.listing()}")
+        return self.parts[self._origin[name][0]]
+
+    def channel(self, name: str) -> np.ndarray:
+        """Pixels of a channel: (H, W) float16, float32 or uint32, as in the file; not a copy.
+
+        Raises
+        ------
+        ExrError
+            If there is no such channel.
+        """
+        part = self.part_of(name)
+        pixels: np.ndarray | None = part.channels[self._origin[name][1]].pixels
+        if pixels is None or pixels.shape != part.shape:
+            raise ValueError(f"{self.path}: pixels were not read (pixels=False)")
+        return pixels
+
+    def pixels(self, channels: tuple[str, ...]) -> np.ndarray:
+        """Several channels of one part, stacked: (H, W, C) float32.
+
+        Raises
+        ------
+        ExrError
+            If a channel is not there.
+        """
+        planes = [self.channel(name) for name in channels]
+        out = np.empty((*planes[0].shape, len(planes)), np.float32)
+        for index, plane in enumerate(planes):
+            out[..., index] = plane
+        return out
+
+    def layer(self, name: str) -> Layer:
+        """The layer with this name, or the one channel with it as a layer of one.
+
+        Tried in this order: the name of a layer, with or without its view; ``RGBA`` for the bare channels;
+        the name of a channel; that of a part; the same whatever the case; the end of a layer's name
+        (``DiffDir`` for ``ViewLayer.DiffDir``). The default stereo view goes before the others.
+
+        Raises
+        ------
+        ExrError
+            If there is no such layer, or several; lists what is there.
+        """
+        layers = sorted(self.layers, key=lambda layer: layer.view not in (None, *self.views[:1]))
+        names = [(layer.name, layer) for layer in layers]
+        names += [(without_view(layer), layer) for layer in layers]
+        names += [(alias, layer) for layer in layers if not layer.name for alias in ("RGBA", "RGB")]
+        names += [(c, Layer(c, layer.part, layer.view, (c,))) for layer in layers for c in layer.channels]
+        names += [(self.parts[layer.part].name, layer) for layer in layers]
+        for fold in (str, str.lower):
+            for known, layer in names:
+                if fold(known) == fold(name):
+                    return layer
+        end = "." + name.lower()
+        ends = [x for x in layers if any(n.lower().endswith(end) for n in (x.name, without_view(x)))]
+        if not ends:
+            raise ExrError(f"{self.path}: no layer {name!r}; {self.listing()}")
+        if len({without_view(layer) for layer in ends}) > 1:
+            several = ", ".join(str(layer) for layer in ends)
+            raise ExrError(f"{self.path}: layer {name!r} is ambiguous: {several}")
+        return ends[0]
+
+    def listing(self) -> str:
+        """What is in the file, for an error message; shortened if there is much of it."""
+        names = [str(layer) for layer in self.layers]
+        more = f" and {len(names) - 24} more" if len(names) > 24 else ""
+        return f"it has {', '.join(names[:24])}{more}"
+
+
+def _component_order(channel: str) -> tuple[int, str]:
+    """Sort key that puts the components of a colour or vector in their order."""
+    component = component_of(channel)
+    order = "RGBAXYZWUV".find(component) if len(component) == 1 else -1
+    return (order if order >= 0 else 99), channel
+
+
+def component_of(channel: str) -> str:
+    """R, G, B, A, X, … of a channel's name; V-Ray writes ``diffuse.red``, Cryptomatte ``r``."""
+    component = channel.rpartition(".")[2].upper()
+    return {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}.get(component, component)
+
+
+def without_view(layer: Layer) -> str:
+    """The layer's name less the name of its view (``ViewLayer.Combined.left`` → ``ViewLayer.Combined``)."""
+    tokens = layer.name.split(".")
+    if layer.view in tokens:
+        tokens.remove(layer.view)
+    return ".".join(tokens)
+
+
+# --------------------------------------------------------------------------------------------------------
+# Reading
+
+
+def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIXELS) -> ExrImage:
+    """Read an OpenEXR file: scan lines or tiles, one part or several, half, float and uint channels.
+
+    Parameters
+    ----------
+    path
+        The file.
+    pixels
+        False reads the headers only; the channels' names are there, their pixels are not.
+    max_pixels
+        The largest data window accepted. Memory is bounded by 64 bytes for each of these pixels.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    ExrError
+        If it is no OpenEXR file, is damaged or truncated (also where only one part of it is), too large,
+        deep, mip-mapped or chroma-subsampled.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        if file.read(4) != _MAGIC:
+            raise ExrError(f"{path}: not an OpenEXR file")
+    OpenEXR.setMaxImageSize(_MAX_SIDE, _MAX_SIDE)
+    OpenEXR.setMaxTileSize(_MAX_TILE, _MAX_TILE)
+    headers = _open(path, header_only=True)
+    _refuse_unusable(path, headers, max_pixels)
+    return ExrImage(path, _open(path, header_only=False) if pixels else headers)
+
+
+def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
+    parts: tuple[Part, ...] = ()
+    with _library_messages() as messages:
+        try:
+            file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+            parts = tuple(
+                Part(
+                    part.header.get("name", ""),
+                    part.header,
+                    {c.name: c for c in (part.header["channels"] if header_only else part.channels.values())},
+                )
+                for part in file.parts
+            )
+        except Exception as error:  # the binding raises RuntimeError, UnicodeDecodeError, MemoryError, …
+            reason = str(error).replace(f" '{path}'", "").removesuffix(" when attempting to open for read")
+            messages.append(reason.replace("\n", " "))
+    # A part whose pixels cannot be read is left out by the binding, with a message and no exception.
+    if messages or not parts:
+        reason = messages[0] if messages else "no parts"
+        raise ExrError(f"{path}: damaged or truncated OpenEXR file ({reason})")
+    return parts
+
+
+def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> None:
+    """Raise ExrError for what is well-formed and cannot be denoised, before memory is taken for it."""
+    total = 0
+    for part in parts:
+        if part.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
+            raise ExrError(f"{path}: deep image; flatten it first")
+        tiles = part.header.get("tiles")
+        if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
+            raise ExrError(f"{path}: mip-mapped texture, not a rendered frame")
+        for name, channel in part.channels.items():
+            if (channel.xSampling, channel.ySampling) != (1, 1):
+                raise ExrError(f"{path}: channel {name!r} is subsampled (luminance-chroma); convert to RGB")
+        height, width = part.shape
+        if height * width > max_pixels:
+            raise ExrError(f"{path}: {width}x{height} pixels, more than the {max_pixels} accepted")
+        total += height * width * 4 * len(part.channels)
+    if not any(part.channels for part in parts):
+        raise ExrError(f"{path}: no channels")
+    if total > _MAX_BYTES_PER_PIXEL * max_pixels:
+        raise ExrError(f"{path}: decodes to {total / 2**30:.0f} GiB, too much")
+
+
+class _Listener:
+    """Stands in for sys.stdout and keeps what one thread writes; all else goes where it would have gone."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._thread = threading.get_ident()
+        self.heard = ""
+
+    def write(self, text: str) -> int:
+        if threading.get_ident() != self._thread:
+            return self._stream.write(text)
+        self.heard += text
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+_LIBRARY_LOCK = threading.Lock()
+
+
+@contextmanager
+def _library_messages() -> Iterator[list[str]]:
+    """Gather what OpenEXR says about a damaged file, which it prints instead of raising.
+
+    The C library prints to file descriptor 2 and the binding to sys.stdout. What others write to descriptor
+    2 meanwhile (decoding releases the GIL) is passed on afterwards. The list is filled on leaving.
+    """
+    messages: list[str] = []
+    with _LIBRARY_LOCK, tempfile.TemporaryFile() as sink:
+        listener = _Listener(sys.stdout)
+        stderr = os.dup(2)
+        os.dup2(sink.fileno(), 2)
+        sys.stdout = listener
+        try:
+            yield messages
+        finally:
+            if sys.stdout is listener:
+                sys.stdout = listener._stream
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            sink.seek(0)
+            printed = sink.readlines()
+            for line in printed:
+                if b"(EXR_ERR" not in line:
+                    os.write(2, line)
+            # The first line of the C library says most precisely what is wrong.
+            reasons = [
+                line.decode(errors="replace").partition("(EXR_ERR")[2].partition(") ")[2].strip()
+                for line in printed
+                if b"(EXR_ERR" in line
+            ]
+            reasons += [line.rpartition(" - ")[2] for line in listener.heard.splitlines()]
+            messages[:0] = reasons
+
+
+# --------------------------------------------------------------------------------------------------------
+# Writing
+
+
+def write_exr(
+    path: str | Path,
+    source: ExrImage,
+    replaced: Mapping[str, np.ndarray],
+    extra: Mapping[str, np.ndarray] | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> int:
+    """Write a file again with some channels replaced; every other channel, part and attribute is kept.
+
+    Parameters
+    ----------
+    path
+        The file to write; may be the source itself. Nothing is there before all of it is.
+    source
+        What to write, from `read_exr`.
+    replaced
+        Qualified channel name → (H, W), of the size of its part's data window. Converted to the pixel type
+        the channel has in the source.
+    extra
+        Layers to add: name → (H, W) or (H, W, C), of the size of some part's data window; float16, float32 or
+        uint32, written as such.
+    attributes
+        Strings to add to the header of the first part.
+
+    Returns
+    -------
+    int
+        How many finite values were too large for a half channel, and were written as ±65504, not as Inf.
+
+    Raises
+    ------
+    ExrError
+        If the source has no such channel.
+    ValueError
+        If an array has the wrong shape, or an attribute would change one that is not a string.
+    OSError
+        If the file cannot be written; no partial file is left.
+
+    Notes
+    -----
+    Channels that are not replaced keep their values exactly, unless the file's compression is a lossy one
+    (DWA, B44), which loses a little each time a file is written.
+    """
+    by_part: list[dict[str, OpenEXR.Channel]] = [dict(part.channels) for part in source.parts]
+    clamped = 0
+    for name, values in replaced.items():
+        old = source.channel(name)
+        if values.shape != old.shape:
+            raise ValueError(f"channel {name!r} has shape {values.shape}, expected {old.shape}")
+        at, own = source._origin[name]
+        pixels, count = _convert(values, old.dtype)
+        clamped += count
+        by_part[at][own] = _like(source.parts[at].channels[own], own, pixels)
+
+    added: list[OpenEXR.Part] = []
+    for name, values in (extra or {}).items():
+        over = next((i for i, part in enumerate(source.parts) if part.shape == values.shape[:2]), None)
+        if over is None:
+            raise ValueError(f"layer {name!r} has shape {values.shape}, expected {source.parts[0].shape}")
+        channels = {n: OpenEXR.Channel(n, np.ascontiguousarray(v)) for n, v in _named(name, values).items()}
+        if len(source.parts) == 1:
+            by_part[over].update(channels)
+        else:
+            header = {k: v for k, v in source.parts[over].header.items() if k in _SHARED}
+            added.append(OpenEXR.Part(header, channels, name))
+
+    parts = []
+    for index, part in enumerate(source.parts):
+        header = _writable(part.header)
+        for key, value in (attributes or {}).items() if index == 0 else ():
+            if not isinstance(header.get(key, ""), str):
+                raise ValueError(f"attribute {key!r} of {source.path} is not a string, and cannot be set")
+            header[key] = value
+        parts.append(OpenEXR.Part(header, by_part[index], part.name))
+    _write(Path(path), parts + added)
+    return clamped
+
+
+def write_layers(
+    path: str | Path,
+    layers: Mapping[str, np.ndarray],
+    *,
+    half: bool = True,
+    attributes: Mapping[str, str] | None = None,
+) -> int:
+    """Write a new single-part file from named layers (ZIP, scan lines).
+
+    Parameters
+    ----------
+    path
+        The file to write.
+    layers
+        Name → (H, W) or (H, W, C ≤ 4), C components named R G B A; X Y Z W where the name ends in normal,
+        vector, motion or position; Z for depth; Y for other single channels. "" writes bare R, G, B, A.
+    half
+        Store R, G, B, A and Y as half. X, Y, Z, W and depth stay float32, as in Blender: half has three
+        digits, too few for a motion of 100 pixels.
+    attributes
+        Strings for the header.
+
+    Returns
+    -------
+    int
+        How many finite values were too large for half, and were written as ±65504.
+
+    Raises
+    ------
+    ValueError
+        If the layers differ in size, or there are none.
+    OSError
+        If the file cannot be written; no partial file is left.
+    """
+    sizes = {name: values.shape[:2] for name, values in layers.items()}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"layers must be of one size, got {sizes}")
+    channels, clamped = {}, 0
+    for name, values in layers.items():
+        for channel, plane in _named(name, values).items():
+            data = _is_vector(name) or channel.endswith(".Z")
+            kind = np.dtype(np.float16 if half and not data else np.float32)
+            pixels, count = _convert(plane, plane.dtype if plane.dtype == np.uint32 else kind)
+            clamped += count
+            channels[channel] = OpenEXR.Channel(channel, pixels)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
+    _write(Path(path), [OpenEXR.Part(header, channels, "")])
+    return clamped
+
+
+# What a part that is added to a multi-part file takes from the one it lies over.
+_SHARED = (
+    "compression",
+    "dataWindow",
+    "displayWindow",
+    "pixelAspectRatio",
+    "screenWindowCenter",
+    "screenWindowWidth",
+    "chromaticities",
+    "timeCode",
+    "view",
+)
+
+
+def _writable(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes without the channel list, which the binding makes from the channels.
+
+    An empty list is left out too: the binding cannot tell of what, refuses it, and it says nothing.
+    """
+    return {k: v for k, v in header.items() if k != "channels" and not (isinstance(v, list) and not v)}
+
+
+def _like(channel: OpenEXR.Channel, name: str, pixels: np.ndarray) -> OpenEXR.Channel:
+    return OpenEXR.Channel(name, pixels, channel.xSampling, channel.ySampling, channel.pLinear)
+
+
+def _is_vector(name: str) -> bool:
+    return name.lower().rpartition(".")[2].endswith(("normal", "vector", "motion", "position"))
+
+
+def _named(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Channel name → (H, W), for the layer `name`."""
+    count = 1 if values.ndim == 2 else values.shape[2] if values.ndim == 3 else 0
+    if not 1 <= count <= 4:
+        raise ValueError(f"layer {name!r} has shape {values.shape}, expected (H, W) or (H, W, 1 to 4)")
+    if count == 1:
+        components = "Z" if name.lower().rpartition(".")[2].endswith("depth") else "Y"
+    else:
+        components = "XYZW" if _is_vector(name) else "RGBA" if count > 2 else "XY"
+    planes = values.reshape(*values.shape[:2], count)
+    return {f"{name}.{c}" if name else c: planes[..., i] for i, c in enumerate(components[:count])}
+
+
+def _convert(values: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, int]:
+    """`values` as contiguous pixels of this type, and how many finite ones were beyond its range."""
+    clamped = 0
+    if kind == np.float16 and values.dtype != np.float16:
+        # 65520 and above round to Inf. What is Inf or NaN already stays so: it was not made here.
+        beyond = (np.abs(values) > HALF_MAX) & np.isfinite(values)
+        clamped = int(np.count_nonzero(beyond))
+        if clamped:
+            values = np.where(beyond, np.copysign(np.float32(HALF_MAX), values), values)
+    elif kind == np.uint32 and values.dtype != np.uint32:
+        # Through float64, which holds every uint32 exactly.
+        values = np.clip(np.rint(np.nan_to_num(values.astype(np.float64))), 0, 2**32 - 1)
+    return np.ascontiguousarray(values, dtype=kind), clamped
+
+
+def _write(path: Path, parts: list[OpenEXR.Part]) -> None:
+    """Write parts so that `path` is never a part of a file."""
+    with replace_file(path) as temporary:
+        with _library_messages() as messages:
+            try:
+                OpenEXR.File(parts).write(str(temporary))
+            except Exception as error:
+                messages.append(str(error).replace(str(temporary), str(path)).replace("\n", " "))
+        if messages:  # filled on leaving the block above
+            raise OSError(f"{path}: cannot write: {messages[0]}")

@@ -1,0 +1,457 @@
+"""Shots: numbered EXR files, read lazily, a window of neighbouring frames at a time."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import fileseq
+import numpy as np
+
+from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
+from hybrid.files.layers import ROLES, Layers, find_layers
+from hybrid.files.sequences import PADDING, find_files, format_frames, parse_frames
+from nlm.variance import variance_from_halves
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame of a shot; all arrays of all frames of a shot are of one size.
+
+    Attributes
+    ----------
+    number
+        Frame number.
+    color
+        (H, W, 3) float32, linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
+    albedo, normal, variance, estimate
+        (H, W, 3) float32 or None. Variance is that of the color's mean, in squared radiance.
+    depth, alpha
+        (H, W) float32 or None.
+    motion
+        (H, W, 2 or 4) float32, pixels, or None; what it means is `motion_convention`'s to say
+        (`hybrid.files.layers.Layers`).
+    aovs
+        Name → (H, W, C) float32, those that were asked for.
+    source
+        The file, if there is one.
+    """
+
+    number: int
+    color: np.ndarray
+    albedo: np.ndarray | None = None
+    normal: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    motion: np.ndarray | None = None
+    motion_convention: str | None = None
+    variance: np.ndarray | None = None
+    alpha: np.ndarray | None = None
+    estimate: np.ndarray | None = None
+    aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    source: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.color.ndim != 3 or self.color.shape[2] != 3:
+            raise ValueError(f"color has shape {self.color.shape}, expected (H, W, 3)")
+        size = self.color.shape[:2]
+        expected: dict[str, tuple[tuple[int, ...], ...]] = {
+            "color": ((*size, 3),),
+            **{name: ((*size, 3),) for name in ("albedo", "normal", "variance", "estimate")},
+            **{name: (size,) for name in ("depth", "alpha")},
+            "motion": ((*size, 2), (*size, 4)),
+        }
+        for name, shapes in expected.items():
+            array = getattr(self, name)
+            if array is not None and (array.shape not in shapes or array.dtype != np.float32):
+                allowed = " or ".join(map(str, shapes))
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {allowed}")
+        for name, array in self.aovs.items():
+            if array.ndim != 3 or array.shape[:2] != size:
+                raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
+        if (self.motion is None) != (self.motion_convention is None):
+            raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
+
+
+class Shot:
+    """The frames of a shot. Made by `open_shot`.
+
+    Attributes
+    ----------
+    numbers
+        The frames that were asked for and are there, ascending.
+    step
+        Distance between neighbouring frames: 1, or 2 where only every second frame was rendered. A renderer's
+        motion vectors usually span one frame, whatever the step.
+    warnings
+        One line each.
+
+    Notes
+    -----
+    Neighbours come from all the files there are, also those outside `numbers`: denoising every second frame,
+    or the last ten, gives the same pictures as denoising all of them.
+
+    At most `keep` frames are held, so memory does not grow with the shot; a window that slides along it reads
+    each file once.
+
+    Renderers may crop each frame to what is not empty, so that data windows differ from frame to frame, and
+    from part to part. Frames are therefore read onto the smallest window that holds those of all frames,
+    with 0 where a file has nothing, as OpenEXR defines it; `write` cuts them again.
+    """
+
+    def __init__(
+        self,
+        files: Mapping[int, Path],
+        *,
+        frames: str | None = None,
+        layers: Mapping[str, str] | None = None,
+        aovs: Sequence[str] = (),
+        keep: int = 2,
+        max_pixels: int = MAX_PIXELS,
+    ) -> None:
+        wanted = sorted(files) if frames is None else parse_frames(frames)
+        # The numbers asked for count as well: --frames 1-5 where 1, 3 and 5 are there has two holes.
+        self.step = math.gcd(*(b - a for a, b in pairwise(sorted({*files, *wanted})))) or 1
+        if frames is None:
+            wanted = list(range(wanted[0], wanted[-1] + 1, self.step))
+        self.numbers = tuple(number for number in wanted if number in files)
+        self.warnings: list[str] = []
+        if not self.numbers:
+            folder = next(iter(files.values())).parent
+            raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
+        if missing := [number for number in wanted if number not in files]:
+            self.warnings.append(f"missing frames {format_frames(missing)}: the windows beside them are narrower")
+        self._files = dict(files)
+        self._overrides = dict(layers or {})
+        self._aovs = tuple(aovs)
+        self._keep = keep
+        self._max_pixels = max_pixels
+        self._held: OrderedDict[int, Frame] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def has(self, number: int) -> bool:
+        """Whether there is a file for this frame, asked for or not."""
+        return number in self._files
+
+    @property
+    def aovs(self) -> tuple[str, ...]:
+        """Names of the further layers that are loaded."""
+        return self._aovs
+
+    @property
+    def count(self) -> int:
+        """How many files there are, asked for or not."""
+        return len(self._files)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of every frame, from the headers."""
+        left, top, right, bottom = self._canvas
+        return bottom - top + 1, right - left + 1
+
+    def reads(self, path: Path) -> bool:
+        """Whether this is one of the shot's files, asked for or not, by whatever name."""
+        if path.resolve() in self._resolved:
+            return True
+        # Another name for the same file: a hard link, or another case where the disk takes no notice of it.
+        return _identity(path) in self._identities
+
+    def around(self, reach: int) -> Shot:
+        """The same shot, asked also for the frames up to `reach` steps before and after, where they are there."""
+        near = {n + k * self.step for n in self.numbers for k in range(-reach, reach + 1)}
+        wider = copy(self)
+        wider.numbers = tuple(sorted(near & self._files.keys()))
+        return wider
+
+    def remade(self, files: Mapping[int, Path]) -> Shot:
+        """The same frames from files that `write` has made of these: the denoised picture is now the color."""
+        # A name of its own has any layer but that of bare channels.
+        color = self.layers(self.numbers[0]).target.name or "RGBA"
+        made = Shot(
+            files,
+            layers={**self._overrides, "color": color},
+            aovs=self._aovs,
+            keep=self._keep,
+            max_pixels=self._max_pixels,
+        )
+        made.numbers, made.step = self.numbers, self.step
+        return made
+
+    def path(self, number: int) -> Path:
+        """The file of a frame.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        if number not in self._files:
+            raise FileNotFoundError(f"frame {number} is not there; the shot has {format_frames(self._files)}")
+        return self._files[number]
+
+    def source(self, number: int) -> ExrImage:
+        """Everything in the file of a frame; not kept."""
+        return self._read(self.path(number))
+
+    def layers(self, number: int) -> Layers:
+        """Which channels of a frame's file are taken for what; reads the header only."""
+        return find_layers(self.header(number), self._overrides)
+
+    def header(self, number: int) -> ExrImage:
+        """Parts and channels of a frame's file, without pixels."""
+        return self._read(self.path(number), pixels=False)
+
+    def read(self, number: int) -> Frame:
+        """A frame, from memory if it was read lately.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is not there.
+        ExrError
+            If the file is damaged, or lacks a layer.
+        ValueError
+            If its size is not that of the first frame.
+        """
+        if number in self._held:
+            self._held.move_to_end(number)
+            return self._held[number]
+        image = self.source(number)
+        layers = find_layers(image, self._overrides)
+        size = _size(image.parts[layers.color.part])
+        if size != self._size:
+            first, second = ("x".join(map(str, s)) for s in (self._size, size))
+            raise ValueError(f"frames differ in size: frame {self.numbers[0]} is {first}, frame {number} is {second}")
+        frame = _frame(image, layers, self._aovs, self._canvas, number)
+        self._held[number] = frame
+        while len(self._held) > self._keep:
+            self._held.popitem(last=False)
+        return frame
+
+    def write(
+        self,
+        path: str | Path,
+        number: int,
+        images: Mapping[str, np.ndarray],
+        extra: Mapping[str, np.ndarray] | None = None,
+        attributes: Mapping[str, str] | None = None,
+    ) -> int:
+        """Write a frame's file again with some layers replaced (`hybrid.files.exr.write_exr`).
+
+        Parameters
+        ----------
+        path
+            The file to write.
+        number
+            Frame number.
+        images
+            Role or name of a layer → (H, W, C) or (H, W), of the size of `Frame.color`. "color" goes where
+            the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
+        extra
+            Layers to add; name → (H, W, C) or (H, W), of the same size.
+        attributes
+            Strings for the header.
+
+        Returns
+        -------
+        int
+            How many values were too large for a half channel.
+        """
+        source = self.source(number)
+        layers = find_layers(source, self._overrides)
+        replaced: dict[str, np.ndarray] = {}
+        for name, image in images.items():
+            taken = layers.target if name == "color" else getattr(layers, name) if name in ROLES else None
+            layer = taken or source.layer(name)
+            part = source.parts[layer.part]
+            cut = self._cut(image, part)
+            # Another part may reach beyond the color of all frames; what is there was not read, and stays.
+            inside = self._cut(np.ones(image.shape[:2], bool), part)
+            planes = [cut] if cut.ndim == 2 else list(np.moveaxis(cut, 2, 0))
+            for channel, plane in zip(layer.channels, planes, strict=False):
+                replaced[channel] = plane if inside.all() else np.where(inside, plane, source.channel(channel))
+        home = source.parts[layers.color.part]
+        added = {name: self._cut(image, home) for name, image in (extra or {}).items()}
+        return write_exr(path, source, replaced, added, attributes)
+
+    def _cut(self, image: np.ndarray, part: Part) -> np.ndarray:
+        """What lies on the data window of a part, of an image on the shot's."""
+        (left, top, right, bottom), (x, y, _, _) = self._canvas, _data_window(part)
+        if image.shape[:2] != (bottom - top + 1, right - left + 1):
+            raise ValueError(
+                f"image has shape {image.shape}, expected {(bottom - top + 1, right - left + 1)} and channels"
+            )
+        return _placed(image, (left - x, top - y), part.shape)
+
+    def _read(self, path: Path, *, pixels: bool = True) -> ExrImage:
+        return read_exr(path, pixels=pixels, max_pixels=self._max_pixels)
+
+    @cached_property
+    def _identities(self) -> frozenset[tuple[int, int]]:
+        return frozenset(known for file in self._files.values() if (known := _identity(file)) is not None)
+
+    @cached_property
+    def _resolved(self) -> frozenset[Path]:
+        return frozenset(file.resolve() for file in self._files.values())
+
+    @cached_property
+    def _size(self) -> tuple[int, int]:
+        """Width and height of the first frame's display window."""
+        image = self._read(self.path(self.numbers[0]), pixels=False)
+        return _size(image.parts[find_layers(image, self._overrides).color.part])
+
+    @cached_property
+    def _canvas(self) -> tuple[int, int, int, int]:
+        """The window, relative to the display window, that holds the color of every frame; from headers."""
+        boxes, size = [], self._size
+        for path in self._files.values():
+            # A file that cannot be read, or is of another size, is an error when its turn comes, not now.
+            with suppress(ExrError, OSError):
+                image = self._read(path, pixels=False)
+                home = image.parts[find_layers(image, self._overrides).color.part]
+                if _size(home) == size:
+                    boxes.append(_data_window(home))
+        lefts, tops, rights, bottoms = zip(*boxes, strict=True)
+        return min(lefts), min(tops), max(rights), max(bottoms)
+
+
+def open_shot(
+    spec: str | Path,
+    *,
+    frames: str | None = None,
+    layers: Mapping[str, str] | None = None,
+    aovs: Sequence[str] = (),
+    keep: int = 2,
+    max_pixels: int = MAX_PIXELS,
+) -> Shot:
+    """Find the files of a shot. None is opened yet.
+
+    Parameters
+    ----------
+    spec
+        ``shot.####.exr``, ``shot.%04d.exr``, ``shot.@@@@.exr``, a folder with one sequence in it, or one file.
+    frames
+        A range such as ``1001-1010x2``; all by default.
+    layers
+        Overrides for `hybrid.files.layers.find_layers`.
+    aovs
+        Names of further layers to load into `Frame.aovs`.
+    keep
+        How many frames to hold in memory; `Shot.window` holds as many as it needs.
+    max_pixels
+        Of the largest frame that is read, see `hybrid.files.exr.read_exr`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If nothing matches; names the pattern and what the folder has.
+    ValueError
+        If the folder has several sequences, or `frames` is not a range.
+    """
+    return Shot(find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep, max_pixels=max_pixels)
+
+
+def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = False) -> Path:
+    """Where the result for a frame goes.
+
+    Parameters
+    ----------
+    pattern
+        ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (one that is
+        there, or any name without ``.exr``), which keeps the input's file names.
+    shot
+        The shot.
+    number
+        Frame number.
+    beside
+        Frames that were not asked for get files too.
+
+    Raises
+    ------
+    ValueError
+        If several frames would get one name, or an input file would be overwritten.
+    """
+    pattern = str(pattern)
+    if Path(pattern).is_dir() or not pattern.lower().endswith(".exr"):
+        path = Path(pattern) / shot.path(number).name
+    else:
+        sequence = fileseq.FileSequence(pattern, pad_style=PADDING)
+        placeholder = bool(sequence.padding()) and not sequence.frameSet()
+        count = shot.count if beside else len(shot)
+        if not placeholder and count > 1:
+            raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
+        path = Path(sequence.frame(number)) if placeholder else Path(pattern)
+    # Not only its own input: frames still to come need the noisy neighbours.
+    if shot.reads(path):
+        raise ValueError(f"output {str(path)!r} would overwrite an input frame")
+    return path
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What the operating system knows a file by; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _size(part: Part) -> tuple[int, int]:
+    """Width and height of the display window."""
+    left, top, right, bottom = part.display_window
+    return right - left + 1, bottom - top + 1
+
+
+def _data_window(part: Part) -> tuple[int, int, int, int]:
+    """The data window relative to the display window's first pixel."""
+    x, y = part.display_window[:2]
+    left, top, right, bottom = part.data_window
+    return left - x, top - y, right - x, bottom - y
+
+
+def _frame(
+    image: ExrImage, layers: Layers, aovs: Sequence[str], canvas: tuple[int, int, int, int], number: int
+) -> Frame:
+    left, top, right, bottom = canvas
+
+    def pixels(layer: Layer) -> np.ndarray:
+        x, y = _data_window(image.parts[layer.part])[:2]
+        size = bottom - top + 1, right - left + 1
+        return _placed(image.pixels(layer.channels), (x - left, y - top), size)
+
+    taken = {role: pixels(layer) for role in ROLES if (layer := getattr(layers, role)) is not None}
+    for role in {"depth", "alpha"} & taken.keys():
+        taken[role] = np.ascontiguousarray(taken[role][..., 0])
+    if "variance" in taken and taken["variance"].shape[2] == 1:
+        taken["variance"] = np.repeat(taken["variance"], 3, axis=2)
+    halves = taken.pop("half_a", None), taken.pop("half_b", None)
+    if "variance" not in taken and halves[0] is not None and halves[1] is not None:
+        taken["variance"] = variance_from_halves(halves[0], halves[1])
+    return Frame(
+        number=number,
+        **taken,
+        motion_convention=layers.motion_convention,
+        aovs={name: pixels(image.layer(name)) for name in aovs},
+        source=image.path,
+    )
+
+
+def _placed(array: np.ndarray, shift: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """`array` moved right and down by `shift`, cut or filled with 0 to `size` (H, W)."""
+    if shift == (0, 0) and array.shape[:2] == size:
+        return array
+    out = np.zeros((*size, *array.shape[2:]), array.dtype)
+    x, y = shift
+    top, bottom = max(0, y), min(size[0], y + array.shape[0])
+    left, right = max(0, x), min(size[1], x + array.shape[1])
+    if top < bottom and left < right:
+        out[top:bottom, left:right] = array[top - y : bottom - y, left - x : right - x]
+    return out

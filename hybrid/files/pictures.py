@@ -1,0 +1,28 @@
+"""PNG pictures to look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.files.replace import replace_file
+
+Array = NDArray[np.float32]
+
+
+def encode_srgb(linear: NDArray[Any]) -> Array:
+    """Clip to [0, 1] and encode as sRGB; any shape."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def write_png(path: Path, picture: NDArray[Any]) -> None:
+    """Write (H, W, 3), encoded, in [0, 1], with 8 bits; as a whole or not at all, and make the folder."""
+    _, data = cv2.imencode(".png", np.round(picture[..., ::-1] * 255).astype(np.uint8))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as temporary:
+        temporary.write_bytes(data.tobytes())

@@ -1,0 +1,139 @@
+"""Training clips: aligned windows at several noise levels, from shots to files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hybrid.alignment.align import Aligner
+from hybrid.estimates import choose_estimate
+from hybrid.files.frames import Shot
+from hybrid.neural.denoiser import tensor_of
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import gated_average
+from network.clips import Clip, importance, important_places, write_shards
+from network.inputs import window_exposure
+from nlm.average import replace_nonfinite
+
+
+def write_clips(
+    levels: Mapping[str, Shot],
+    samples: Sequence[float],
+    folder: Path,
+    name: str,
+    *,
+    radius: int = 2,
+    tile: int = 128,
+    tiles: int = 4,
+    estimate: str = "auto",
+    reference: Shot | None = None,
+    seed: int = 0,
+    advance: Callable[[], object] = lambda: None,
+) -> list[Path]:
+    """Write the training clips of a shot.
+
+    Parameters
+    ----------
+    levels : mapping of str to Shot
+        Independent renders of the same frames.
+    samples : sequence of float
+        Samples per pixel of each.
+    folder : Path
+        Where the shards are written.
+    name : str
+        Of the shot; sets are split by it.
+    radius : int
+        Frames on each side of the centre.
+    tile : int
+        Side of a clip, pixels; 0 for whole frames.
+    tiles : int
+        Clips of each frame, placed by `network.clips.importance`.
+    estimate : str
+        Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
+    reference : Shot, optional
+        The same frames clean, or some of them: clips are made of these alone, and trained towards them.
+    seed : int
+        Of the places.
+    advance : callable
+        Called after each frame.
+
+    Returns
+    -------
+    list of Path
+        The shards.
+
+    Raises
+    ------
+    ValueError
+        If the levels have no frame in common, frames are smaller than a tile, or there are no estimates.
+
+    References
+    ----------
+    Kalojanov and Thurston 2023, section 6, "Training Data".
+    """
+    shots = list(levels.values())
+    every = shots if reference is None else [*shots, reference]
+    numbers = [number for number in shots[0].numbers if all(shot.has(number) for shot in every)]
+    if not numbers:
+        what = ", ".join(levels) + ("" if reference is None else " and the reference")
+        raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
+    aligners = [
+        Aligner(shot, plan_shot(shot).stages, radius=radius, estimates=choose_estimate(estimate, shot).estimates)
+        for shot in shots
+    ]
+
+    def make() -> Iterator[Clip]:
+        rng = np.random.default_rng(seed)
+        for number in numbers:
+            whole = _clip([_level(shot, aligner, number) for shot, aligner in zip(shots, aligners, strict=True)])
+            if reference is not None:
+                clean = tensor_of(replace_nonfinite(reference.read(number).color)[0][None])[:, 0]
+                whole = replace(whole, reference=clean.expand_as(whole.noisy))
+            if tile == 0:
+                yield whole
+            else:
+                if min(whole.color.shape[-2:]) < tile:
+                    height, width = whole.color.shape[-2:]
+                    raise ValueError(f"tile: expected at most the frame's {width}×{height} pixels, got {tile}")
+                noisiest = min(range(len(samples)), key=lambda level: samples[level])
+                middle, scale = whole.color.shape[1] // 2, whole.exposure[noisiest]
+                weights = importance(
+                    whole.noisy[noisiest] / scale,
+                    whole.pseudo_reference[noisiest] / scale,
+                    whole.albedo[noisiest, middle],
+                    whole.confidence[noisiest],
+                )
+                for y, x in important_places(weights, tile, tiles, rng):
+                    yield whole.crop(y, x, tile)
+            advance()
+
+    return write_shards(folder, name, samples, make())
+
+
+def _level(shot: Shot, aligner: Aligner, number: int) -> dict[str, torch.Tensor]:
+    """What a clip holds of one noise level, with N = 1 in front."""
+    aligned = aligner.align(number)
+    if aligned.estimate is None:
+        raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
+    color = aligned.mixed(aligned.color)
+    noisy, _ = replace_nonfinite(shot.read(number).color)
+    return {
+        "color": tensor_of(color),
+        "albedo": tensor_of(np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo)),
+        "normal": tensor_of(np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal)),
+        "estimate": tensor_of(aligned.estimate),
+        "confidence": tensor_of(aligned.confidence[..., None]),
+        "modulation": tensor_of(aligned.modulation[None])[:, 0],
+        "noisy": tensor_of(noisy[None])[:, 0],
+        "pseudo_reference": tensor_of(gated_average(aligned)[None])[:, 0],
+        "exposure": window_exposure(tensor_of(color)),
+    }
+
+
+def _clip(levels: list[dict[str, torch.Tensor]]) -> Clip:
+    """A clip of its levels."""
+    return Clip(**{name: torch.cat([level[name] for level in levels]) for name in levels[0]})

@@ -1,0 +1,98 @@
+"""Training on the clips of a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+
+from hybrid.neural.denoiser import shipped_weights
+from network.checkpoint import load_model
+from network.clips import SamplerConfig, open_clips, split_by_shot
+from network.models import PRESETS, window_length
+from network.train import TrainConfig, train
+
+
+def train_network(
+    clips: Path,
+    output: Path,
+    *,
+    preset: str = "fast",
+    init: str | None = None,
+    validation: Sequence[str] = (),
+    threads: int | None = None,
+    resume: bool = False,
+    log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
+    crop: int = 128,
+    sets: int = 10,
+    seed: int = 0,
+    **settings: Any,
+) -> list[float]:
+    """Train a preset, or weights there are, on the clips of a folder.
+
+    Parameters
+    ----------
+    clips : Path
+        From `write_clips`.
+    output : Path
+        Weights to write.
+    preset : str
+        Of `network.models.PRESETS`; not looked at with init.
+    init : str, optional
+        Weights to start from: a file, or a preset that ships.
+    validation : sequence of str
+        Shots kept out of training.
+    threads : int, optional
+        Of torch and numba.
+    resume, log
+        As for `network.train.train`.
+    crop, sets
+        Of `network.clips.SamplerConfig`.
+    seed : int
+        Of initial weights and samples.
+    **settings
+        Further fields of `network.train.TrainConfig`.
+
+    Returns
+    -------
+    list of float
+        The losses.
+
+    Raises
+    ------
+    ValueError
+        If settings, clips and model do not fit together.
+
+    Notes
+    -----
+    Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over nccl with GPUs and gloo without.
+    """
+    config = TrainConfig(seed=seed, sampler=SamplerConfig(crop=crop, sets=sets), **settings)
+    if threads is not None:
+        torch.set_num_threads(threads)
+        numba.set_num_threads(min(threads, numba.get_num_threads()))
+    training, kept_out = split_by_shot(open_clips(clips), validation)
+    if init is None:
+        if preset not in PRESETS:
+            raise ValueError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
+        model = PRESETS[preset](frames=training.frames, seed=seed)
+    else:
+        path = Path(init) if Path(init).suffix else shipped_weights(init)
+        model = load_model(path)
+        if window_length(model) != training.frames:
+            raise ValueError(
+                f"clips: expected windows of {window_length(model)} frames as {init} has, got {training.frames}"
+            )
+    output.parent.mkdir(parents=True, exist_ok=True)
+    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if together:
+        torch.distributed.init_process_group()
+    try:
+        return train(training, kept_out, model, config, output, resume=resume, log=log)
+    finally:
+        if together:
+            torch.distributed.destroy_process_group()

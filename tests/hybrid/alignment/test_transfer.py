@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from hybrid.alignment.transfer import ALBEDO_FLOOR, compress, demodulate, expand, measure_exposure, remodulate
+
+
+@pytest.fixture
+def radiance():
+    return np.random.default_rng(1).gamma(0.5, 2, (13, 17, 3)).astype(np.float32)
+
+
+def test_remodulation_undoes_demodulation(radiance):
+    albedo = np.random.default_rng(2).uniform(0, 0.9, radiance.shape).astype(np.float32)
+    # One division and one multiplication: two roundings of 6e-8.
+    np.testing.assert_allclose(remodulate(demodulate(radiance, albedo), albedo), radiance, rtol=3e-7)
+
+
+def test_demodulation_is_linear_so_that_aovs_still_sum(radiance):
+    albedo = np.random.default_rng(3).uniform(0, 0.9, radiance.shape).astype(np.float32)
+    parts = demodulate(0.25 * radiance, albedo) + demodulate(0.75 * radiance, albedo)
+    np.testing.assert_allclose(parts, demodulate(radiance, albedo), rtol=3e-7)
+
+
+def test_demodulation_of_black_is_bounded_by_the_floor(radiance):
+    black = np.zeros_like(radiance)
+    np.testing.assert_allclose(demodulate(radiance, black), radiance / np.float32(ALBEDO_FLOOR), rtol=1e-6)
+    assert np.isfinite(demodulate(radiance, -black - 1)).all()  # a negative albedo counts as black
+
+
+def test_one_channel_is_divided_by_the_mean_albedo(radiance):
+    albedo = np.full_like(radiance, 0.45)
+    divisor = np.float32(0.45 + ALBEDO_FLOOR)
+    np.testing.assert_allclose(demodulate(radiance[..., :1], albedo), radiance[..., :1] / divisor, rtol=1e-6)
+
+
+def test_compression_is_undone_by_expansion(radiance):
+    # 1 − x/(1 + x) loses the digits that x/(1 + x) has above 1: a relative error of (1 + x) roundings.
+    np.testing.assert_allclose(expand(compress(radiance, 0.7), 0.7), radiance, rtol=1e-5, atol=1e-6)
+    assert compress(np.float32([[[1e30, 0, -1]]]), 1.0).tolist() == [[[1, 0, 0]]]
+
+
+@pytest.mark.parametrize("scale", [1e-6, 3.0, 1e6])
+def test_exposure_scales_with_the_image(radiance, scale):
+    assert measure_exposure(radiance * np.float32(scale)) == pytest.approx(scale * measure_exposure(radiance), rel=1e-5)
+
+
+def test_exposure_ignores_fireflies_and_what_is_not_finite(radiance):
+    spoiled = radiance.copy()
+    spoiled[3, 4], spoiled[5, 6, 1] = 1e6, np.nan
+    # Two of 221 pixels: the clip moves by one rank and the mean by half a per cent of itself.
+    assert measure_exposure(spoiled) == pytest.approx(measure_exposure(radiance), rel=0.02)
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 5, 3)), np.full((4, 5, 3), np.nan), np.zeros((0, 5, 3))])
+def test_exposure_of_an_image_without_light_is_one(image):
+    assert measure_exposure(image.astype(np.float32)) == 1.0

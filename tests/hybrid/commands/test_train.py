@@ -1,0 +1,248 @@
+"""The commands `prepare` and `train`, and what `denoise` says of a network's work."""
+
+from __future__ import annotations
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.scenes import Scene
+
+torch = pytest.importorskip("torch")
+
+from hybrid.cli import main  # noqa: E402
+from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
+from hybrid.files.exr import read_exr  # noqa: E402
+from hybrid.files.frames import open_shot  # noqa: E402
+from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
+from network.clips import open_clips  # noqa: E402
+from network.models import unet  # noqa: E402
+from network.stabilizer import Stabilizer, StabilizerConfig  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+SCENE = Scene(height=40, width=48)
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    """A shot at three levels with a reference, as ravg simulate leaves it."""
+    folder = tmp_path_factory.mktemp("shots") / "wall"
+    folder.mkdir()
+    for number, level in enumerate(("a", "b", "c", "reference")):
+        scene = Scene(height=40, width=48, noise=0.2 + 0.1 * number)
+        for path in sorted(scene.write(folder / level).glob("*.exr")):
+            path.rename(folder / path.name.replace("shot", level))
+        (folder / level).rmdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A small network of three frames, not trained."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    save_model(path, Stabilizer(StabilizerConfig(frames=3, cell=2, widths=(4, 4), ra_scales=(1,))))
+    return path
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
+    kept = tmp_path / "wall"
+    shutil.copytree(shot, kept)
+    (kept / f"reference.{SCENE.first}.exr").unlink()
+    levels = ("--levels", "a=24,c=8", "--tile", 0, "--estimate", "nlm", "--window", 3)
+    assert run("prepare", kept, "-o", tmp_path / "clips", *levels, "--reference") == 0
+    clips = open_clips(tmp_path / "clips")
+    assert len(clips) == SCENE.frames - 1  # those that have one
+    assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]
+    values = clips.read(0, 0, (0, "reference"))
+    wanted = open_shot(str(kept / "reference.####.exr")).read(SCENE.first + 1).color
+    ratio = values["target"].float().permute(1, 2, 0).numpy() / wanted
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
+
+
+def test_one_sequence_is_prepared_towards_the_reference_beside_it(shot, tmp_path):
+    (tmp_path / "wall.b.0000.safetensors").touch()  # another shot's, whose name begins alike
+    options = ("--tile", 0, "--estimate", "nlm", "--window", 3, "--reference", "--frames", SCENE.first)
+    assert run("prepare", shot / "a.####.exr", "-o", tmp_path, *options) == 0
+    assert (tmp_path / "wall.0000.safetensors").is_file()
+
+
+def test_levels_of_a_shot_are_found_without_its_references(shot):
+    name, levels, samples = open_levels(str(shot), {"a": 24, "c": 8})
+    assert (name, list(levels), samples) == ("wall", ["a", "c"], [24, 8])
+    with pytest.raises(ValueError, match=r"no samples in the header of a; expected --levels a=SAMPLES"):
+        open_levels(str(shot))
+    name, levels, samples = open_levels(str(shot / "a.####.exr"))
+    assert (name, list(levels), samples) == ("wall", ["a"], [1])
+    with pytest.raises(FileNotFoundError, match=r"levels: expected a, d in .*, got a, b, c, reference"):
+        open_levels(str(shot), {"a": 24, "d": 8})
+
+
+def test_samples_are_read_from_cycles_headers():
+    _, levels, samples = open_levels("examples/shot", {"noisy": 24})
+    assert samples == [24]
+    header = read_exr(levels["noisy"].path(8), pixels=False).parts[0].header
+    assert any(key.startswith("cycles.") for key in header) == (open_levels("examples/shot")[2] == [24])
+
+
+@pytest.mark.parametrize("text", ["", "a", "a=", "a=0", "a=x", "=4", "a=4,,b=4"])
+def test_levels_that_are_no_list_are_an_error(text):
+    with pytest.raises(ValueError, match="levels: expected NAME=SAMPLES"):
+        parse_samples(text)
+
+
+def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
+    clips, out = tmp_path / "clips", tmp_path / "w.safetensors"
+    other = tmp_path / "other"
+    shutil.copytree(shot, other)
+    options = ["--levels", "a=24,b=24,c=8", "--window", "3", "--estimate", "nlm"]
+    assert run("prepare", shot, "-o", clips, "--tile", "32", "--tiles", "2", *options) == 0
+    assert run("prepare", shot, other, "-o", clips, "--tile", "0", *options) == 0  # the first is there already
+    found = open_clips(clips)
+    assert (found.shots, len(found.of(["other"]))) == (["other", "wall"], 3)
+    assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
+
+    train = ["train", clips, "-o", out, "--crop", "32", "--batch", "1", "--threads", "1", "--float32"]
+    assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
+    assert "denoised" in capsys.readouterr().err
+    assert load_notes(out)["training"]["steps"] == 2
+    assert load_model(out).config.frames == 3
+    assert list((tmp_path / "logs").glob("events.*"))
+
+    # On one's own footage, one level and no reference, from weights there are.
+    own = tmp_path / "own"
+    assert run("prepare", shot / "a.####.exr", "-o", own, "--tile", "32", "--window", "3", "--estimate", "nlm") == 0
+    tuned = tmp_path / "tuned.safetensors"
+    assert run("train", own, "-o", tuned, "--init", out, "--steps", "1", "--crop", "32", "--rate", "1e-4") == 0
+    assert load_model(tuned).config == load_model(out).config
+
+    capsys.readouterr()
+    for more, message in (
+        (["--steps", "1", "--resume"], "resume: no file"),
+        (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 32, as this model needs, got 40"),
+        (
+            ["--steps", "1", "--preset", "slow"],
+            "preset is 'slow', expected one of fast, balanced, quality, unet, multiscale, paper, tkpcn",
+        ),
+        (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
+        ([], "steps, minutes: expected at least one limit"),
+        (["--steps", "1", "--validation", "nowhere"], "expected shots among"),
+    ):
+        assert run(*train, *more) == 1
+        assert message in capsys.readouterr().err
+    assert run("train", tmp_path / "logs", "-o", out, "--steps", "1") == 1
+    assert "expected what ravg prepare writes" in capsys.readouterr().err
+
+
+def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
+    picture = tmp_path / "parts.png"
+    options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--breakdown", picture]
+    assert run("denoise", shot / "a.####.exr", "-o", tmp_path / "out", *options) == 0
+    assert picture.stat().st_size > 1000
+    printed = capsys.readouterr().out
+    for name in ("before1", "centre", "after1"):
+        assert name in printed
+    layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in ("before1", "centre", "after1")]
+    frame = open_shot(tmp_path / "out", aovs=layers).read(SCENE.first + 1)
+    total = sum(frame.aovs[layer] for layer in layers[:3])
+    np.testing.assert_allclose(total, frame.color, rtol=2e-3, atol=1e-3)  # layers may be halves
+    np.testing.assert_allclose(sum(frame.aovs[layer] for layer in layers[3:]), 1, rtol=2e-3)
+
+
+def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
+    """A window of three frames sees the second frame from the first; what is in the third comes by way of that."""
+
+    def other(index, layers):
+        if index == 2:
+            grain = np.random.default_rng(5).uniform(0.8, 1.2, (SCENE.height, SCENE.width, 1))
+            layers["ViewLayer.Combined"] = (layers["ViewLayer.Combined"] * grain).astype(np.float32)
+
+    folders = SCENE.write(tmp_path / "in"), SCENE.write(tmp_path / "other", edit=other)
+    seen = []
+    for passes in (1, 2):
+        first = []
+        for folder in folders:
+            out = tmp_path / f"{folder.name}{passes}"
+            options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--effects", "warp"]
+            code = run("denoise", folder, "-o", out, "--passes", passes, "--no-effects", "refine", *options)
+            assert code == 0, capsys.readouterr().err
+            left = {item.name for item in out.iterdir()}  # nothing of the first pass
+            assert left == {"ravg.json", *(f"shot.{number}.exr" for number in (1001, 1002, 1003))}
+            first.append(open_shot(out).read(SCENE.first).color)
+        seen.append(not np.array_equal(*first))
+    assert seen == [False, True]
+    assert run("denoise", folders[0], "-o", tmp_path, "--weights", weights, "--passes", "0") == 2
+
+
+# All stages said, so that no plan is measured on other frames, or on a denoised picture.
+STAGES = ["--effects", "demodulate,warp", "--no-effects", "outliers,refine,gate,fixed-noise,prefilter,alpha,skip"]
+
+
+def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, monkeypatch):
+    """The first pass has to make the neighbours as well; it used to make only the frames asked for."""
+    folder = Scene(height=40, width=48, frames=5).write(tmp_path / "in")
+    monkeypatch.setattr("hybrid.files.exr.MAX_PIXELS", 100)  # so that all passes have to know of --max-pixels
+    options = ["--weights", weights, "--precision", "float32", "--passes", 2, "--max-pixels", 4000, *STAGES]
+    code = run("denoise", folder, "-o", tmp_path / "all", "--estimate", "nlm", *options)
+    assert code == 0, capsys.readouterr().err
+    assert run("denoise", folder, "-o", tmp_path / "one", "--estimate", "nlm", "--frames", "1003", *options) == 0
+    name = "shot.1003.exr"
+    assert {path.name for path in (tmp_path / "one").iterdir()} == {"ravg.json", name}
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+
+
+def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
+    """On their left was what the first pass had made."""
+    folder = SCENE.write(tmp_path / "in")
+    noisy = []
+    for passes in (1, 2):
+        pictures = tmp_path / f"preview{passes}.png", tmp_path / f"parts{passes}.png"
+        options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", *STAGES]
+        options += ["--passes", passes, "--preview", pictures[0], "--breakdown", pictures[1]]
+        assert run("denoise", folder, "-o", tmp_path / f"out{passes}", *options) == 0
+        noisy.append([cv2.imread(str(path))[: SCENE.height, : SCENE.width] for path in pictures])
+    np.testing.assert_array_equal(*noisy)
+    np.testing.assert_array_equal(*noisy[0])  # both are exposed alike
+
+
+def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):
+    """Frames made without one used to pass for finished, and have no such layers; and if all were, there was a bug."""
+    folder = SCENE.write(tmp_path / "in")
+    words = ["denoise", folder, "-o", tmp_path / "out", "--weights", weights, "--estimate", "nlm", "--resume"]
+    picture = tmp_path / "parts.png"
+    assert run(*words) == 0
+    assert run(*words, "--breakdown", picture) == 0
+    printed = capsys.readouterr()
+    assert "finished already" not in printed.err
+    assert "before1" in printed.out
+    whole = picture.read_bytes()
+    picture.unlink()
+    assert run(*words, "--breakdown", picture) == 0
+    printed = capsys.readouterr()
+    assert "3 of 3 frames were finished already" in printed.err
+    assert "no weights to print: all frames were finished already" in printed.out
+    assert "average weight" not in printed.out
+    assert picture.read_bytes() == whole
+
+
+def test_a_network_without_estimates_says_so(tmp_path, capsys):
+    path = tmp_path / "small.safetensors"
+    save_model(path, unet(frames=3))
+    folder = SCENE.write(tmp_path / "in")
+    words = ["denoise", folder, "--weights", path, "-o", tmp_path / "out", "--estimate"]
+    assert run(*words, "oidn") == 1
+    assert "estimate is 'oidn', expected auto or none: the network of small.safetensors takes none" in (
+        capsys.readouterr().err
+    )
+    assert not (tmp_path / "out").exists()
+    assert run(*words, "auto") == 0
+    assert "estimates: none (this network takes none)" in capsys.readouterr().err
+    assert run(*words, "none", "--passes", 2) == 0
+    assert "estimates: none (this network takes none)" in capsys.readouterr().err

@@ -1,0 +1,352 @@
+"""Every measure against its definition, its peers, and made-up shots whose score is known."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from skimage.metrics import peak_signal_noise_ratio
+
+from flow.warp import warp
+from hybrid.comparison.metrics import (
+    bootstrap_interval,
+    flip_map,
+    mean_bias,
+    mean_over_shots,
+    psnr,
+    relmse,
+    smape,
+    ssim,
+    static_std,
+    temporal_psnr,
+    tone_map,
+)
+
+SIZE = (40, 56)
+needs_flip = pytest.mark.skipif(find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed")
+
+
+def flip(image: NDArray[np.float32], reference: NDArray[np.float32]) -> float:
+    return float(flip_map(image, reference).mean(dtype=np.float64))
+
+
+ONE_FRAME = [psnr, ssim, relmse, smape, mean_bias, pytest.param(flip, marks=needs_flip)]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def texture(rng: np.random.Generator, size: tuple[int, int] = SIZE) -> NDArray[np.float32]:
+    """Smooth colourful radiance between 0.1 and about 3, with structure down to a few pixels."""
+    noise = cv2.GaussianBlur(rng.normal(size=(*size, 3)), (0, 0), 2.0)
+    return np.exp(noise / noise.std() * 0.7).astype(np.float32)
+
+
+def noisy(image: NDArray[np.float32], rng: np.random.Generator, sigma: float = 0.2) -> NDArray[np.float32]:
+    return np.maximum(image * (1 + sigma * rng.normal(size=image.shape)), 0).astype(np.float32)
+
+
+def expand(tone: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Inverse of the tone curve at exposure 1: lets a test place an error of known size behind the curve."""
+    return (tone / (1 - tone)).astype(np.float32)
+
+
+def shift(image: NDArray[np.float32], pixels: int) -> NDArray[np.float32]:
+    return np.roll(image, pixels, axis=1)
+
+
+# One frame
+
+
+def test_perfect_image_scores_perfect(rng: np.random.Generator) -> None:
+    image = texture(rng)
+    assert psnr(image, image) == np.inf
+    assert ssim(image, image) == pytest.approx(1, abs=1e-12)  # rounding of the ratio of equal sums
+    assert relmse(image, image) == smape(image, image) == mean_bias(image, image) == 0
+
+
+def test_measures_equal_their_formulas(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    image = noisy(reference, rng)
+    x, r = image.astype(float), reference.astype(float)
+    assert tone_map(x, 2.0) == pytest.approx(2 * x / (1 + 2 * x))
+    assert psnr(image, reference) == pytest.approx(-10 * np.log10(np.mean((x / (1 + x) - r / (1 + r)) ** 2)))
+    assert relmse(image, reference) == pytest.approx(np.mean((x - r) ** 2 / (r**2 + 0.01)))
+    assert smape(image, reference) == pytest.approx(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)))
+    assert mean_bias(image * np.float32(1.03), image) == pytest.approx(0.03, abs=1e-6)  # float32 product
+
+
+def test_psnr_agrees_with_scikit_image(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    image = noisy(reference, rng)
+    theirs = peak_signal_noise_ratio(tone_map(reference), tone_map(image), data_range=1.0)
+    assert psnr(image, reference) == pytest.approx(theirs, abs=1e-9)  # both in float64
+
+
+def test_ssim_equals_a_direct_computation(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    image = noisy(reference, rng)
+    x, r = tone_map(image), tone_map(reference)
+
+    def mean(v: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cv2.GaussianBlur(v, (11, 11), 1.5)
+
+    mx, mr = mean(x), mean(r)
+    vx, vr, cov = mean(x * x) - mx * mx, mean(r * r) - mr * mr, mean(x * r) - mx * mr
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mx * mr + c1) * (2 * cov + c2) / ((mx * mx + mr * mr + c1) * (vx + vr + c2))
+    expected = similarity[5:-5, 5:-5].mean()  # windows that lie wholly inside
+    assert ssim(image, reference) == pytest.approx(expected, abs=1e-9)  # both in float64
+
+
+@needs_flip
+def test_flip_is_the_evaluators_with_the_reference_first(rng: np.random.Generator) -> None:
+    import flip_evaluator
+
+    reference = texture(rng)
+    image = noisy(reference, rng) * np.float32(4)  # exposures follow the reference, so that the order shows
+    theirs = flip_evaluator.evaluate(reference, image, "HDR", applyMagma=False)[1]
+    swapped = flip_evaluator.evaluate(image, reference, "HDR", applyMagma=False)[1]
+    assert flip(image, reference) == pytest.approx(theirs, abs=1e-6)  # single precision, threaded sum
+    assert abs(theirs - swapped) > 1e-3
+    assert flip(reference, reference) == 0
+
+
+def test_relmse_trims_the_largest_errors_only(rng: np.random.Generator) -> None:
+    reference = np.ones((*SIZE, 3), np.float32)
+    image = reference + np.float32(0.1)
+    expected = relmse(image, reference)
+    image[3, 4] = 1e4  # one pixel of 2240: inside the 0.1 % (two pixels) that are trimmed
+    assert relmse(image, reference) > 1e4
+    assert relmse(image, reference, trim=0.001) == pytest.approx(expected)
+
+
+def test_one_exposure_scales_every_measure(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    image = noisy(reference, rng)
+    for measure in (psnr, ssim, relmse, smape):
+        # A power of two is exact in float, so the two ways round differ in nothing.
+        assert measure(image * 4, reference * 4) == pytest.approx(measure(image, reference, exposure=4))
+
+
+def test_halves_take_the_references_noise_out(rng: np.random.Generator) -> None:
+    size = (200, 200, 3)
+    truth = rng.uniform(0.2, 0.8, size)
+    image = expand(truth + 0.02 * rng.normal(size=size))
+    halves = tuple(expand(truth + 0.05 * rng.normal(size=size)) for _ in range(2))
+    # Known error 0.02; the product of errors has a relative spread of about (0.05/0.02)²/√120000 = 2 %.
+    assert psnr(image, halves) == pytest.approx(-20 * np.log10(0.02), abs=0.3)
+    assert psnr(image, (halves[0] + halves[1]) / 2) < psnr(image, halves) - 3
+
+
+def test_halves_that_explain_everything_give_infinity(rng: np.random.Generator) -> None:
+    a, b = noisy(texture(rng), rng), noisy(texture(rng), rng)
+    between = expand(0.5 * (tone_map(a) + tone_map(b)))
+    assert psnr(between, (a, b)) == np.inf  # (x − a)(x − b) < 0 everywhere: no error can be told from zero
+
+
+@pytest.mark.parametrize("measure", ONE_FRAME)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_lost_pixel_makes_the_frame_nan(measure, value: float, rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    image = reference.copy()
+    image[5, 6, 1] = value
+    assert np.isnan(measure(image, reference))
+
+
+def test_trimming_does_not_hide_a_lost_pixel(rng: np.random.Generator) -> None:
+    image = texture(rng)
+    reference = image.copy()
+    image[5, 6] = np.nan
+    assert np.isnan(relmse(image, reference, trim=0.01))
+
+
+@pytest.mark.parametrize("measure", ONE_FRAME)
+def test_bad_references_are_errors(measure, rng: np.random.Generator) -> None:
+    image = texture(rng)
+    broken = image.copy()
+    broken[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="reference must be finite, 1 of"):
+        measure(image, broken)
+    with pytest.raises(ValueError, match="alike"):
+        measure(image, image[1:])
+
+
+def test_trim_out_of_range_is_an_error(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="trim must be in"):
+        relmse(texture(rng), texture(rng), trim=1.0)
+
+
+def test_black_reference_has_no_bias() -> None:
+    black = np.zeros((*SIZE, 3), np.float32)
+    assert np.isnan(mean_bias(black + 1, black))
+
+
+def test_flip_without_the_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(ImportError, match=r"ravg\[compare\]"):
+        flip_map(np.zeros((*SIZE, 3)), np.zeros((*SIZE, 3)))
+
+
+# Time
+
+
+def still(count: int) -> tuple[list[NDArray[np.float32]], list[NDArray[np.bool_]]]:
+    """Zero flows and full masks for the `count` − 1 pairs of a shot that stands still."""
+    pairs = count - 1
+    return [np.zeros((*SIZE, 2), np.float32)] * pairs, [np.ones(SIZE, bool)] * pairs
+
+
+def test_still_perfect_shot_is_perfect(rng: np.random.Generator) -> None:
+    shot = [texture(rng)] * 4
+    assert (temporal_psnr(shot, shot, *still(4)) == np.full(3, np.inf)).all()
+    assert (static_std(shot, np.ones(SIZE, bool)) == np.zeros(4)).all()
+
+
+def test_error_that_stays_is_no_flicker(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    assert (temporal_psnr([noisy(reference, rng)] * 3, [reference] * 3, *still(3)) == np.inf).all()
+
+
+@pytest.mark.parametrize("size", [0.001, 0.02])
+def test_flicker_of_known_size_is_recovered(size: float, rng: np.random.Generator) -> None:
+    tone = tone_map(texture(rng)) * 0.9
+    shot = [expand(tone + (size if t % 2 else 0)) for t in range(6)]
+    scores = temporal_psnr(shot, [expand(tone)] * 6, *still(6))
+    # float32 radiance behind the curve is exact to 1e-7, 1e-4 of the smaller flicker.
+    np.testing.assert_allclose(scores, -20 * np.log10(size), atol=2e-3)
+    # Half the steps up, half down: s/2 about the mean, and 6/5 for the unbiased variance of six frames.
+    np.testing.assert_allclose(static_std(shot, np.ones(SIZE, bool)), size / 2 * np.sqrt(6 / 5), rtol=2e-3)
+
+
+def test_static_std_counts_static_pixels_only(rng: np.random.Generator) -> None:
+    sigma, mask = 0.01, np.zeros(SIZE, bool)
+    mask[:, :20] = True
+    tone = np.full((*SIZE, 3), 0.4)
+    shot = [tone + sigma * rng.normal(size=tone.shape) for _ in range(20)]
+    for t, frame in enumerate(shot):
+        frame[:, 20:] = 0.04 * t  # moves, and is masked out
+    # 2400 values × 19 degrees of freedom: a standard error of 0.3 %, five of them allowed.
+    found = static_std((expand(f) for f in shot), mask)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(sigma, rel=0.016)
+
+
+def test_flow_leads_back_to_the_previous_frame(rng: np.random.Generator) -> None:
+    """An error that travels with the scene is no flicker if the flow is read in the right direction."""
+    scene, error = texture(rng), np.float32(0.05) * texture(rng)
+    references = [shift(scene, 2 * t) for t in range(4)]
+    frames = [shift(scene + error, 2 * t) for t in range(4)]
+    back = np.zeros((*SIZE, 2), np.float32)
+    back[..., 0] = -2
+    inside = np.ones(SIZE, bool)
+    inside[:, :2] = False  # came in from outside the frame
+    assert (temporal_psnr(frames, references, [back] * 3, [inside] * 3) == np.inf).all()
+    wrong = temporal_psnr(frames, references, [-back] * 3, [inside] * 3)
+    assert (wrong < 50).all()
+
+
+def test_blur_does_not_win(rng: np.random.Generator) -> None:
+    """A plain warp error puts blur above the truth. Against the reference's own differences it cannot."""
+    scene, columns = texture(rng), np.arange(SIZE[1])
+    back = np.zeros((*SIZE, 2), np.float32)
+    back[..., 0] = -2
+    inside = np.ones(SIZE, bool)
+    inside[:, :2] = False
+    # The texture moves by 2 px a frame, the edge of a shadow by 5: what vectors cannot explain.
+    references = [shift(scene, 2 * t) * np.where(columns < 10 + 5 * t, 0.3, 1.0)[:, None] for t in range(6)]
+    references = [r.astype(np.float32) for r in references]
+    faithful = [expand(np.clip(tone_map(r) + 0.01 * rng.normal(size=r.shape), 0, 0.99)) for r in references]
+    blurred = [cv2.GaussianBlur(r, (0, 0), 4.0) for r in references]
+
+    def warp_error(shot: list[NDArray[np.float32]]) -> float:
+        tones = [tone_map(frame).astype(np.float32) for frame in shot]
+        return float(np.mean([((b - warp(a, back)[0])[inside] ** 2).mean() for a, b in pairwise(tones)]))
+
+    assert warp_error(blurred) < warp_error(references)
+
+    def score(shot: list[NDArray[np.float32]]) -> float:
+        return float(temporal_psnr(shot, references, [back] * 5, [inside] * 5).mean())
+
+    assert score(references) == np.inf
+    assert score(faithful) > score(blurred) + 3
+
+
+def test_temporal_psnr_takes_halves(rng: np.random.Generator) -> None:
+    size, sigma = (*SIZE, 3), 0.02
+    truth = rng.uniform(0.2, 0.8, size)
+    frames = [expand(truth + sigma * rng.normal(size=size)) for _ in range(5)]
+    halves = [tuple(expand(truth + 0.03 * rng.normal(size=size)) for _ in range(2)) for _ in range(5)]
+    scores = temporal_psnr(frames, halves, *still(5))
+    # The error of two frames differs by √2 σ; the spread over 6720 values × 4 pairs is about 0.1 dB.
+    assert scores.mean() == pytest.approx(-20 * np.log10(np.sqrt(2) * sigma), abs=0.4)
+
+
+def test_temporal_measures_are_nan_where_a_frame_is(rng: np.random.Generator) -> None:
+    reference = texture(rng)
+    lost = reference.copy()
+    lost[2, 2] = np.nan
+    shot = [reference, lost, reference, reference]
+    scores = temporal_psnr(shot, [reference] * 4, *still(4))
+    assert np.isnan(scores[:2]).all()
+    assert scores[2] == np.inf
+    assert np.isnan(static_std(shot, np.ones(SIZE, bool))).all()
+    empty = np.zeros(SIZE, bool)
+    assert np.isnan(static_std([reference] * 3, empty)).all()
+    assert np.isnan(temporal_psnr([reference] * 2, [reference] * 2, still(2)[0], [empty])).all()
+
+
+def test_series_that_do_not_belong_together_are_errors(rng: np.random.Generator) -> None:
+    image = texture(rng)
+    flows, masks = still(3)
+    with pytest.raises(ValueError, match="shorter"):
+        temporal_psnr([image] * 3, [image] * 2, flows, masks)
+    with pytest.raises(ValueError, match="longer"):
+        temporal_psnr([image] * 2, [image] * 2, flows, masks)
+    with pytest.raises(ValueError, match="valid must have the shape"):
+        temporal_psnr([image] * 2, [image] * 2, flows[:1], [np.ones((2, 2), bool)])
+    with pytest.raises(ValueError, match="static must have the shape"):
+        static_std([image] * 2, np.ones((2, 2), bool))
+
+
+# Intervals
+
+
+def test_bootstrap_interval_is_the_normal_one_for_normal_data(rng: np.random.Generator) -> None:
+    values = rng.normal(3, 2, 400)
+    low, high = bootstrap_interval(values, seed=1)
+    half = 1.96 * values.std() / np.sqrt(values.size)
+    # The 2.5 % quantile of 2000 resamples has a standard error of about 3 % of the half width.
+    assert low == pytest.approx(values.mean() - half, abs=0.15 * half)
+    assert high == pytest.approx(values.mean() + half, abs=0.15 * half)
+    assert bootstrap_interval(values, seed=1) == (low, high)
+    assert bootstrap_interval(values, seed=2) != (low, high)
+
+
+def test_bootstrap_interval_of_special_values() -> None:
+    assert bootstrap_interval([2.5]) == (2.5, 2.5)
+    assert bootstrap_interval([np.inf, np.inf]) == (np.inf, np.inf)
+    assert np.isnan(bootstrap_interval([1.0, np.nan])).all()
+    with pytest.raises(ValueError, match="not empty"):
+        bootstrap_interval([])
+    with pytest.raises(ValueError, match="shots must add up to the 3 values"):
+        bootstrap_interval([1.0, 2.0, 3.0], shots=(2, 2))
+
+
+def test_bootstrap_over_shots_is_as_wide_as_they_differ(rng: np.random.Generator) -> None:
+    """Many frames of three shots that differ tell the mean of shots no better than three figures do."""
+    shots = (200, 100, 50)
+    values = np.concatenate([mean + 0.1 * rng.normal(size=n) for mean, n in zip((1.0, 2.0, 6.0), shots, strict=True)])
+    assert mean_over_shots(values, shots) == pytest.approx(3.0, abs=0.03)  # 0.1/√50 of the shortest, a third of it
+    low, high = bootstrap_interval(values, shots=shots)
+    # One resample in 27 takes the same shot three times: the ends are the shots themselves, a hundredth about them.
+    assert low == pytest.approx(1.0, abs=0.05)
+    assert high == pytest.approx(6.0, abs=0.05)
+    narrow = bootstrap_interval(values)
+    assert narrow[1] - narrow[0] < 0.5  # frames alone would claim to know it

@@ -1,0 +1,485 @@
+"""Reading, finding and writing layers of OpenEXR files."""
+
+from __future__ import annotations
+
+import os
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hybrid.files.exr import ExrError, read_exr, write_exr, write_layers
+from hybrid.files.layers import describe_layers, find_layers
+
+CYCLES = {
+    "Combined": "RGBA",
+    "Denoising Albedo": "RGB",
+    "Denoising Depth": "Z",
+    "Denoising Normal": "XYZ",
+    "Depth": "Z",
+    "Normal": "XYZ",
+    "Vector": "XYZW",
+}
+
+
+def planes(names: list[str], size=(5, 7), kind="f2", seed=0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: (100 * rng.random(size)).astype(kind) for name in names}
+
+
+def save(path: Path, channels: dict, **header) -> Path:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File([OpenEXR.Part(header, dict(channels), "")]).write(str(path))  # it changes the dict
+    return path
+
+
+def save_parts(path: Path, parts: dict[str, dict], headers: dict[str, dict] | None = None) -> Path:
+    made = []
+    for name, channels in parts.items():
+        header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.scanlineimage}
+        made.append(OpenEXR.Part({**header, **(headers or {}).get(name, {})}, channels, name))
+    OpenEXR.File(made).write(str(path))
+    return path
+
+
+def cycles_names(layers=CYCLES, prefix="ViewLayer.") -> list[str]:
+    return [f"{prefix}{layer}.{c}" for layer, components in layers.items() for c in components]
+
+
+# --- reading
+
+
+def test_channels_keep_their_type_and_every_bit(tmp_path):
+    channels = {
+        "R": np.array([[1.5, np.nan, np.inf]], np.float16),
+        "G": np.array([[-np.inf, -0.0, 1e-7]], np.float16),
+        "B": np.array([[1e30, np.nan, 1e-42]], np.float32),
+        "id": np.array([[0, 2**31, 2**32 - 1]], np.uint32),
+    }
+    image = read_exr(save(tmp_path / "a.exr", channels))
+    for name, values in channels.items():
+        assert image.channel(name).dtype == values.dtype
+        assert image.channel(name).tobytes() == values.tobytes()
+
+
+def test_pixels_stacks_channels_as_float32_in_the_order_asked_for(tmp_path):
+    channels = planes(["R", "G", "B"])
+    pixels = read_exr(save(tmp_path / "a.exr", channels)).pixels(("B", "R"))
+    assert pixels.dtype == np.float32
+    assert pixels.flags.c_contiguous
+    np.testing.assert_array_equal(pixels, np.stack([channels["B"], channels["R"]], -1).astype(np.float32))
+
+
+def test_headers_alone_are_enough_to_find_layers_and_give_no_pixels(tmp_path):
+    image = read_exr(save(tmp_path / "a.exr", planes(cycles_names())), pixels=False)
+    assert find_layers(image).motion_convention == "cycles"
+    with pytest.raises(ValueError, match="not read"):
+        image.channel("ViewLayer.Combined.R")
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.3, 0.6, 0.9, 0.999])
+def test_truncated_file_is_an_error_of_one_line_and_nothing_is_printed(tmp_path, capfd, fraction):
+    for path in (
+        save(tmp_path / "single.exr", planes(["R", "G", "B"], (40, 30))),
+        save_parts(tmp_path / "multi.exr", {"a": planes(["R"], (40, 30)), "b": planes(["R"], (40, 30))}),
+    ):
+        data = path.read_bytes()
+        path.write_bytes(data[: int(fraction * len(data))])
+        with pytest.raises(ExrError) as caught:
+            read_exr(path)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+        assert capfd.readouterr() == ("", "")
+
+
+def test_others_may_print_while_the_library_is_listened_to(tmp_path, capfd, monkeypatch):
+    path = save(tmp_path / "a.exr", planes(["R"]))
+    opened = OpenEXR.File
+
+    def chatty(*args, **kwargs):
+        os.write(2, b"progress\n")
+        return opened(*args, **kwargs)
+
+    monkeypatch.setattr(OpenEXR, "File", chatty)
+    read_exr(path, pixels=False)
+    assert capfd.readouterr().err == "progress\n"
+
+
+def test_one_damaged_part_of_several_is_an_error(tmp_path):
+    gradient = np.repeat(np.arange(64, dtype=np.float16)[None], 9, 0)  # is stored compressed, with a checksum
+    path = save_parts(tmp_path / "a.exr", {"a": {"R": gradient}, "b": {"R": gradient}})
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 255  # in the last chunk of the last part
+    path.write_bytes(data)
+    assert len(read_exr(path, pixels=False).parts) == 2
+    with pytest.raises(ExrError, match="damaged"):
+        read_exr(path)
+
+
+def test_what_is_not_a_rendered_frame_is_refused(tmp_path):
+    text = tmp_path / "text.exr"
+    text.write_text("not an image")
+    with pytest.raises(ExrError, match="not an OpenEXR file"):
+        read_exr(text)
+
+    deep = np.empty((2, 2), object)
+    for index in np.ndindex(2, 2):
+        deep[index] = np.array([1.0], np.float32)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    OpenEXR.File(header, {"Z": deep}).write(str(tmp_path / "deep.exr"))
+    with pytest.raises(ExrError, match="deep"):
+        read_exr(tmp_path / "deep.exr")
+
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 4
+    tiles.mode = OpenEXR.MIPMAP_LEVELS
+    save(tmp_path / "mip.exr", planes(["R"], (8, 8)), type=OpenEXR.tiledimage, tiles=tiles)
+    with pytest.raises(ExrError, match="mip-mapped"):
+        read_exr(tmp_path / "mip.exr")
+
+    chroma = OpenEXR.Channel("BY", np.zeros((4, 4), np.float16), 2, 2)
+    save(tmp_path / "chroma.exr", {"Y": np.zeros((4, 4), np.float16), "BY": chroma})
+    with pytest.raises(ExrError, match="subsampled"):
+        read_exr(tmp_path / "chroma.exr")
+
+
+def test_size_is_checked_before_pixels_are_read(tmp_path):
+    path = save(tmp_path / "a.exr", planes(["R", "G"], (10, 10)))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])  # reading the pixels would fail first, otherwise
+    with pytest.raises(ExrError, match="10x10 pixels, more than the 99"):
+        read_exr(path, max_pixels=99)
+    many = save(tmp_path / "b.exr", planes([f"l{i}.R" for i in range(17)], (10, 10)))
+    with pytest.raises(ExrError, match="GiB"):  # 17 channels of 4 bytes against 64 bytes per pixel
+        read_exr(many, max_pixels=100)
+    read_exr(many, max_pixels=107)
+
+
+def test_missing_file_is_an_oserror(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.exr"):
+        read_exr(tmp_path / "none.exr")
+
+
+# --- finding
+
+
+def test_cycles_layers_are_found(tmp_path):
+    layers = find_layers(read_exr(save(tmp_path / "a.exr", planes(cycles_names())), pixels=False))
+    assert str(layers.color) == "ViewLayer.Combined.RGB"
+    assert layers.target == layers.color
+    assert str(layers.alpha) == "ViewLayer.Combined.A"
+    assert str(layers.albedo) == "ViewLayer.Denoising Albedo.RGB"
+    assert str(layers.normal) == "ViewLayer.Denoising Normal.XYZ"
+    assert str(layers.depth) == "ViewLayer.Denoising Depth.Z"
+    assert str(layers.motion) == "ViewLayer.Vector.XYZW"
+    assert (layers.motion_convention, layers.variance, layers.estimate) == ("cycles", None, None)
+
+
+def test_where_cycles_has_denoised_combined_is_the_estimate_and_is_replaced(tmp_path):
+    names = cycles_names({**CYCLES, "Noisy Image": "RGBA"})
+    layers = find_layers(read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False))
+    assert str(layers.color) == "ViewLayer.Noisy Image.RGB"
+    assert str(layers.alpha) == "ViewLayer.Noisy Image.A"
+    assert str(layers.estimate) == str(layers.target) == "ViewLayer.Combined.RGB"
+
+
+@pytest.mark.parametrize("qualified", [True, False])
+def test_multi_part_file_has_the_same_names_as_single_part(tmp_path, qualified):
+    single = read_exr(save(tmp_path / "a.exr", planes(cycles_names())), pixels=False)
+    parts = {
+        f"ViewLayer.{layer}": planes([f"ViewLayer.{layer}.{c}" if qualified else c for c in components])
+        for layer, components in CYCLES.items()
+    }
+    multi = read_exr(save_parts(tmp_path / "b.exr", parts), pixels=False)
+    assert sorted(multi.channel_names) == sorted(single.channel_names)
+    for role in ("color", "albedo", "normal", "depth", "motion", "alpha"):
+        assert str(getattr(find_layers(multi), role)) == str(getattr(find_layers(single), role))
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (
+            ["color.R", "color.G", "color.B", "albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y",
+             "normal.Z", "depth.Z", "motion.X", "motion.Y", "variance.R", "variance.G", "variance.B"],
+            {"color": "color.RGB", "albedo": "albedo.RGB", "normal": "normal.XYZ", "depth": "depth.Z",
+             "motion": "motion.XY", "variance": "variance.RGB"},
+        ),
+        (
+            ["R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "denoise_albedo.R", "denoise_albedo.G",
+             "denoise_albedo.B", "variance.Y", "diffuse.R", "diffuse.G", "diffuse.B"],
+            {"color": "RGB", "alpha": "A", "depth": "Z", "normal": "N.XYZ", "albedo": "denoise_albedo.RGB",
+             "variance": "variance.Y"},
+        ),
+        (
+            ["Ci.r", "Ci.g", "Ci.b", "Albedo.red", "Albedo.green", "Albedo.blue"],
+            {"color": "Ci.rgb", "albedo": "Albedo.red,green,blue"},
+        ),
+    ],
+    ids=["plain", "arnold", "other-letters"],
+)  # fmt: skip
+def test_other_names_are_found(tmp_path, names, expected):
+    layers = find_layers(read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False))
+    roles = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
+    found = {role: str(getattr(layers, role)) for role in roles if getattr(layers, role)}
+    assert found == expected
+    if "motion" in expected:
+        assert layers.motion_convention == "backward"
+
+
+def test_layers_of_another_view_layer_are_not_mixed_in(tmp_path):
+    names = cycles_names({"Combined": "RGBA"}, "Back.") + cycles_names(CYCLES, "Front.")
+    layers = find_layers(read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False))
+    assert str(layers.color) == "Back.Combined.RGB"
+    assert layers.normal is None
+    front = find_layers(read_exr(tmp_path / "a.exr", pixels=False), {"color": "Front.Combined"})
+    assert str(front.normal) == "Front.Denoising Normal.XYZ"
+
+
+def test_unnamed_channels_of_other_parts_are_not_guessed_at(tmp_path):
+    parts = {"beauty": planes(["R", "G", "B"]), "mask": planes(["Y"]), "spec": planes(["R", "G", "B"])}
+    layers = find_layers(read_exr(save_parts(tmp_path / "a.exr", parts), pixels=False))
+    assert str(layers.color) == "beauty.RGB"
+    assert (layers.depth, layers.variance, layers.albedo) == (None, None, None)
+
+
+def test_stereo_takes_the_default_view_and_overrides_any(tmp_path):
+    names = [f"ViewLayer.{x}.{view}.{c}" for x in ("Combined", "Albedo") for view in "lr" for c in "RGB"]
+    names = [name.replace(".l.", ".left.").replace(".r.", ".right.") for name in names]
+    single = read_exr(save(tmp_path / "a.exr", planes(names), multiView=["right", "left"]), pixels=False)
+    parts = {
+        f"ViewLayer.{x}-{view}": planes([f"ViewLayer.{x}.{c}" for c in "RGB"])
+        for view in ("right", "left")
+        for x in ("Combined", "Albedo")
+    }
+    headers = {name: {"view": name.partition("-")[2]} for name in parts}
+    multi = read_exr(save_parts(tmp_path / "b.exr", parts, headers), pixels=False)
+    for image in (single, multi):
+        layers = find_layers(image)
+        assert (layers.view, layers.views) == ("right", ("right", "left"))
+        assert layers.color.channels[0] == "ViewLayer.Combined.right.R"
+        assert layers.albedo.channels[0] == "ViewLayer.Albedo.right.R"
+        layers = find_layers(image, {"color": "Combined.left"})
+        assert layers.view == "left"
+        assert layers.albedo.channels[0] == "ViewLayer.Albedo.left.R"
+
+
+def test_overrides_win_and_say_what_there_is(tmp_path):
+    names = [*"RGBA", "RGBA_key.R", "RGBA_key.G", "RGBA_key.B", "m.u", "m.v", "P.X", "P.Y", "P.Z"]
+    image = read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False)
+    layers = find_layers(image, {"color": "rgba_KEY", "motion": "m", "depth": "P.Z", "alpha": "A"})
+    assert str(layers.color) == "RGBA_key.RGB"
+    assert layers.motion.channels == ("m.u", "m.v")
+    assert layers.motion_convention == "backward"
+    assert layers.depth.channels == ("P.Z",)
+    assert layers.alpha.channels == ("A",)
+    with pytest.raises(ExrError, match=r"no layer 'beauty'; it has RGBA, .*P\.XYZ, RGBA_key\.RGB, m\.uv"):
+        find_layers(image, {"color": "beauty"})
+    with pytest.raises(ExrError, match=r"m\.uv cannot be used as color: it needs channels R, G and B"):
+        find_layers(image, {"color": "m"})
+    with pytest.raises(ValueError, match="role 'colour' is unknown, expected one of color"):
+        find_layers(image, {"colour": "m"})
+
+
+def test_layer_by_the_end_of_its_name_must_be_the_only_one(tmp_path):
+    image = read_exr(save(tmp_path / "a.exr", planes(["a.key.R", "b.key.R", "b.fill.R"])), pixels=False)
+    assert image.layer("fill").name == "b.fill"
+    with pytest.raises(ExrError, match=r"'key' is ambiguous: a\.key\.R, b\.key\.R"):
+        image.layer("key")
+
+
+def test_listing_is_shortened(tmp_path):
+    image = read_exr(save(tmp_path / "a.exr", planes([f"l{i:03}.R" for i in range(100)])), pixels=False)
+    with pytest.raises(ExrError, match="and 76 more") as caught:
+        image.layer("x")
+    assert len(str(caught.value)) < 400
+
+
+def test_description_names_what_is_taken_and_what_is_missing(tmp_path):
+    names = cycles_names({"Combined": "RGB", "Vector": "XYZW"})
+    rows = describe_layers(find_layers(read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False)))
+    by_role = {role: rest for role, *rest in rows}
+    assert by_role["color"] == ["ViewLayer.Combined.RGB", ""]
+    assert by_role["motion"] == ["ViewLayer.Vector.XYZW", "convention: cycles"]
+    assert by_role["albedo"][0] == "missing"
+    assert all(note for _, taken, note in rows if taken == "missing")
+
+
+# --- writing
+
+ATTRIBUTES = {
+    "dataWindow": (np.array([-2, 3], np.int32), np.array([4, 7], np.int32)),
+    "displayWindow": (np.array([0, 0], np.int32), np.array([9, 9], np.int32)),
+    "pixelAspectRatio": 2.0,
+    "screenWindowCenter": np.array([0.25, -0.5], np.float32),
+    "lineOrder": OpenEXR.DECREASING_Y,
+    "chromaticities": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.329),
+    "timeCode": OpenEXR.TimeCode(),
+    "a string": "ünï / cryptomatte {}",
+    "strings": ["a", "b"],
+    "floats": [1.5, 2.5],
+    "float": 0.1,
+    "double": np.array([0.1]),
+    "int": -3,
+    "rational": Fraction(24000, 1001),
+    "v2i": np.array([1, -2], np.int32),
+    "v3f": np.array([1, -2, 0.1], np.float32),
+    "m44f": np.arange(16, dtype=np.float32).reshape(4, 4),
+    "bytes": OpenEXR.Bytes(b"\x00\x01\xff", "hint"),
+}
+
+
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24"])
+@pytest.mark.parametrize("tiled", [False, True])
+def test_rewriting_without_changes_gives_the_same_bytes(tmp_path, compression, tiled):
+    header = {**ATTRIBUTES, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    if tiled:
+        tiles = OpenEXR.TileDescription()
+        tiles.xSize, tiles.ySize = 4, 3
+        header |= {"type": OpenEXR.tiledimage, "tiles": tiles, "lineOrder": OpenEXR.INCREASING_Y}
+    channels = {**planes(["R", "G", "B"]), **planes(["Z"], kind="f4"), **planes(["id"], kind="u4")}
+    path = save(tmp_path / "a.exr", channels, **header)
+    assert write_exr(tmp_path / "b.exr", read_exr(path), {}) == 0
+    assert (tmp_path / "b.exr").read_bytes() == path.read_bytes()
+
+
+def test_rewriting_a_multi_part_file_gives_the_same_bytes(tmp_path):
+    window = {"dataWindow": (np.array([1, 1], np.int32), np.array([3, 2], np.int32))}
+    window["displayWindow"] = (np.array([0, 0], np.int32), np.array([6, 4], np.int32))
+    display = {"displayWindow": window["displayWindow"]}
+    path = save_parts(
+        tmp_path / "a.exr",
+        {"rgba_left": planes(["R", "G", "B"]), "crop": planes(["id"], (2, 3), "u4"), "z": planes(["Z"])},
+        {"rgba_left": {"view": "left", **display}, "crop": window, "z": {**display, "owner": "me"}},
+    )
+    write_exr(tmp_path / "b.exr", read_exr(path), {})
+    assert (tmp_path / "b.exr").read_bytes() == path.read_bytes()
+
+
+def test_only_the_replaced_channels_change(tmp_path):
+    parts = {"ViewLayer.Combined": planes(["R", "G", "B", "A"]), "ViewLayer.Depth": planes(["Z"], kind="f4")}
+    source = read_exr(save_parts(tmp_path / "a.exr", parts))
+    new = np.random.default_rng(1).random((5, 7)).astype(np.float32)
+    write_exr(tmp_path / "b.exr", source, {"ViewLayer.Combined.G": new})
+    again = read_exr(tmp_path / "b.exr")
+    for name in source.channel_names:
+        expected = new.astype(np.float16) if name == "ViewLayer.Combined.G" else source.channel(name)
+        assert again.channel(name).dtype == expected.dtype
+        np.testing.assert_array_equal(again.channel(name), expected)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    values=arrays(np.float32, (3, 5), elements=st.floats(width=32)),
+    kind=st.sampled_from([np.float16, np.float32]),
+)
+def test_written_values_are_the_nearest_and_no_inf_is_made(tmp_path_factory, values, kind):
+    folder = tmp_path_factory.mktemp("exr")
+    source = read_exr(save(folder / "a.exr", {"R": np.zeros((3, 5), kind)}))
+    clamped = write_exr(folder / "b.exr", source, {"R": values})
+    out = read_exr(folder / "b.exr").channel("R")
+    np.testing.assert_array_equal(np.isnan(out), np.isnan(values))
+    np.testing.assert_array_equal(np.isinf(out), np.isinf(values))
+    limited = values if kind == np.float32 else np.where(np.isinf(values), values, values.clip(-65504, 65504))
+    np.testing.assert_array_equal(out, limited.astype(kind))
+    beyond = (np.abs(values) > 65504) & np.isfinite(values)
+    assert clamped == (beyond.sum() if kind == np.float16 else 0)
+
+
+def test_uint_channels_are_rounded_and_limited(tmp_path):
+    source = read_exr(save(tmp_path / "a.exr", {"id": np.zeros((1, 5), np.uint32)}))
+    values = np.array([[-3, 1.6, np.nan, 1e12, 7]], np.float32)
+    write_exr(tmp_path / "b.exr", source, {"id": values})
+    expected = [[0, 2, 0, 2**32 - 1, 7]]
+    np.testing.assert_array_equal(read_exr(tmp_path / "b.exr").channel("id"), expected)
+
+
+def test_layers_and_attributes_can_be_added(tmp_path):
+    single = save(tmp_path / "a.exr", planes(["R", "G", "B"]), comment="before", frame=3)
+    multi = save_parts(tmp_path / "b.exr", {"x": planes(["R"]), "y": planes(["R"])})
+    extra = {"confidence": np.full((5, 7), 0.5, np.float32), "part.specular": np.ones((5, 7, 3), np.float16)}
+    for path in (single, multi):
+        source = read_exr(path)
+        write_exr(tmp_path / "out.exr", source, {}, extra, {"comment": "after"})
+        again = read_exr(tmp_path / "out.exr")
+        assert set(source.channel_names) < set(again.channel_names)
+        assert (again.pixels(again.layer("confidence").channels) == 0.5).all()
+        assert again.layer("part.specular").channels == tuple(f"part.specular.{c}" for c in "RGB")
+        assert again.channel("part.specular.R").dtype == np.float16
+        assert again.parts[0].header["comment"] == "after"
+    with pytest.raises(ValueError, match=r"'frame'.*not a string"):
+        write_exr(tmp_path / "out.exr", read_exr(single), {}, None, {"frame": "4"})
+    with pytest.raises(ValueError, match=r"layer 'c' has shape \(5, 8\), expected \(5, 7\)"):
+        write_exr(tmp_path / "out.exr", read_exr(single), {}, {"c": np.zeros((5, 8), np.float32)})
+
+
+def test_source_may_be_written_over(tmp_path):
+    path = save(tmp_path / "a.exr", planes(["R", "G"]))
+    green = read_exr(path).channel("G").copy()
+    write_exr(path, read_exr(path), {"R": np.zeros((5, 7), np.float32)})
+    again = read_exr(path)
+    np.testing.assert_array_equal(again.channel("G"), green)
+    assert not again.channel("R").any()
+
+
+def test_wrong_channel_or_shape_leaves_no_file(tmp_path):
+    source = read_exr(save(tmp_path / "a.exr", planes(["R"])))
+    with pytest.raises(ExrError, match="no channel 'G'; it has R"):
+        write_exr(tmp_path / "b.exr", source, {"G": np.zeros((5, 7), np.float32)})
+    with pytest.raises(ValueError, match=r"'R' has shape \(7, 5\), expected \(5, 7\)"):
+        write_exr(tmp_path / "b.exr", source, {"R": np.zeros((7, 5), np.float32)})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("disk full")])
+def test_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, error):
+    path = save(tmp_path / "a.exr", planes(["R"]))
+    source, before = read_exr(path), path.read_bytes()
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(type(error) if isinstance(error, Exception) else error):
+        write_exr(path, source, {"R": np.zeros((5, 7), np.float32)})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_folder_that_cannot_be_written_is_an_oserror_naming_the_file(tmp_path):
+    source = read_exr(save(tmp_path / "a.exr", planes(["R"])))
+    with pytest.raises(FileNotFoundError, match=r"cannot write: No such file.*none.out\.exr'$"):
+        write_exr(tmp_path / "none" / "out.exr", source, {})
+    if os.geteuid() == 0:
+        pytest.skip("root may write anywhere")
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o555)
+    with pytest.raises(PermissionError, match=r"cannot write: Permission denied.*out\.exr'$"):
+        write_exr(locked / "out.exr", source, {})
+
+
+def test_new_file_has_its_layers_found_again(tmp_path):
+    rng = np.random.default_rng(0)
+    shapes = {"color": 3, "albedo": 3, "normal": 3, "motion": 2, "variance": 3}
+    layers = {name: rng.random((5, 3, count)).astype(np.float32) for name, count in shapes.items()}
+    layers["depth"] = 1e6 * rng.random((5, 3)).astype(np.float32)
+    layers["color"][0, 0] = 1e6, np.nan, np.inf
+    path = tmp_path / "a.exr"
+    assert write_layers(path, layers, attributes={"title": "test"}) == 1  # the 1e6
+    image = read_exr(path)
+    assert image.parts[0].header["title"] == "test"
+    found = find_layers(image)
+    for name in ("normal", "motion", "depth"):  # stay float32
+        taken = image.pixels(getattr(found, name).channels)
+        np.testing.assert_array_equal(taken, layers[name].reshape(taken.shape))
+    np.testing.assert_array_equal(image.pixels(found.albedo.channels), layers["albedo"].astype(np.float16))
+    np.testing.assert_array_equal(image.pixels(found.color.channels)[0, 0], [65504, np.nan, np.inf])
+    assert write_layers(path, {"": layers["color"]}, half=False) == 0
+    assert read_exr(path).channel("R")[0, 0] == 1e6
+    with pytest.raises(ValueError, match="one size"):
+        write_layers(path, {"a": np.zeros((2, 2), np.float32), "b": np.zeros((2, 3), np.float32)})

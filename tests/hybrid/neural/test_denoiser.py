@@ -1,0 +1,208 @@
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes import Scene
+
+torch = pytest.importorskip("torch")
+
+from hybrid.alignment.align import Aligner  # noqa: E402
+from hybrid.breakdown import Breakdown  # noqa: E402
+from hybrid.estimates import OfWindows  # noqa: E402
+from hybrid.files.frames import open_shot  # noqa: E402
+from hybrid.neural.clips import write_clips  # noqa: E402
+from hybrid.neural.denoiser import Denoiser, shipped_weights  # noqa: E402
+from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from network.checkpoint import save_model  # noqa: E402
+from network.clips import open_clips  # noqa: E402
+from network.models import fast, unet  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+STAGES = {"demodulate", "outliers", "warp"}
+SCENE = Scene(height=70, width=90, frames=5)
+
+
+@pytest.fixture(scope="module", params=[fast, unet])
+def weights(request, tmp_path_factory):
+    """A network that was never trained: whatever it makes of its input, it must make it everywhere alike."""
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    model = request.param(seed=3)
+    with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
+        (model.weight if request.param is fast else model.head.window).weight.mul_(20)
+    save_model(path, model)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return SCENE.write(tmp_path_factory.mktemp("shot"))
+
+
+def align(folder, **options):
+    return Aligner(open_shot(folder, **options), STAGES, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
+
+
+def test_tiles_give_what_the_whole_image_gives(folder, weights):
+    window = align(folder)
+    whole = Denoiser(weights, tile=256, precision="float32")(window).color
+    tiled = Denoiser(weights, tile=32, precision="float32")(window).color
+    # The receptive field of the U-Net is wider than the halo; what lies beyond has next to no influence.
+    np.testing.assert_allclose(tiled, whole, rtol=1e-3, atol=1e-4)
+    assert np.abs(whole - window.color[2] * window.modulation).max() > 0.1  # it does something
+
+
+def test_bfloat16_is_close_to_float32(folder, weights):
+    window = align(folder)
+    exact = Denoiser(weights, precision="float32")(window).color
+    short = Denoiser(weights, precision="bfloat16")(window).color
+    # Features have 8 bits; the kernels that come of them are applied in float32.
+    assert np.sqrt(np.mean((short - exact) ** 2)) < 0.02 * exact.mean()
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_result_scales_with_the_radiance(tmp_path, folder, weights, scale):
+    denoiser = Denoiser(weights, precision="float32")
+    plain = denoiser(align(folder)).color
+    scaled = denoiser(align(SCENE.write(tmp_path, scale=scale))).color
+    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-4 * scale)
+
+
+def test_a_flat_picture_stays_as_it_is(tmp_path, weights):
+    def flatten(index, layers):
+        layers["ViewLayer.Combined"][:] = 0.7
+        layers["ViewLayer.Denoising Albedo"][:] = 0.5
+
+    image = Denoiser(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
+    np.testing.assert_allclose(image, 0.7, rtol=1e-5)
+
+
+def test_without_guides_it_runs(tmp_path, weights):
+    scene = SCENE.write(tmp_path, without={"Denoising Albedo", "Denoising Normal", "Depth"})
+    assert np.isfinite(Denoiser(weights)(align(scene)).color).all()
+
+
+def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
+    def split(index, layers):
+        layers["direct"] = 0.25 * layers["ViewLayer.Combined"]
+        layers["mask"] = np.ones((SCENE.height, SCENE.width), np.float32)
+
+    denoiser = Denoiser(weights, precision="float32")
+    window = align(SCENE.write(tmp_path, edit=split), aovs=("direct", "mask"))
+    aovs = denoiser(window).aovs
+    assert aovs["direct"].shape == (SCENE.height, SCENE.width, 3)
+    # Constant 1 divided by a changing albedo is not constant; but the kernels sum to 1, so nothing is lost.
+    assert np.isfinite(aovs["mask"]).all()
+    assert aovs["mask"].mean() == pytest.approx(1, rel=0.05)
+
+
+def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
+    def cut_out(index, layers):
+        alpha = np.random.default_rng(index).uniform(0.4, 0.6, (SCENE.height, SCENE.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
+
+    shot = open_shot(SCENE.write(tmp_path, edit=cut_out))
+    window = Aligner(shot, STAGES | {"alpha"}, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
+    alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"]
+    assert alpha.shape == (SCENE.height, SCENE.width, 1)
+    assert 0.4 <= alpha.min() <= alpha.max() <= 0.6  # kernels are convex
+    assert alpha.std() < 0.5 * window.aovs["alpha"][2].std()
+
+
+def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
+    def blank(index, layers):
+        layers["ViewLayer.Combined"][:, 40:] = 0
+
+    scene = Scene(height=40, width=320, frames=5)  # wide enough for tiles whose halo holds no edge
+    shot = open_shot(scene.write(tmp_path, edit=blank))
+    denoiser = Denoiser(weights, tile=16, precision="float32")
+    aligners = [Aligner(shot, STAGES | extra, estimates=OfWindows(DRAFT)) for extra in (set(), {"skip"})]
+    images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
+    np.testing.assert_allclose(images[1], images[0], atol=1e-6)
+    assert images[1][:, 60:].max() < 1e-3
+    assert (images[1][:, 240:] == 0).all()  # exactly what was there
+
+
+def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
+    noisy = open_shot(SCENE.write(tmp_path / "noisy"))
+    clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
+    frames = []
+    levels = {"noisy": noisy, "clean": clean}
+    write_clips(levels, [4, 64], tmp_path, "wall", tile=0, estimate="nlm", advance=lambda: frames.append(1))
+    clips = open_clips(tmp_path)
+    assert len(clips) == len(frames) == SCENE.frames
+    assert clips.shots == ["wall"]
+    assert clips.pairs(2) == [[(1, "noisy"), (1, "pseudo_reference")], [(1, "pseudo_reference")]]
+    values = {name: value.float().numpy() for name, value in clips.read(2, 0, (1, "noisy")).items()}
+    truth = SCENE.clean(2)["ViewLayer.Combined"].transpose(2, 0, 1)
+    unit = truth.mean() / values["target"].mean()  # radiance is stored over the exposure of the cleanest level
+    np.testing.assert_allclose(values["target"] * unit, truth, rtol=2e-3)  # half has 11 bits
+    # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
+    radiance = values["color"][2] * values["modulation"] * unit
+    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
+
+
+def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
+    (tmp_path / "clips").mkdir()
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "whole", tile=0, estimate="nlm")
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "tiles", tile=32, tiles=3, estimate="nlm")
+    clips = open_clips(tmp_path / "clips")
+    whole = clips.of(["whole"]).read(0, 0, (0, "pseudo_reference"))
+    tiles = clips.of(["tiles"])
+    assert len(tiles) == 3
+    for index in range(3):
+        tile = tiles.read(index, 0, (0, "pseudo_reference"))
+        assert tile["color"].shape == (5, 3, 32, 32)
+        assert float(tile["exposure"]) == float(whole["exposure"])
+        windows = whole["color"][2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
+        assert bool((windows == tile["color"][2]).all(-1).all(-1).all(-1).any())  # it is one of them
+    with pytest.raises(ValueError, match="tile: expected at most the frame's 90×70 pixels, got 80"):
+        write_clips({"noisy": shot}, [4], tmp_path, "large", tile=80, estimate="nlm")
+
+
+def test_contributions_sum_to_the_result_and_weights_to_one(folder, weights):
+    window, counted = align(folder), Breakdown()
+    denoised = Denoiser(weights, precision="float32", tile=32, breakdown=counted)(window)
+    names = ["before2", "before1", "centre", "after1", "after2"]
+    assert list(denoised.extra) == [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
+    parts = sum(denoised.extra[f"contribution.{name}"] for name in names)
+    np.testing.assert_allclose(parts, denoised.color, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
+    shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])
+    np.testing.assert_allclose(shares.sum(0), 1, rtol=1e-5)
+    rows = list(counted.rows())
+    assert [row[0] for row in rows] == names
+    for row, share in zip(rows, shares, strict=True):
+        assert [float(figure) for figure in row[1:]] == pytest.approx(
+            [share.mean(), share.min(), share.max()], abs=1e-4
+        )
+
+
+def test_bad_options_are_refused(weights):
+    for options, word in (
+        ({"precision": "int8"}, "precision"),
+        ({"tile": 3}, "tile"),
+        ({"threshold": 1.0}, "threshold"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            Denoiser(weights, **options)
+    with pytest.raises(ValueError, match="expected one of"):
+        shipped_weights("slowest")
+
+
+def test_more_threshold_stays_closer_to_the_input_and_to_its_own_frame():
+    """On a rendered shot, with a small network that takes no estimates: 150 steps on two other scenes."""
+    shot = open_shot("examples/shot/noisy.####.exr", frames="11")
+    window = Aligner(shot, STAGES).align(11)
+    noisy = window.color[2] * window.modulation
+    distances, weights_of_centre = [], []
+    for threshold in (0.0, 0.25, 0.5, 0.75, 0.95):
+        counted = Breakdown()
+        path = Path(__file__).parents[2] / "data" / "small.safetensors"
+        image = Denoiser(path, precision="float32", threshold=threshold, breakdown=counted)(window).color
+        distances.append(float(np.abs(image / (1 + image) - noisy / (1 + noisy)).mean()))
+        weights_of_centre.append(float(list(counted.rows())[2][1]))
+    assert all(more < less for less, more in pairwise(distances))
+    assert all(more > less for less, more in pairwise(weights_of_centre))

@@ -1,0 +1,52 @@
+"""The weights that are shipped, on the shot that is bundled."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from hybrid.alignment.align import Aligner
+from hybrid.comparison.metrics import mean_bias, psnr
+from hybrid.estimates import MODE_OF, OfWindows
+from hybrid.files.frames import open_shot
+from hybrid.neural.denoiser import Denoiser, shipped_weights
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import FINAL, filter_window
+from nlm.average import robust_average
+
+pytestmark = pytest.mark.neural
+
+SHOT = Path(__file__).parents[3] / "examples" / "shot"
+FRAME = 11
+
+
+@pytest.fixture(scope="module")
+def window():
+    shot = open_shot(SHOT / "noisy.####.exr")
+    return Aligner(shot, plan_shot(shot).stages, estimates=OfWindows(FINAL)).align(FRAME)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return open_shot(SHOT / "reference.####.exr").read(FRAME).color
+
+
+def test_final_gains_what_is_promised_on_the_bundled_shot(window, reference):
+    final = psnr(filter_window(window, FINAL), reference)
+    robust = psnr(robust_average(window.color, window.confidence) * window.modulation, reference)
+    assert final > psnr(window.color[2] * window.modulation, reference) + 6
+    assert final > robust + 2
+
+
+@pytest.mark.parametrize("preset", [*MODE_OF, "tkpcn"])
+def test_weights_reach_what_their_card_says(window, reference, preset):
+    path = shipped_weights(preset)
+    card = path.with_suffix(".md").read_text(encoding="utf-8")
+    promised = float(re.search(r"frame 11 of the bundled shot: (\d+\.\d+) dB", card)[1])
+    image = Denoiser(path)(window).color
+    # bfloat16 or float32, one processor or another: hundredths of a decibel
+    assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
+    assert preset == "tkpcn" or psnr(image, reference) > psnr(filter_window(window, FINAL), reference)
+    assert abs(mean_bias(image, reference)) < 0.01

@@ -1,0 +1,80 @@
+"""The preset that fits a time per frame."""
+
+import numpy as np
+import pytest
+
+from hybrid import budget, cli
+from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
+from hybrid.commands.denoise import _fitting
+from hybrid.estimates import MODE_OF
+from hybrid.files.frames import open_shot
+from hybrid.pipeline import Denoised
+from hybrid.plan import plan_shot
+from tests.scenes import Scene
+
+SCENE = Scene(height=40, width=56, frames=5)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10s", 10), ("10", 10), ("500ms", 0.5), ("2m", 120), ("1.5 min", 90), (".5s", 0.5)]
+)
+def test_times_are_understood(text, seconds):
+    assert parse_budget(text) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("text", ["", "s", "-1s", "0", "10h", "1e3", "ten"])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(ValueError, match="expected a time per frame"):
+        parse_budget(text)
+
+
+def test_a_part_is_cut_out_of_the_middle(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    whole, part = (s.read(SCENE.first) for s in (shot, cut_out(shot, 16)))
+    np.testing.assert_array_equal(part.color, whole.color[12:28, 20:36])
+    np.testing.assert_array_equal(part.motion, whole.motion[12:28, 20:36])
+    assert part.depth.shape == (16, 16)
+    np.testing.assert_array_equal(cut_out(shot, 99).read(SCENE.first).color, whole.color)
+
+
+@pytest.mark.parametrize("estimate", ["nlm", "sequence"])
+def test_presets_are_measured_from_the_most_accurate_on(tmp_path, monkeypatch, estimate):
+    monkeypatch.setattr(budget, "SIDE", 16)
+    folder = SCENE.write(tmp_path)
+    shot, seen = open_shot(folder), []
+
+    def load(preset):
+        return (lambda window: seen.append((preset, window.number)) or Denoised(window.color[1])), 1
+
+    spec = str(folder) if estimate == "sequence" else estimate
+    measured = list(measure_presets(shot, plan_shot(shot).stages, spec, load))
+    assert [m.preset for m in measured] == ["quality", "balanced", "fast"] == list(reversed(MODE_OF))
+    assert all(m.seconds > 0 for m in measured)
+    assert seen == [(m.preset, SCENE.first + k) for m in measured for k in (1, 2)]
+
+
+@pytest.mark.parametrize(("asked", "chosen", "tried"), [("9s", "quality", 1), ("5s", "balanced", 2), ("1s", "fast", 3)])
+def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, capsys, asked, chosen, tried):
+    pytest.importorskip("torch")
+    shot, times = open_shot(SCENE.write(tmp_path)), {"quality": 8.0, "balanced": 4.0, "fast": 2.0}
+    measured = []
+
+    def measure(*_):
+        for preset, seconds in times.items():
+            measured.append(preset)
+            yield Measured(preset, seconds)
+
+    monkeypatch.setattr(budget, "measure_presets", measure)
+    assert _fitting(shot, asked, "nlm", plan_shot(shot), "float32") == chosen
+    assert len(measured) == tried  # nothing is measured that is not needed
+    said = capsys.readouterr().err
+    assert f"preset: {chosen}" in said
+    assert ("not even the fastest" in said) == (asked == "1s")
+
+
+def test_a_budget_and_a_preset_are_not_both_chosen(tmp_path):
+    pytest.importorskip("torch")
+    shot = str(SCENE.write(tmp_path / "in"))
+    for options in (["--budget", "9s"], ["--preset", "auto"], ["--preset", "auto", "--budget", "9s", "--weights", "w"]):
+        assert cli.main(["denoise", shot, "-o", str(tmp_path / "out"), *options]) == 2
+    assert cli.main(["denoise", shot, "-o", str(tmp_path / "out"), "--preset", "auto", "--budget", "soon"]) == 1

@@ -1,0 +1,233 @@
+"""The command, as a user meets it."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.cli import main
+from hybrid.comparison.metrics import psnr
+from hybrid.files.exr import read_exr, write_layers
+from tests.scenes import Scene
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_help_works(capsys):
+    assert run(capsys, "--help")[0] == 0
+
+
+def test_inspect_names_channels_and_decisions(shot_folder, capsys):
+    code, out, _ = run(capsys, "inspect", shot_folder)
+    assert code == 0
+    for word in ("ViewLayer.Combined", "Vector", "demodulate", "refine", "off"):
+        assert word in out
+
+
+def test_pseudoref_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):
+    scene = Scene()
+    folder, out = scene.write(tmp_path / "in"), tmp_path / "out"
+    preview = tmp_path / "look.png"
+    code, _, err = run(
+        capsys,
+        "pseudoref",
+        folder / "shot.####.exr",
+        "-o",
+        out / "done.####.exr",
+        "--preset",
+        "draft",
+        "--preview",
+        preview,
+    )
+    assert code == 0, err
+    assert preview.stat().st_size > 1000
+    for index in range(3):
+        before = read_exr(folder / f"shot.{1001 + index}.exr")
+        after = read_exr(out / f"done.{1001 + index}.exr")
+        assert before.channel_names == after.channel_names
+        for name in before.channel_names:
+            same = np.array_equal(before.channel(name), after.channel(name))
+            assert same == ("Combined" not in name)
+        truth = scene.clean(index)["ViewLayer.Combined"]
+        pictures = [image.pixels(image.layer("ViewLayer.Combined").channels) for image in (before, after)]
+        assert psnr(pictures[1], truth) > psnr(pictures[0], truth) + 3
+    report = json.loads((out / "ravg.json").read_text())
+    assert report["frames"] == 3
+    assert report["outliers"] >= 0
+    assert {"read", "prepare", "warp", "write"} <= report["stages"].keys()
+    assert all(decision["reason"] for decision in report["plan"])
+
+
+def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
+    _, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-effects", "warp")
+    assert "not run: warp (forced" in " ".join(err.split())
+
+
+def test_a_hole_is_a_warning(shot_folder, tmp_path, capsys):
+    (shot_folder / "shot.1002.exr").unlink()
+    # Frames 1001 and 1003 alone would be every second frame; the range says that 1002 was expected.
+    code, _, err = run(
+        capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--frames", "1001-1003"
+    )
+    assert code == 0
+    assert "warning: missing frames 1002" in err
+
+
+def one_line_error(capsys, *arguments):
+    code, _, err = run(capsys, *arguments)
+    assert code == 1
+    last = [line for line in err.splitlines() if line.strip()][-1]
+    assert last.startswith("error: ")
+    return last
+
+
+def test_a_wrong_path_is_named(tmp_path, capsys):
+    assert "nowhere" in one_line_error(capsys, "inspect", tmp_path / "nowhere.####.exr")
+
+
+def test_a_missing_layer_is_named_with_those_there_are(shot_folder, capsys):
+    error = one_line_error(capsys, "inspect", shot_folder, "--layer", "color=RGBA_beauty")
+    assert "RGBA_beauty" in error
+    assert "ViewLayer.Combined" in error
+
+
+def test_frames_of_different_size_are_named(shot_folder, tmp_path, capsys):
+    Scene(height=44).write(tmp_path / "other")
+    os.replace(tmp_path / "other" / "shot.1002.exr", shot_folder / "shot.1002.exr")
+    out = tmp_path / "o"
+    assert "56x4" in one_line_error(capsys, "pseudoref", shot_folder, "-o", out)
+    assert not list(out.glob("*.exr"))
+
+
+def test_a_truncated_file_is_named_and_leaves_no_partial_output(shot_folder, tmp_path, capsys):
+    victim = shot_folder / "shot.1003.exr"
+    victim.write_bytes(victim.read_bytes()[:-2000])
+    out = tmp_path / "o"
+    assert "shot.1003.exr" in one_line_error(capsys, "pseudoref", shot_folder, "-o", out)
+    assert all(len(read_exr(path).channel_names) > 3 for path in out.glob("*"))
+
+
+def test_the_input_is_not_overwritten(shot_folder, capsys):
+    before = {path: path.read_bytes() for path in shot_folder.iterdir()}
+    assert "overwrite" in one_line_error(capsys, "pseudoref", shot_folder, "-o", shot_folder)
+    assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("command", ["pseudoref", pytest.param("denoise", marks=pytest.mark.neural)])
+def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, command):
+    if command == "denoise":
+        pytest.importorskip("torch")
+    theirs = Path(shutil.copytree(shot_folder, tmp_path / "theirs"))
+    before = {path: path.read_bytes() for path in theirs.iterdir()}
+    words = (command, shot_folder, "--estimate", theirs, "-o", theirs)
+    assert "would overwrite a frame of the estimate" in one_line_error(capsys, *words)
+    assert {path: path.read_bytes() for path in theirs.iterdir()} == before
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("option", ["-o", "--preview", "--breakdown"])
+def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys, passes, option):
+    """The second pass reads what the first has made, and used to write over what that was made from."""
+    pytest.importorskip("torch")
+    before = {path: path.read_bytes() for path in shot_folder.iterdir()}
+    words = ["denoise", shot_folder, "--estimate", "nlm", "--passes", passes]
+    if option == "-o":
+        words += ["-o", shot_folder / "shot.####.exr"]
+    else:
+        words += ["-o", tmp_path / "out", option, shot_folder / "shot.1002.exr"]
+    assert "overwrite" in one_line_error(capsys, *words)
+    assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
+    assert not (tmp_path / "out").exists()  # it was refused before anything was made
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_named(shot_folder, tmp_path, capsys):
+    out = tmp_path / "o"
+    out.mkdir(mode=0o500)
+    assert str(out) in one_line_error(capsys, "pseudoref", shot_folder, "-o", out)
+
+
+def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
+    (tmp_path / "o").write_text("not a folder")
+    assert str(tmp_path / "o") in one_line_error(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o" / "x.####.exr")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["pseudoref"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--preset", "best"],
+        ["inspect", "SHOT", "--layer", "color"],
+        ["inspect", "SHOT", "--no-such-option"],
+    ],
+)
+def test_bad_usage_is_two(arguments, shot_folder, tmp_path, capsys):
+    words = {"SHOT": str(shot_folder), "OUT": str(tmp_path / "o")}
+    assert run(capsys, *(words.get(word, word) for word in arguments))[0] == 2
+
+
+def test_a_file_without_color_is_refused(tmp_path, capsys):
+    write_layers(tmp_path / "depth.exr", {"depth": np.ones((8, 8), np.float32)})
+    assert "color" in one_line_error(capsys, "inspect", tmp_path / "depth.exr")
+
+
+@pytest.fixture
+def compared(tmp_path):
+    """A noisy shot, its clean frames, and a folder for the report."""
+    scene = Scene()
+    return scene.write(tmp_path / "hall"), scene.write(tmp_path / "clean", clean=True), tmp_path / "report"
+
+
+def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, capsys):
+    noisy, clean, out = compared
+    arguments = [noisy, "--reference", clean, "--methods", "noisy,draft", "--rounds", 1]
+    code, table, err = run(
+        capsys, "compare", *arguments, "-o", out, "--external", f"theirs={clean}", "--samples", 8, "--markdown"
+    )
+    assert code == 0, err
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert rows[0][:2] == ["method", "hall: PSNR (dB) / Temporal PSNR (dB)"]
+    assert [row[0] for row in rows[2:]] == ["noisy", "draft", "theirs"]
+    assert rows[4][1] == "**∞** / **∞**"
+    assert rows[4][2] == "–"  # nobody knows its time
+    assert (out / "results.md").read_text() == table
+    assert {"report.html", "results.json", "results.csv", "chart.png"} <= {path.name for path in out.iterdir()}
+    document = json.loads((out / "results.json").read_text())
+    assert set(document["results"][1]["metrics"]) >= {"ssim", "smape", "relmse_trimmed", "mean_bias"}
+
+    # A finished report stands beside another shot, and two of them can be put together without running anything.
+    _, table, _ = run(capsys, "compare", "--beside", out, "--beside", out, "-o", out / "both", "--markdown")
+    assert table.splitlines()[0].count("hall: PSNR") == 2
+    assert "All shots" in (out / "both" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("extra", "complaint"),
+    [
+        (["--methods", "noisy,unheard-of"], "expected one of noisy"),
+        (["--external", "nameless"], "expected NAME=PATTERN"),
+        (["--external", "noisy=x.exr"], "a name that no other method has"),
+        (["--level", "x.####.exr"], "expected PATTERN=SPP"),
+        (["--clock", "sun"], "expected one of wall, cpu"),
+    ],
+)
+def test_compare_refuses_what_it_cannot_do(compared, capsys, extra, complaint):
+    noisy, clean, _ = compared
+    code, _, err = run(capsys, "compare", noisy, "--reference", clean, *extra)
+    assert code == 2
+    assert complaint in " ".join(err.replace("│", " ").split())
+
+
+def test_compare_wants_something_to_compare(capsys, tmp_path):
+    assert run(capsys, "compare")[0] == 2
+    code, _, err = run(capsys, "compare", "--beside", tmp_path)
+    assert code == 1
+    assert "results.json" in err

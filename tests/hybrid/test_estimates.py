@@ -1,0 +1,324 @@
+"""Per-frame estimates: where they come from, and what time makes of them."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid import estimates
+from hybrid.alignment.align import Aligner
+from hybrid.cli import main
+from hybrid.comparison.metrics import psnr
+from hybrid.estimates import OfCleanGuides, OfFrames, OfWindows, choose_estimate
+from hybrid.files.frames import open_shot
+from hybrid.plan import plan_shot
+from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
+from tests.scenes import Scene
+
+STAGES = {"demodulate", "outliers", "warp", "gate"}
+SCENE = Scene(frames=5, height=48, width=64)
+MIDDLE = SCENE.first + 2
+
+
+def flickering(frame, seed=0):
+    """A denoiser of single frames: the truth, but for a smooth error of its own in every frame."""
+    rng = np.random.default_rng((seed, frame.number))
+    truth = SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
+    return truth * np.float32(1 + 0.02 * rng.standard_normal())
+
+
+def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
+    asked = []
+
+    def estimate(frame):
+        asked.append(frame.number)
+        return frame.color
+
+    aligner = Aligner(open_shot(SCENE.write(tmp_path)), STAGES, estimates=OfFrames(estimate))
+    for number in aligner.shot.numbers:
+        assert aligner.align(number).estimate.shape == (5, SCENE.height, SCENE.width, 3)
+    assert sorted(asked) == list(aligner.shot.numbers)
+
+
+def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_from(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    sliding = Aligner(shot, STAGES, estimates=OfWindows(DRAFT))
+    windows = [sliding.align(number) for number in shot.numbers]
+    alone = Aligner(shot, STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE)
+    np.testing.assert_array_equal(windows[2].estimate, alone.estimate)
+    np.testing.assert_array_equal(gated_average(windows[2]), gated_average(alone))
+
+
+def noisy_albedo(index, layers):
+    """What depth of field makes of an albedo."""
+    noise = np.random.default_rng(100 + index).standard_normal((SCENE.height, SCENE.width, 3))
+    name = "ViewLayer.Denoising Albedo"
+    layers[name] = np.clip(layers[name] + 0.05 * noise, 0, 1).astype(np.float32)
+
+
+def test_guides_are_prefiltered_for_those_who_rely_on_them(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path, edit=noisy_albedo))
+    seen = {}
+
+    def denoise(frame):
+        assert frame.number not in seen
+        seen[frame.number] = frame
+        return frame.color
+
+    aligner = Aligner(shot, STAGES | {"prefilter"}, estimates=OfCleanGuides(denoise))
+    for number in shot.numbers:
+        aligner.align(number)
+    assert sorted(seen) == list(shot.numbers)
+    given = shot.read(MIDDLE)
+    truth = SCENE.clean(2)["ViewLayer.Denoising Albedo"]
+    error, before = (np.abs(albedo - truth).mean() for albedo in (seen[MIDDLE].albedo, given.albedo))
+    # The mean of three frames alone would leave 0.58 of it; noise hides which pixels are alike, so 0.67.
+    assert error < 0.8 * before
+    np.testing.assert_allclose(seen[MIDDLE].color, given.color, rtol=1e-5)
+
+
+def test_guides_without_noise_are_left_as_they_are(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    seen = []
+    aligner = Aligner(shot, STAGES, radius=0, estimates=OfCleanGuides(lambda frame: seen.append(frame) or frame.color))
+    aligner.align(MIDDLE)
+    (frame,) = seen
+    np.testing.assert_array_equal(frame.albedo, shot.read(MIDDLE).albedo)
+    np.testing.assert_array_equal(frame.normal, shot.read(MIDDLE).normal)
+
+
+def test_frames_needed_are_those_that_are_read(tmp_path):
+    scene = replace(SCENE, frames=15)
+    shot = open_shot(scene.write(tmp_path))
+    stages = STAGES | {"prefilter"}
+
+    def same(frame):
+        return frame.color
+
+    for source in (None, OfFrames(same), OfCleanGuides(same), OfWindows(DRAFT)):
+        aligner, read = Aligner(shot, stages, estimates=source), []
+        aligner.shot.read = lambda number, read=read: read.append(number) or type(shot).read(shot, number)
+        aligner.align(scene.first + 7)
+        reach = 2 if source is None else source.reach(2, stages)
+        assert sorted(read) == list(range(scene.first + 7 - reach, scene.first + 8 + reach))
+
+
+def test_the_centres_estimate_comes_through_unchanged(tmp_path):
+    window = Aligner(open_shot(SCENE.write(tmp_path)), STAGES, estimates=OfFrames(flickering)).align(MIDDLE)
+    given = flickering(open_shot(tmp_path).read(MIDDLE))
+    np.testing.assert_allclose(window.estimate[2] * window.modulation, given, rtol=1e-6)
+
+
+def test_where_colors_agree_geometry_cannot_take_all_trust_away(tmp_path):
+    """An outline's albedo is mixed anew in each frame; here all of it is."""
+
+    def mixed_anew(index, layers):
+        name = "ViewLayer.Denoising Albedo"
+        layers[name] = np.random.default_rng(index).uniform(0.1, 0.9, layers[name].shape).astype(np.float32)
+
+    shot = open_shot(SCENE.write(tmp_path, edit=mixed_anew))
+
+    def truth(frame):
+        return SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
+
+    window = Aligner(shot, STAGES - {"demodulate"}, estimates=OfFrames(truth)).align(MIDDLE)
+    # The wall passes by whole pixels: warped, the next frame is this one but for the light, which follows the camera.
+    inside = np.s_[4:-4, 4:-4]
+    assert np.median(window.confidence[3][inside]) == pytest.approx(0.3, abs=0.01)
+    other = Aligner(
+        shot, STAGES - {"demodulate"}, estimates=OfFrames(lambda f: truth(f) * (1 + (f.number == MIDDLE + 1)))
+    )
+    assert other.align(MIDDLE).confidence[3].max() < 0.05
+
+
+def test_flicker_is_averaged_away(tmp_path):
+    """Five independent errors: their mean has a fifth of the variance, 7 dB, less where frames lack the pixel."""
+    shot = open_shot(SCENE.write(tmp_path))
+    gain = []
+    for seed in range(4):
+        aligner = Aligner(shot, STAGES, estimates=OfFrames(lambda frame, seed=seed: flickering(frame, seed)))
+        # Errors of one factor per frame are all that differs; the gate is wide, as the frames are noisy.
+        window = aligner.align(MIDDLE)
+        truth = SCENE.clean(2)["ViewLayer.Combined"]
+        before = np.mean((window.estimate[2] * window.modulation - truth) ** 2)
+        gain.append((before, np.mean((gated_average(window) - truth) ** 2)))
+    before, after = np.mean(gain, axis=0)
+    assert after < before / 2.5
+
+
+def test_light_that_changes_is_not_averaged(tmp_path):
+    """A shadow that falls on the centre frame only: geometry does not see it, the gate does."""
+
+    def shadowed(index, layers):
+        if index == 2:
+            layers["ViewLayer.Combined"][:, :32] *= 0.25
+
+    def estimate(frame):
+        layers = SCENE.clean(frame.number - SCENE.first)
+        shadowed(frame.number - SCENE.first, layers)
+        return layers["ViewLayer.Combined"]
+
+    shot = open_shot(SCENE.write(tmp_path, edit=shadowed))
+    truth = estimate(shot.read(MIDDLE))
+    errors = []
+    for stages in (STAGES, STAGES - {"gate"}):
+        result = gated_average(Aligner(shot, stages, estimates=OfFrames(estimate)).align(MIDDLE))
+        errors.append(np.abs(result - truth)[:, :28].mean() / truth[:, :28].mean())
+    assert errors[0] < 0.02  # of the shadow's light
+    assert errors[1] > 1  # dragged in from the bright frames
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_average_scales_with_the_radiance(tmp_path, scale):
+    plain = gated_average(
+        Aligner(open_shot(SCENE.write(tmp_path / "a")), STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE)
+    )
+    shot = open_shot(SCENE.write(tmp_path / "b", scale=scale))
+    scaled = gated_average(Aligner(shot, STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE))
+    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3)
+
+
+def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path):
+    def broken(frame):
+        image = flickering(frame)
+        image[5, 5], image[9, 9] = np.nan, -1
+        return image
+
+    shot = open_shot(SCENE.write(tmp_path))
+    result = gated_average(Aligner(shot, STAGES, estimates=OfFrames(broken)).align(MIDDLE))
+    assert np.isfinite(result).all()
+    assert result.min() >= 0
+    with pytest.raises(ValueError, match=r"estimate of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
+        Aligner(shot, STAGES, estimates=OfFrames(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
+    with pytest.raises(ValueError, match=f"frame {MIDDLE} has no estimate"):
+        Aligner(shot, STAGES, estimates=OfFrames(lambda frame: None)).align(MIDDLE)
+    with pytest.raises(ValueError, match="expected a window with estimates"):
+        gated_average(Aligner(shot, STAGES).align(MIDDLE))
+
+
+def test_a_neighbour_without_an_estimate_counts_for_nothing(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    window = Aligner(
+        shot, STAGES, estimates=OfFrames(lambda f: None if f.number == MIDDLE + 1 else flickering(f))
+    ).align(MIDDLE)
+    assert (window.confidence[3] == 0).all()
+    assert window.confidence[1].max() > 0
+
+
+def denoised(index, layers):
+    """What Cycles writes where it denoises at render time."""
+    layers["ViewLayer.Noisy Image"] = layers["ViewLayer.Combined"]
+    layers["ViewLayer.Combined"] = SCENE.clean(index)["ViewLayer.Combined"]
+
+
+def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeypatch):
+    plain = open_shot(SCENE.write(tmp_path / "plain"))
+    cycles = open_shot(SCENE.write(tmp_path / "cycles", edit=denoised))
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    assert choose_estimate("auto", cycles).name == "file"
+    assert choose_estimate("auto", plain).name == "oidn-clean"
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: False)
+    source = choose_estimate("auto", plain, own=STANDARD)
+    assert (source.name, source.estimates) == ("nlm", OfWindows(STANDARD))
+    assert choose_estimate("none", plain).estimates is None
+    with pytest.raises(ImportError, match="pyoidn is not installed"):
+        choose_estimate("oidn-fast", plain)
+
+
+def test_what_cycles_has_denoised_is_taken_and_stays_what_it_is_at_the_centre(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path, edit=denoised))
+    window = Aligner(shot, STAGES, estimates=choose_estimate("auto", shot).estimates).align(MIDDLE)
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    np.testing.assert_allclose(window.estimate[2] * window.modulation, truth, rtol=1e-5)
+
+
+def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    SCENE.write(tmp_path / "clean", clean=True, without={"Vector", "Depth"})
+    source = choose_estimate(str(tmp_path / "clean" / "shot.####.exr"), shot)
+    window = Aligner(shot, STAGES, estimates=source.estimates).align(MIDDLE)
+    assert psnr(gated_average(window), SCENE.clean(2)["ViewLayer.Combined"]) > 50
+    replace(SCENE, frames=2).write(tmp_path / "short", clean=True)
+    with pytest.raises(ValueError, match=f"expected frame {MIDDLE}, which the shot has"):
+        choose_estimate(str(tmp_path / "short" / "shot.####.exr"), shot)
+    with pytest.raises(FileNotFoundError):
+        choose_estimate(str(tmp_path / "nothing.####.exr"), shot)
+
+
+def test_of_a_sequence_that_cycles_has_denoised_the_denoised_picture_is_taken(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    SCENE.write(tmp_path / "cycles", edit=denoised)
+    source = choose_estimate(str(tmp_path / "cycles"), shot)
+    np.testing.assert_array_equal(source.estimates.function(shot.read(MIDDLE)), SCENE.clean(2)["ViewLayer.Combined"])
+
+
+def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    sources = [choose_estimate("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
+    images = [source.estimates.function(shot.read(MIDDLE)) for source in sources]
+    assert len(made) == 1
+    assert (tmp_path / f"kept.{MIDDLE}.exr").is_file()
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_allclose(images[0], 0.5 * shot.read(MIDDLE).color, rtol=1e-3)
+
+
+def test_pictures_are_kept_in_a_file_each(tmp_path, monkeypatch):
+    """Also where one frame was asked for: its neighbours are denoised as well."""
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    folder, one = SCENE.write(tmp_path), str(tmp_path / "kept.exr")
+    with pytest.raises(ValueError, match=r"kept\.exr' names one file for 5 frames, expected OUT\.####\.exr"):
+        choose_estimate("oidn", open_shot(folder, frames=str(MIDDLE)), kept=one)
+    alone = open_shot(folder / f"shot.{MIDDLE}.exr")
+    assert choose_estimate("oidn", alone, kept=one).reason == "asked for"
+
+
+def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy", edit=denoised))
+    for spec in ("auto", "nlm", "none", str(tmp_path / "noisy")):
+        assert "nothing of it is kept" in choose_estimate(spec, shot, kept=str(tmp_path / "kept")).reason
+        assert "kept" not in choose_estimate(spec, shot).reason
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
+def test_oidn_estimates_come_out_stable(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path))
+    window = Aligner(shot, STAGES, estimates=choose_estimate("oidn", shot).estimates).align(MIDDLE)
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    alone, stable = psnr(window.estimate[2] * window.modulation, truth), psnr(gated_average(window), truth)
+    assert stable > alone > psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)
+
+
+def test_the_command_says_what_was_taken(tmp_path, capfd):
+    folder = SCENE.write(tmp_path / "noisy", edit=denoised)
+    out = tmp_path / "out"
+    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", "auto"]) == 0
+    assert "estimates: file (the file holds a denoised picture)" in capfd.readouterr().err
+    assert open_shot(out).numbers == open_shot(folder).numbers
+    assert '"estimate": "file"' in (out / "ravg.json").read_text(encoding="utf-8")
+    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", str(tmp_path / "no.####.exr")]) == 1
+
+
+def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
+    """Cycles with OIDN and its passes stored, adaptive sampling, one seed for all frames (examples/render_shot.py)."""
+    folder = Path(__file__).parents[1] / "data" / "defaults"
+    out = tmp_path / "stable.####.exr"
+    assert main(["pseudoref", str(folder / "noisy.####.exr"), "-o", str(out), "--estimate", "auto"]) == 0
+    said = capfd.readouterr().err
+    assert "estimates: file" in said
+    assert "fixed-noise" in said
+    before, after = open_shot(folder), open_shot(str(out))
+    pictures = [before.read(10).estimate, after.read(10).estimate]  # Combined is replaced, the Noisy Image stays
+    np.testing.assert_array_equal(after.read(10).color, before.read(10).color)
+    assert 30 < psnr(pictures[1], pictures[0]) < 60  # changed, and not by much
+
+
+def test_the_plan_sees_the_one_seed_of_blenders_defaults():
+    plan = plan_shot(open_shot(Path(__file__).parents[1] / "data" / "defaults"))
+    decision = next(d for d in plan.decisions if d.stage == "fixed-noise")
+    assert decision.on
+    assert "Animate Seed" in decision.reason

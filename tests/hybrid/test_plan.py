@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+
+from hybrid.alignment.align import Aligner
+from hybrid.files.frames import open_shot
+from hybrid.plan import STAGES, plan_shot
+from tests.scenes import Scene
+
+
+def decisions(folder):
+    plan = plan_shot(open_shot(folder))
+    return {decision.stage: decision for decision in plan.decisions}
+
+
+def test_every_effect_is_decided_once_with_a_reason(shot_folder):
+    plan = plan_shot(open_shot(shot_folder))
+    assert [d.stage for d in plan.decisions] == list(STAGES)
+    assert all(d.reason for d in plan.decisions)
+
+
+def test_exact_vectors_are_used_as_they_are(shot_folder):
+    found = decisions(shot_folder)
+    assert found["warp"].on
+    assert found["warp"].figure == pytest.approx(np.hypot(2, 1), abs=1e-3)
+    assert not found["refine"].on
+    assert not found["dense-flow"].on
+    assert not found["gate"].on
+
+
+def test_nothing_is_warped_where_nothing_moves(tmp_path):
+    found = decisions(Scene(step=(0, 0)).write(tmp_path))
+    assert not found["warp"].on
+    assert not found["refine"].on
+
+
+def test_without_vectors_motion_is_looked_for_only_where_something_moves(tmp_path):
+    moving = decisions(Scene(noise=0.05).write(tmp_path / "moving", without={"Vector"}))
+    still = decisions(Scene(noise=0.05, step=(0, 0)).write(tmp_path / "still", without={"Vector"}))
+    assert moving["dense-flow"].on
+    assert moving["warp"].on
+    assert not still["dense-flow"].on
+    assert not still["warp"].on
+
+
+def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gate(tmp_path):
+    def reflect(index, layers):
+        y, x = np.mgrid[: Scene.height, : Scene.width]
+        # A bright disc that stands still while the vectors say that everything moves: a reflection.
+        layers["ViewLayer.Combined"][(y - 20) ** 2 + (x - 10 - 14 * index) ** 2 < 64] *= 5
+
+    found = decisions(Scene().write(tmp_path, edit=reflect))
+    assert found["refine"].on
+    assert found["gate"].on
+
+
+def test_fireflies_call_for_rejection(tmp_path):
+    def burn(index, layers):
+        layers["ViewLayer.Combined"][7 + index, 9] = 1e5
+
+    assert not decisions(Scene(noise=0.1).write(tmp_path / "calm"))["outliers"].on
+    assert decisions(Scene(noise=0.1).write(tmp_path / "burnt", edit=burn))["outliers"].on
+
+
+def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
+    def blur(index, layers):
+        noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
+        layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
+
+    assert not decisions(Scene().write(tmp_path / "sharp"))["prefilter"].on
+    assert decisions(Scene().write(tmp_path / "noisy", edit=blur))["prefilter"].on
+
+
+def test_without_albedo_there_is_no_demodulation(tmp_path):
+    found = decisions(Scene().write(tmp_path, without={"Denoising Albedo"}))
+    assert not found["demodulate"].on
+    assert found["demodulate"].figure is None
+
+
+def test_one_frame_has_a_plan(tmp_path):
+    found = decisions(Scene(frames=1).write(tmp_path))
+    assert not found["warp"].on
+
+
+def test_the_user_may_force_what_was_measured(shot_folder):
+    plan = plan_shot(open_shot(shot_folder)).force(on=["refine"], off=["warp"])
+    assert "refine" in plan.stages
+    assert "warp" not in plan.stages
+    forced = [d for d in plan.decisions if d.forced]
+    assert {d.stage for d in forced} == {"refine", "warp"}
+    assert all(d.reason.startswith("forced") for d in forced)
+
+
+@pytest.mark.parametrize(("on", "off"), [(["wrap"], []), ([], ["wrap"]), (["warp"], ["warp"])])
+def test_forcing_nonsense_is_refused(shot_folder, on, off):
+    with pytest.raises(ValueError, match=r"wrap|both"):
+        plan_shot(open_shot(shot_folder)).force(on=on, off=off)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_noise_that_stands_still_on_the_screen_is_found(tmp_path, moving, fixed):
+    """One seed for all frames: the grain is a function of the pixel, not of the frame."""
+    scene = Scene(height=64, width=96, frames=4, step=(2, 1) if moving else (0, 0))
+
+    def one_seed(index, layers):
+        grain = np.random.default_rng(5).gamma(11, 1 / 11, (scene.height, scene.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = scene.clean(index)["ViewLayer.Combined"] * grain
+
+    shot = open_shot(scene.write(tmp_path, edit=one_seed if fixed else None))
+    decision = next(d for d in plan_shot(shot).decisions if d.stage == "fixed-noise")
+    assert decision.on == fixed
+    assert ("Animate Seed" in decision.reason) == fixed
+
+
+def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_path):
+    scene = Scene(height=48, width=64, frames=5, step=(0, 0))
+
+    def one_seed(index, layers):
+        grain = np.random.default_rng(5).gamma(11, 1 / 11, (scene.height, scene.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = scene.clean(index)["ViewLayer.Combined"] * grain
+
+    shot = open_shot(scene.write(tmp_path, edit=one_seed))
+    stages = {"demodulate", "warp", "fixed-noise"}
+    window = Aligner(shot, stages).align(scene.first + 2)
+    assert (window.confidence[[0, 1, 3, 4]] == 0).all()
+    trusting = Aligner(shot, stages - {"fixed-noise"}).align(scene.first + 2)
+    assert trusting.variance.max() < 1e-10  # five times the same picture
+    # Grain of a standard deviation of 0.3: what is left of it says so, within what a 5×5 box of it varies.
+    truth = (0.3 * scene.clean(2)["ViewLayer.Combined"] / window.modulation) ** 2
+    assert np.median(window.variance / truth) == pytest.approx(1, abs=0.35)

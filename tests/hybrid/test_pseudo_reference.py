@@ -1,0 +1,158 @@
+import numpy as np
+import pytest
+
+from hybrid.alignment.align import Aligner
+from hybrid.comparison.metrics import psnr
+from hybrid.files.frames import open_shot
+from hybrid.plan import STAGES
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, DRAFT, FINAL, STANDARD, filter_window
+from nlm.average import robust_average
+from tests.scenes import Scene
+
+MOVING = {"demodulate", "outliers", "warp"}
+SCENE = Scene(frames=5)
+MIDDLE = SCENE.first + 2
+
+
+def align(folder, stages=MOVING, number=MIDDLE, **options):
+    return Aligner(open_shot(folder), stages, **options).align(number)
+
+
+def test_exact_vectors_bring_every_frame_onto_the_centre(tmp_path):
+    window = align(SCENE.write(tmp_path, clean=True))
+    assert window.confidence.shape == (5, SCENE.height, SCENE.width)
+    radiance = window.color * window.modulation
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    for frame, confidence in zip(radiance, window.confidence, strict=True):
+        # Whole-pixel vectors: the warp interpolates nothing; the division by albedo rounds.
+        np.testing.assert_allclose(frame[confidence > 0.5], truth[confidence > 0.5], rtol=1e-5)
+    # The frame two steps away has moved 4 px right and 2 down; the 3×3 minimum takes one more row and column.
+    assert window.confidence[0][4:-4, 6:-6].min() > 0.9
+    assert window.confidence[4][4:-4, 6:-6].min() > 0.9
+
+
+@pytest.mark.parametrize("number", [SCENE.first, SCENE.first + SCENE.frames - 1])
+def test_the_first_and_the_last_frame_lack_neighbours_and_are_estimated_all_the_same(tmp_path, number):
+    window = align(SCENE.write(tmp_path), number=number)
+    absent = slice(0, 2) if number == SCENE.first else slice(3, 5)
+    assert (window.confidence[absent] == 0).all()
+    assert (window.confidence[2] == 1).all()
+    assert np.isfinite(filter_window(window, STANDARD)).all()
+
+
+def test_a_hole_in_the_sequence_is_a_narrower_window(tmp_path):
+    folder = SCENE.write(tmp_path)
+    (folder / f"shot.{MIDDLE - 1}.exr").unlink()
+    window = align(folder)
+    # Flows are chained over the frame that is missing, so what lies beyond it cannot be reached.
+    assert (window.confidence[:2] == 0).all()
+    assert window.confidence[3:].max() > 0.9
+
+
+def test_frames_are_read_once_while_the_window_slides(tmp_path, monkeypatch):
+    shot = open_shot(SCENE.write(tmp_path))
+    read = []
+    monkeypatch.setattr("hybrid.files.frames.read_exr", _counting(read))
+    aligner = Aligner(shot, MOVING)
+    for number in shot.numbers:
+        aligner.align(number)
+    pixels = [path for path, whole in read if whole]
+    assert sorted(pixels) == sorted(set(pixels))
+
+
+def _counting(read):
+    from hybrid.files.exr import read_exr
+
+    def counted(path, *args, pixels=True, **options):
+        read.append((str(path), pixels))
+        return read_exr(path, *args, pixels=pixels, **options)
+
+    return counted
+
+
+def test_each_preset_beats_the_robust_average_and_final_the_noisy_frame_by_six_decibels(tmp_path):
+    window = align(SCENE.write(tmp_path))
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    noisy = psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)
+    robust = psnr(robust_average(window.color, window.confidence) * window.modulation, truth)
+    for preset in CLASSICAL_PRESETS.values():
+        assert psnr(filter_window(window, preset), truth) > robust + 1
+    assert psnr(filter_window(window, FINAL), truth) > noisy + 6
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+@pytest.mark.parametrize("preset", [DRAFT, STANDARD])
+def test_the_estimate_scales_with_the_radiance(tmp_path, scale, preset):
+    stages = MOVING | {"gate", "prefilter", "refine"}
+    plain = filter_window(align(SCENE.write(tmp_path / "plain"), stages), preset)
+    scaled = filter_window(align(SCENE.write(tmp_path / "scaled", scale=scale), stages), preset)
+    # float32 through two filters; the promise is 1e-3
+    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-5 * scale)
+
+
+def test_nonfinite_pixels_are_counted_filled_and_stay_local(tmp_path):
+    def spoil(index, layers):
+        if index == 2:
+            layers["ViewLayer.Combined"][10, 12] = np.nan
+            layers["ViewLayer.Combined"][11, 12, 1] = np.inf
+            layers["ViewLayer.Denoising Albedo"][30, 5] = np.nan
+            layers["ViewLayer.Vector"][20, 20] = np.nan, 1e9, -1e9, np.inf
+
+    good = align(SCENE.write(tmp_path / "good"))
+    spoilt = align(SCENE.write(tmp_path / "spoilt", edit=spoil))
+    assert (good.repaired, spoilt.repaired) == (0, 3)
+    assert spoilt.confidence[2, 10, 12] == 0
+    image, plain = filter_window(spoilt, STANDARD), filter_window(good, STANDARD)
+    assert np.isfinite(image).all()
+    # Beyond search (2), patch (3), variance (2), outliers (1) and guided (1) radius of the spoilt pixels little can
+    # change: only the guided filter's and the gate's global scales.
+    far = np.ones(image.shape[:2], bool)
+    for y, x in ((10, 12), (30, 5), (20, 20)):
+        far[max(y - 12, 0) : y + 13, max(x - 12, 0) : x + 13] = False
+    np.testing.assert_allclose(image[far], plain[far], rtol=0.02)
+
+
+def test_a_firefly_leaves_neither_a_bright_spot_nor_a_dark_hole(tmp_path):
+    def burn(index, layers):
+        if index == 2:
+            layers["ViewLayer.Combined"][20, 28] = 1e6
+
+    image = filter_window(align(SCENE.write(tmp_path, edit=burn)), FINAL)
+    truth = SCENE.clean(2)["ViewLayer.Combined"]
+    ratio = image[18:23, 26:31].mean() / truth[18:23, 26:31].mean()
+    # The noise of 30 % averaged over five frames and some neighbours: a few per cent.
+    assert 0.9 < ratio < 1.1
+
+
+def test_a_still_shot_is_not_warped(tmp_path):
+    scene = Scene(frames=3, step=(0, 0))
+    aligner = Aligner(open_shot(scene.write(tmp_path)), {"demodulate"})
+    window = aligner.align(scene.first + 1)
+    noisy = scene.noisy(0)["ViewLayer.Combined"]
+    np.testing.assert_allclose(window.color[1] * window.modulation, noisy, rtol=1e-5)
+    assert (aligner.flow(scene.first + 1, scene.first)[0] == 0).all()
+
+
+def test_without_vectors_the_motion_is_found(tmp_path):
+    scene = Scene(height=64, width=96, noise=0.05)
+    folder = scene.write(tmp_path, without={"Vector"})
+    aligner = Aligner(open_shot(folder), MOVING | {"dense-flow"})
+    aligner.align(scene.first + 1)
+    inner = aligner.flow(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
+    # The wall's 4 px squares have straight edges; most of the picture must be found to half a pixel.
+    error = np.hypot(inner[..., 0] - scene.step[0], inner[..., 1] - scene.step[1])
+    assert np.median(error) < 0.5
+
+
+def test_aovs_travel_along_and_sum_to_the_beauty(tmp_path):
+    def split(index, layers):
+        layers["direct"] = 0.25 * layers["ViewLayer.Combined"]
+        layers["indirect"] = 0.75 * layers["ViewLayer.Combined"]
+
+    shot = open_shot(SCENE.write(tmp_path, edit=split), aovs=("direct", "indirect"))
+    window = Aligner(shot, {"demodulate", "warp"}).align(MIDDLE)
+    np.testing.assert_allclose(window.aovs["direct"] + window.aovs["indirect"], window.color, rtol=1e-5)
+
+
+def test_every_effect_is_known_to_the_plan():
+    assert STAGES.keys() >= MOVING | {"gate", "prefilter", "refine", "dense-flow"}

@@ -1,0 +1,73 @@
+"""Made-up shots whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid.files.exr import write_layers
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A textured wall lit by a soft gradient, passing the camera by whole pixels per frame."""
+
+    height: int = 40
+    width: int = 56
+    frames: int = 3
+    first: int = 1001
+    step: tuple[int, int] = (2, 1)  # pixels right and down that the wall moves per frame
+    noise: float = 0.3
+
+    def clean(self, index: int) -> dict[str, np.ndarray]:
+        """Noise-free layers of frame `index`, with Cycles' names and conventions."""
+        rng = np.random.default_rng(7)
+        margin = 40
+        wall = rng.uniform(0.2, 0.8, (self.height // 4 + margin, self.width // 4 + margin, 3)).astype(np.float32)
+        wall = wall.repeat(4, axis=0).repeat(4, axis=1)
+        y, x = 2 * margin - self.step[1] * index, 2 * margin - self.step[0] * index
+        albedo = wall[y : y + self.height, x : x + self.width]
+        light = np.linspace(0.5, 2, wall.shape[1], dtype=np.float32)[None, x : x + self.width, None]
+        vector = np.empty((self.height, self.width, 4), np.float32)
+        # The previous frame is sampled at (x + X, y - Y), the next at (x - Z, y + W).
+        vector[:] = -self.step[0], self.step[1], -self.step[0], self.step[1]
+        normal = np.broadcast_to(np.float32([0, 0, 1]), albedo.shape).copy()
+        return {
+            "ViewLayer.Combined": albedo * light,
+            "ViewLayer.Denoising Albedo": albedo.copy(),
+            "ViewLayer.Denoising Normal": normal,
+            "ViewLayer.Depth": np.full((self.height, self.width), 4, np.float32),
+            "ViewLayer.Vector": vector,
+        }
+
+    def noisy(self, index: int) -> dict[str, np.ndarray]:
+        """The same with unbiased multiplicative noise in the color, skewed as that of a path tracer is."""
+        layers = self.clean(index)
+        shape = 1 / self.noise**2
+        rng = np.random.default_rng((11, index))
+        grain = rng.gamma(shape, 1 / shape, (self.height, self.width, 1)).astype(np.float32)
+        layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * grain
+        return layers
+
+    def write(
+        self,
+        folder: Path,
+        *,
+        clean: bool = False,
+        scale: float = 1,
+        without: Collection[str] = (),
+        edit: Callable[[int, dict[str, np.ndarray]], None] | None = None,
+    ) -> Path:
+        """Write the frames as shot.####.exr: color times `scale`, some layers left out, or edited frame by frame."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for index in range(self.frames):
+            layers = self.clean(index) if clean else self.noisy(index)
+            layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * np.float32(scale)
+            if edit is not None:
+                edit(index, layers)
+            kept = {name: layer for name, layer in layers.items() if name.partition(".")[2] not in without}
+            write_layers(folder / f"shot.{self.first + index:04d}.exr", kept, half=False)
+        return folder
