@@ -1,0 +1,452 @@
+"""The U-Nets of Intel Open Image Denoise (OIDN), from which a network can start.
+
+`Trunk` is the network, `read_tza` reads weights, `load_oidn` finds OIDN's in the library that the package ``pyoidn``
+installs, and `denoise_picture` does with them what OIDN does. Nothing of OIDN's is part of this project.
+
+References
+----------
+Áfra 2025, "Intel Open Image Denoise", https://www.openimagedenoise.org. Network, exposure and transfer curve are those
+of ``training/`` in RenderKit/oidn, the weights those of RenderKit/oidn-weights; both are Apache-2.0 (see NOTICE).
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import importlib.util
+import mmap
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from math import log, prod
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+#: Channels of the convolutions at each scale of the encoder, finest first.
+ENCODERS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "small": ((32, 32), (32,), (32,), (32,), (32, 32)),
+    "base": ((32, 32), (48,), (64,), (80,), (96, 96)),
+    "large": ((64, 64), (96, 96), (128, 128), (192, 192), (256, 256)),
+}
+#: The same of the decoder, coarsest first.
+DECODERS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "small": ((64, 64), (64, 64), (64, 32), (32, 32)),
+    "base": ((112, 112), (96, 96), (64, 64), (64, 32)),
+    "large": ((192, 192), (128, 128), (96, 96), (64, 64)),
+}
+#: Bytes and SHA-256 of OIDN's weights, as version 2.5.1 has them.
+OIDN_WEIGHTS = {
+    "rt_hdr": (1830792, "a097e8fe9b1ba71ec43cde3e6df3fcf54fa4f8f2f4dd41eac01d0a76a16261e3"),
+    "rt_hdr_small": (634568, "c9171947f2bceb4367725b7a0d5b4e0d663ac44108386af42f1b49e4361952e7"),
+    "rt_hdr_alb": (1835976, "a8e4fbbd3a794e0098f88e23882faf5459840bda5b0ff39f22bcaaf2cfd03b5a"),
+    "rt_hdr_alb_small": (638024, "1f3839dfc949e969bc5ad4d600e85bfa96187e0cb5ffee2f4715c791e6221fba"),
+    "rt_hdr_alb_nrm": (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
+    "rt_hdr_alb_nrm_small": (641480, "980ea307e7825cae23ed8b1addf8de62ece84b61094795a5631ebf1c91b2e1a7"),
+    "rt_hdr_calb_cnrm": (1841160, "d0057057bd76c64e3e67b449728ef8f4fd2f11ccfb74c1e59b9d50dafd50ee0e"),
+    "rt_hdr_calb_cnrm_small": (641480, "a6c43bfdbff01bdd8a9c777e139720f9e58b872a50c8db07079bddd007482dc5"),
+    "rt_hdr_calb_cnrm_large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
+    "rt_alb": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
+    "rt_alb_large": (7684615, "a8efbe6eed511f41c8f5ff9145923214cefb0703cf91a3b00a1dc131ade1600a"),
+    "rt_nrm": (1830792, "fb8f7f5571332b602406f88a0b570d809dd3c06aebb530f5d048828f57490bc7"),
+    "rt_nrm_large": (7684615, "8ac7705ec5ac303116b40ad2f0880cd741ed1f4280828bf2f18f7635c3377257"),
+}
+
+
+# How a TZA file begins: magic and version.
+_TZA = struct.pack("<HBB", 0x41D7, 2, 0)
+
+
+@dataclass(frozen=True)
+class TrunkConfig:
+    """Sizes of a `Trunk`."""
+
+    inputs: int = 9  # channels: color, then albedo, then normal
+    size: str = "base"  # of ENCODERS
+
+    def __post_init__(self) -> None:
+        if self.inputs < 1:
+            raise ValueError(f"inputs: expected at least one channel, got {self.inputs}")
+        if self.size not in ENCODERS:
+            raise ValueError(f"size: expected one of {', '.join(ENCODERS)}, got {self.size!r}")
+
+
+class Trunk(nn.Module):
+    """OIDN's U-Net: plain 3×3 convolutions, five scales, what enters each scale handed on to the decoder.
+
+    Parameters
+    ----------
+    config : TrunkConfig
+        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large").
+    """
+
+    #: Height and width must be multiples of this.
+    multiple = 16
+
+    def __init__(self, config: TrunkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, skips = config.inputs, []
+        self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
+        for widths in ENCODERS[config.size]:
+            skips.append(width)
+            self.encoder.append(_convolutions(width, widths))
+            width = widths[-1]
+        for skip, widths in zip(reversed(skips[:-1]), DECODERS[config.size], strict=True):
+            self.decoder.append(_convolutions(width + skip, widths))
+            width = widths[-1]
+        self.last = nn.Conv2d(width, 3, 3, padding=1)
+
+    @property
+    def first(self) -> nn.Conv2d:
+        """The first convolution."""
+        return cast(nn.Conv2d, cast(nn.Sequential, self.encoder[0])[0])
+
+    @property
+    def convolutions(self) -> Iterator[nn.Conv2d]:
+        """All convolutions, in the order in which they run."""
+        return (module for module in self.modules() if isinstance(module, nn.Conv2d))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(N, C, H, W)`` in [0, 1], float32, to ``(N, 3, H, W)``.
+
+        Raises
+        ------
+        ValueError
+            If height or width is no multiple of 16.
+        """
+        for name, length in zip(("height", "width"), x.shape[2:], strict=True):
+            if length == 0 or length % self.multiple:
+                raise ValueError(f"x: expected a {name} that is a multiple of {self.multiple}, got {length}")
+        full = x.to(memory_format=torch.channels_last)
+        x = full.to(self.first.weight.dtype)
+        bottleneck, skips = self.encode(x)
+        if x.dtype == torch.bfloat16:
+            # See `round_trunk`.
+            skips[0] = torch.cat([x, (full[:, :3] - x[:, :3]).to(x.dtype)], 1)
+        return self.decode(bottleneck, skips)
+
+    def encode(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Features of the coarsest scale, and what entered each of the finer ones, finest first."""
+        skips = []
+        for stage in self.encoder[:-1]:
+            skips.append(x)
+            x = functional.max_pool2d(stage(x), 2)
+        return self.encoder[-1](x), skips
+
+    def decode(self, x: Tensor, skips: Sequence[Tensor]) -> Tensor:
+        """What `encode` returns to the picture."""
+        for stage, skip in zip(self.decoder, reversed(skips), strict=True):
+            x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
+            x = stage(torch.cat([x, skip], 1))
+        return self.last(x.to(self.last.weight.dtype))
+
+
+def _convolutions(width: int, widths: Sequence[int]) -> nn.Sequential:
+    """3×3 convolutions to these widths, a ReLU after each."""
+    layers: list[nn.Module] = []
+    for following in widths:
+        layers += [nn.Conv2d(width, following, 3, padding=1), nn.ReLU(inplace=True)]
+        width = following
+    return nn.Sequential(*layers)
+
+
+@torch.no_grad()
+def round_trunk(trunk: Trunk) -> Trunk:
+    """Copy of a trunk with weights in bfloat16, for processors that have it (AVX-512 bf16, AMX).
+
+    Notes
+    -----
+    On the transfer curve the last of a bfloat16's eight bits is up to 3 % of a lamp's light. So the rounding errors of
+    the nine taps between two channels cancel; the color that enters the last scale of the decoder brings its low bits
+    along, as three channels with the weights of the color; and the last convolution is left in float32. Each network is
+    then 64 to 66 dB from its float32 picture on the bundled shot, with a mean within 0.2 %; with weights cast
+    as they are 58 to 59 dB, and up to 1.3 % too dark (`benchmarks/bench_trunk.py`).
+    """
+    rounded = copy.deepcopy(trunk)
+    finest = cast(nn.Conv2d, cast(nn.Sequential, rounded.decoder[-1])[0])
+    color = finest.weight[:, -rounded.config.inputs :][:, :3]
+    finest.weight = nn.Parameter(torch.cat([finest.weight, color], 1))
+    finest.in_channels += 3
+    *layers, _ = rounded.convolutions
+    for layer in layers:
+        weight = _round_taps(layer.weight)
+        layer.bfloat16().weight.data = weight.contiguous(memory_format=torch.channels_last)
+    return rounded.eval().requires_grad_(False)
+
+
+def _round_taps(weight: Tensor) -> Tensor:
+    """Weights ``(O, I, H, W)`` in bfloat16, each tap taking over the error of greater ones: sums over taps are kept."""
+    taps = weight.flatten(2)
+    order = taps.abs().argsort(2, descending=True)
+    rounded, error = torch.empty_like(taps, dtype=torch.bfloat16), torch.zeros_like(taps[..., 0])
+    for tap in order.unbind(2):
+        wanted = taps.gather(2, tap[..., None])[..., 0] + error
+        rounded.scatter_(2, tap[..., None], wanted.bfloat16()[..., None])
+        error = wanted - wanted.bfloat16()
+    return rounded.view_as(weight)
+
+
+def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
+    """Read the tensors of a TZA file, OIDN's archive of weights.
+
+    Parameters
+    ----------
+    data : bytes
+        The file, of version 2.
+    where : str
+        What errors call it.
+
+    Returns
+    -------
+    dict of str to Tensor
+        Float32, in the file's order, which is the order of the layers.
+
+    Raises
+    ------
+    ValueError
+        If it is not such a file, is cut short, or holds anything but finite numbers.
+
+    Notes
+    -----
+    All little-endian. Magic 0x41D7 (uint16), version (2 × uint8), offset of the table (uint64); in the table the number
+    of tensors (uint32), and for each the length of its name (uint16), the name, the number of dimensions (uint8), sizes
+    (uint32), layout (a letter each), type (``f`` or ``h``), offset of the values (uint64).
+    """
+    position = 0
+
+    def take(form: str) -> tuple[int, ...]:
+        nonlocal position
+        size = struct.calcsize("<" + form)
+        if position + size > len(data):
+            raise ValueError(f"{where}: expected {size} bytes at {position}, got {max(len(data) - position, 0)}")
+        values = struct.unpack_from("<" + form, data, position)
+        position += size
+        return values
+
+    def take_text(length: int) -> str:
+        try:
+            return bytes(take(f"{length}B")).decode("ascii")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{where}: expected ASCII at {position - length}") from error
+
+    magic, major, _, position = take("HBBQ")
+    if (magic, major) != (0x41D7, 2):
+        raise ValueError(f"{where}: expected magic 0x41d7 and version 2, got {magic:#x} and {major}")
+    tensors: dict[str, Tensor] = {}
+    for _ in range(*take("I")):
+        name = take_text(*take("H"))
+        shape = take(f"{take('B')[0]}I")
+        layout, kind = take_text(len(shape)), take_text(1)
+        (offset,) = take("Q")
+        if name in tensors or layout not in ("x", "oihw") or kind not in ("f", "h"):
+            raise ValueError(f"{where}: expected a new tensor, x or oihw, f or h, got {name!r}, {layout!r}, {kind!r}")
+        count, dtype = prod(shape), torch.float32 if kind == "f" else torch.float16
+        if count == 0 or offset + count * dtype.itemsize > len(data):
+            raise ValueError(f"{where}: {name} of shape {shape}: expected some values, all within the file")
+        values = torch.frombuffer(bytearray(data[offset : offset + count * dtype.itemsize]), dtype=dtype).float()
+        if not bool(values.isfinite().all()):
+            raise ValueError(f"{where}: {name}: expected finite numbers, got others among them")
+        tensors[name] = values.view(shape)
+    return tensors
+
+
+def make_trunk(tensors: dict[str, Tensor], where: str = "TZA") -> Trunk:
+    """Trunk of the size that the tensors of a TZA file have, with their values.
+
+    Raises
+    ------
+    ValueError
+        If they are those of no such network.
+    """
+    found = [tuple(value.shape) for value in tensors.values()]
+    inputs = found[0][1] if found and len(found[0]) == 4 else 1
+    # Built without memory, so that a file cannot ask for more of it than it brings.
+    with torch.device("meta"):
+        trunks = [Trunk(TrunkConfig(inputs, size)) for size in ENCODERS]
+    for trunk in trunks:
+        wanted = trunk.state_dict()
+        if found == [tuple(value.shape) for value in wanted.values()]:
+            trunk.load_state_dict(dict(zip(wanted, tensors.values(), strict=True)), assign=True)
+            return trunk
+    raise ValueError(f"{where}: expected the layers of a small, base or large U-Net, got {len(found)} other tensors")
+
+
+def load_oidn(name: str) -> Trunk:
+    """Trunk with OIDN's weights, read from the library of the installed package ``pyoidn``.
+
+    Parameters
+    ----------
+    name : str
+        Of `OIDN_WEIGHTS`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such name, or the library does not hold these weights.
+    FileNotFoundError
+        If there is no such library.
+    """
+    if name not in OIDN_WEIGHTS:
+        raise ValueError(f"OIDN's weights: expected one of {', '.join(OIDN_WEIGHTS)}, got {name!r}")
+    path = find_library()
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as library:
+        return make_trunk(read_tza(_find_blob(library, name, path), name), name)
+
+
+def find_library() -> Path:
+    """Path of the library that holds OIDN's weights.
+
+    Raises
+    ------
+    FileNotFoundError
+        If ``pyoidn`` is not installed, or without it.
+    """
+    spec = importlib.util.find_spec("pyoidn")
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    found = sorted(chain.from_iterable(Path(folder).rglob("*OpenImageDenoise_core.*") for folder in folders))
+    if not found:
+        raise FileNotFoundError("OIDN's weights: expected libOpenImageDenoise_core of the package pyoidn, found none")
+    return found[0]
+
+
+def _find_blob(library: mmap.mmap, name: str, path: Path) -> bytes:
+    """The bytes of these weights, wherever in the library they lie."""
+    size, digest = OIDN_WEIGHTS[name]
+    start = library.find(_TZA)
+    while start >= 0:
+        blob = library[start : start + size]
+        if len(blob) == size and hashlib.sha256(blob).hexdigest() == digest:
+            return blob
+        start = library.find(_TZA, start + 1)
+    raise ValueError(f"OIDN's weights: expected {name} of OIDN 2.5.1 in {path.name}, found none of that SHA-256")
+
+
+@torch.inference_mode()
+def denoise_picture(trunk: Trunk, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
+    """Denoise pictures as OIDN does.
+
+    Parameters
+    ----------
+    trunk : Trunk
+        With weights for these inputs, in any precision; the last convolution may stay float32.
+    color : Tensor
+        ``(N, 3, H, W)`` linear radiance, float32; NaN and negative values count as 0.
+    albedo, normal : Tensor, optional
+        Likewise; albedo in [0, 1], normals in [−1, 1] in any fixed space, what lies beyond is clipped.
+
+    Returns
+    -------
+    Tensor
+        ``(N, 3, H, W)`` linear radiance, float32, at least 0.
+
+    Raises
+    ------
+    ValueError
+        If the inputs are not as many as the trunk's, or differ in shape.
+    """
+    exposure = autoexposure(color).view(-1, 1, 1, 1)
+    layers = [pu_forward(_clip(color * exposure, 0, _MOST))]
+    if albedo is not None:
+        layers.append(_clip(albedo, 0, 1))
+    if normal is not None:
+        layers.append(_clip(normal, -1, 1) * 0.5 + 0.5)
+    return pu_inverse(_run(trunk, layers).clamp_min(0)) / exposure
+
+
+@torch.inference_mode()
+def denoise_albedo(trunk: Trunk, albedo: Tensor) -> Tensor:
+    """Denoise albedo, ``(N, 3, H, W)`` in [0, 1], by itself, as OIDN does; see `denoise_picture`."""
+    return srgb_inverse(_run(trunk, [srgb_forward(_clip(albedo, 0, 1))]).clamp(0, 1))
+
+
+@torch.inference_mode()
+def denoise_normal(trunk: Trunk, normal: Tensor) -> Tensor:
+    """Denoise normals, ``(N, 3, H, W)`` in [−1, 1], by themselves, as OIDN does; see `denoise_picture`."""
+    return _run(trunk, [_clip(normal, -1, 1) * 0.5 + 0.5]).clamp(0, 1) * 2 - 1
+
+
+def _run(trunk: Trunk, layers: list[Tensor]) -> Tensor:
+    """The trunk on these layers together, of any size; float32."""
+    x = torch.cat(layers, 1)
+    if x.shape[1] != trunk.config.inputs:
+        raise ValueError(f"inputs: expected {trunk.config.inputs} channels as the weights are for, got {x.shape[1]}")
+    height, width = x.shape[2:]
+    padded = functional.pad(x, (0, -width % trunk.multiple, 0, -height % trunk.multiple))
+    return trunk(padded)[..., :height, :width].float()
+
+
+def _clip(x: Tensor, low: float, high: float) -> Tensor:
+    """x in [low, high], 0 for NaN."""
+    return x.nan_to_num(0, high, low).clamp(low, high)
+
+
+def autoexposure(color: Tensor) -> Tensor:
+    """Factor by which OIDN brings a picture to middle gray.
+
+    Parameters
+    ----------
+    color : Tensor
+        ``(N, 3, H, W)`` linear; NaN and negative values count as 0.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``, positive; ``autoexposure(a·x) = autoexposure(x) / a``. 1 where nothing is above 1e-8.
+
+    Notes
+    -----
+    ``0.18 / 2^mean(log2 L)``, L the mean luminances above 1e-8 of bins of at most 16×16 pixels.
+    """
+    # float64: a sum over a bin may exceed float32 where no pixel does.
+    color = _clip(color, 0, _MOST).double()
+    luminance = torch.einsum("nchw,c->nhw", color, color.new_tensor([0.212671, 0.715160, 0.072169]))
+    for axis in (1, 2):
+        length = luminance.shape[axis]
+        bins = -(-length // 16)
+        edges = torch.arange(bins + 1, device=color.device) * length // bins
+        luminance = torch.segment_reduce(
+            luminance.movedim(axis, 0).contiguous(), "mean", lengths=edges.diff(), axis=0
+        ).movedim(0, axis)
+    lit = luminance > 1e-8
+    logs = torch.where(lit, luminance, 1).log2().sum((1, 2)) / lit.sum((1, 2)).clamp_min(1)
+    return torch.where(lit.any(2).any(1), 0.18 / logs.exp2(), 1).float()
+
+
+# The greatest float32.
+_MOST = torch.finfo(torch.float32).max
+# A fit of the PU2 curve of Aydin, Mantiuk and Seidel 2008, doi:10.1117/12.765095, normalised at 100 cd/m², from OIDN's
+# training/color.py: a line up to Y0, a power up to Y1, a logarithm above.
+_A, _B, _C, _D, _E, _F, _G = (
+    1.41283765e03, 1.64593172e00, 4.31384981e-01, -2.94139609e-03, 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
+)  # fmt: skip
+_Y0, _Y1, _X0, _X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
+# What the greatest half, 65504, is mapped to before it is called 1.
+_WHITE = _E * log(65504 + _F) + _G
+
+
+def pu_forward(y: Tensor) -> Tensor:
+    """Map radiance in [0, ∞), 0.18 being middle gray, to a perceptually uniform scale; 65504 to 1."""
+    x = torch.where(y <= _Y1, _B * y.clamp_min(_Y0) ** _C + _D, _E * (y + _F).log() + _G)
+    return torch.where(y <= _Y0, _A * y, x) / _WHITE
+
+
+def pu_inverse(x: Tensor) -> Tensor:
+    """Inverse of `pu_forward`."""
+    x = x * _WHITE
+    y = torch.where(x <= _X1, ((x.clamp_min(_X0) - _D) / _B) ** (1 / _C), ((x - _G) / _E).exp() - _F)
+    return torch.where(x <= _X0, x / _A, y)
+
+
+def srgb_forward(y: Tensor) -> Tensor:
+    """sRGB curve (IEC 61966-2-1) of values in [0, 1]."""
+    return torch.where(y <= 0.0031308, 12.92 * y, 1.055 * y.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def srgb_inverse(x: Tensor) -> Tensor:
+    """Inverse of `srgb_forward`."""
+    return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
