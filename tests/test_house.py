@@ -59,6 +59,12 @@ def test_no_module_imports_in_a_circle():
     tuple(TopologicalSorter(graph).static_order())  # raises where there is a circle
 
 
+def test_the_extension_for_blender_imports_blender_and_nothing_else():
+    """It runs in Blender's Python, where nothing of ours is installed."""
+    for path in (ROOT / "blender").rglob("*.py"):
+        assert imports(path) - {"bpy"} <= sys.stdlib_module_names, path.name
+
+
 def test_the_core_imports_no_peer_at_start():
     """Importing the command must not load what only some of its commands need."""
     code = "import sys, hybrid, hybrid.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"

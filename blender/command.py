@@ -1,0 +1,132 @@
+"""The command `ravg`, found and run in a process of its own. Knows nothing of Blender."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+# How long `ravg` may take to clean up after it was asked to stop, seconds; it needs about one.
+PATIENCE = 10.0
+# The log is shown as plain text: no colors, no wrapped lines, UTF-8 on every system.
+_PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "160", "PYTHONIOENCODING": "utf-8", "PYTHONUNBUFFERED": "1"}
+
+
+def find_command(named: str) -> str:
+    """Return the path of the command that a user has named: a path, or a name that PATH knows.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none; one line that says where to name it.
+    """
+    found = shutil.which(os.path.expanduser(named.strip() or "ravg"))
+    if found is None:
+        raise FileNotFoundError(f"no command {named!r}: name the path of ravg in Preferences > Add-ons > ravg")
+    return found
+
+
+class Run:
+    """`ravg` at work.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command and what it is given.
+    outputs : iterable of Path
+        The files that it is to write. It renames each into its place when it is whole, so that their number tells
+        how far the work has come.
+    log : Path
+        Where to put what it prints.
+
+    Raises
+    ------
+    OSError
+        If the command cannot be started.
+    """
+
+    def __init__(self, arguments: Sequence[str], outputs: Iterable[Path], log: Path) -> None:
+        self._before = {path: _version(path) for path in outputs}
+        self._log = log
+        self._stopped_at: float | None = None
+        own: dict[str, Any] = {"start_new_session": True}  # Ctrl-C in Blender's terminal is Blender's
+        if sys.platform == "win32":
+            own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+        with log.open("wb") as sink:
+            self._process = subprocess.Popen(
+                list(arguments),
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **_PLAIN},
+                **own,
+            )
+
+    @property
+    def total(self) -> int:
+        """How many frames there are to make."""
+        return len(self._before)
+
+    @property
+    def finished(self) -> int:
+        """How many of them this run has made."""
+        return sum(_version(path) not in (None, before) for path, before in self._before.items())
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was asked to stop."""
+        return self._stopped_at is not None
+
+    @property
+    def code(self) -> int | None:
+        """The exit code; None while it runs. One that was asked to stop and does not is killed in time."""
+        code = self._process.poll()
+        if code is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > PATIENCE:
+            self._process.kill()
+        return code
+
+    def stop(self) -> None:
+        """Ask it to stop; finished frames stay."""
+        if self._stopped_at is None and self._process.poll() is None:
+            self._stopped_at = time.monotonic()
+            self._process.send_signal(signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT)
+
+    def wait(self) -> int:
+        """Wait for its end and return the exit code."""
+        while (code := self.code) is None:
+            time.sleep(0.05)
+        return code
+
+    @property
+    def log(self) -> str:
+        """All that it has printed so far."""
+        return self._log.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def warnings(self) -> list[str]:
+        """What it has warned of."""
+        marked = (line.partition("warning: ") for line in self.log.splitlines())
+        return [text for before, mark, text in marked if mark and not before.strip()]
+
+    @property
+    def error(self) -> str:
+        """Why it has failed, in one line: its own, else the last that it has printed."""
+        lines = [line.strip(" │╭╮╰╯─") for line in self.log.splitlines()]  # usage errors stand in a frame
+        lines = [line for line in lines if line]
+        errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+        return (errors or lines or [f"ravg ended with code {self.code}"])[-1]
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """What tells one file from the next in its place; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns

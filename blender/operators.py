@@ -1,0 +1,188 @@
+"""What the panel's buttons do."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import bpy
+
+from . import jobs, scenes
+
+LOG = "ravg.log"  # the text block that holds what ravg has printed
+
+
+class SetUp(bpy.types.Operator):
+    """Switch on what ravg reads: OpenEXR MultiLayer with Denoising Data and Vector, and a seed that changes"""
+
+    bl_idname = "ravg.set_up"
+    bl_label = "Set Up Passes"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender reads it
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        changed = scenes.set_up(context.scene)
+        self.report({"INFO"}, f"Set up: {', '.join(changed)}" if changed else "All is set up already")
+        if changed and context.scene.render.use_persistent_data:
+            self.report({"WARNING"}, "Persistent Data is on: Blender 5.0 renders wrong until the file is opened again")
+        return {"FINISHED"}
+
+
+class Denoise(bpy.types.Operator):
+    """Denoise the rendered frames with the installed ravg, beside Blender, and load the result"""
+
+    bl_idname = "ravg.denoise"
+    bl_label = "Denoise Frames"
+
+    render: bpy.props.BoolProperty(
+        name="Render", description="Set up the passes and render the animation first", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("ravg is at work")
+        return jobs.current is None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Wait for the end: in scripts, and where Blender has no window."""
+        try:
+            job = jobs.begin(context.scene)
+            if self.render:
+                scenes.set_up(context.scene)
+                bpy.ops.render.render(animation=True)
+            job.start()
+            while not job.ended:
+                time.sleep(jobs.INTERVAL)
+        except OSError as error:
+            jobs.stop_current()
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        except BaseException:
+            jobs.stop_current()
+            raise
+        return conclude(self, context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Return at once, and let a timer follow."""
+        if bpy.app.background:
+            return self.execute(context)
+        try:
+            job = jobs.begin(context.scene)
+            if self.render:
+                scenes.set_up(context.scene)
+                jobs.start_when_rendered(job)
+                bpy.ops.render.render("INVOKE_DEFAULT", animation=True)
+            else:
+                job.start()
+        except OSError as error:
+            jobs.stop_current()
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
+        return {"FINISHED"}
+
+
+class Cancel(bpy.types.Operator):
+    """Stop ravg; finished frames stay, and Resume goes on from there"""
+
+    bl_idname = "ravg.cancel"
+    bl_label = "Stop"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return jobs.current is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        jobs.current.cancel()
+        return {"FINISHED"}
+
+
+class Conclude(bpy.types.Operator):
+    """Report how ravg has ended, and load what it has made"""
+
+    bl_idname = "ravg.conclude"
+    bl_label = "Conclude"
+    bl_options = {"INTERNAL"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return conclude(self, context)
+
+
+class Show(bpy.types.Operator):
+    """Show the denoised frames in an image editor"""
+
+    bl_idname = "ravg.show"
+    bl_label = "Show"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return _load(self, lambda image, count: show(context, image, count))
+
+
+class AddToCompositor(bpy.types.Operator):
+    """Add an image node with the denoised frames to the compositor's nodes"""
+
+    bl_idname = "ravg.add_to_compositor"
+    bl_label = "Add to Compositor"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        def add(image: bpy.types.Image, count: int) -> None:
+            node = _compositor(context.scene).nodes.new("CompositorNodeImage")
+            node.image, node.label = image, "Denoised"
+            scenes.show_from(node, context.scene, count)
+
+        return _load(self, add)
+
+
+def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
+    """Say in Blender's own places how the job has ended, and show its frames if it has made them all."""
+    job, jobs.current = jobs.current, None
+    if job.run is None:
+        if job.error:
+            operator.report({"ERROR"}, job.error)
+        return {"CANCELLED"}
+    text = bpy.data.texts.get(LOG) or bpy.data.texts.new(LOG)
+    text.from_string(job.run.log)
+    for warning in job.run.warnings:
+        operator.report({"WARNING"}, warning)
+    if job.run.stopped:
+        operator.report({"WARNING"}, f"Stopped: {job.run.finished} of {job.run.total} frames are finished")
+        return {"CANCELLED"}
+    if job.run.code != 0:
+        operator.report({"ERROR"}, f"{job.run.error} (all of it in the text {LOG})")
+        return {"CANCELLED"}
+    scene = bpy.data.scenes[job.scene]
+    operator.report({"INFO"}, f"Denoised {job.run.total} frames into {scenes.output_folder(scene)}")
+    return _load(operator, lambda image, count: show(context, image, count))
+
+
+def show(context: bpy.types.Context, image: bpy.types.Image, count: int) -> None:
+    """Show a sequence in the image editor that is open, or else in a new window."""
+    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
+    editor = next((area for area in areas if area.type == "IMAGE_EDITOR"), None)
+    if editor is None:
+        if bpy.app.background:
+            return
+        bpy.ops.wm.window_new()
+        editor = context.window_manager.windows[-1].screen.areas[0]
+        editor.type = "IMAGE_EDITOR"
+    editor.spaces.active.image = image
+    scenes.show_from(editor.spaces.active.image_user, context.scene, count)
+
+
+def _load(operator: bpy.types.Operator, use: Any) -> set[str]:
+    try:
+        use(*scenes.load_denoised(bpy.context.scene))
+    except (OSError, RuntimeError) as error:  # RuntimeError is what Blender raises for a file that it cannot read
+        operator.report({"ERROR"}, str(error).strip())
+        return {"CANCELLED"}
+    return {"FINISHED"}
+
+
+def _compositor(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """The nodes of the scene's compositor, made where there are none."""
+    if hasattr(scene, "compositing_node_group"):  # Blender 5.0 and later
+        if scene.compositing_node_group is None:
+            scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
+        return scene.compositing_node_group
+    scene.use_nodes = True
+    return scene.node_tree

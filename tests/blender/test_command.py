@@ -1,0 +1,137 @@
+"""The extension's side of the process that it starts; needs no Blender."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[2] / "blender" / "command.py"
+spec = importlib.util.spec_from_file_location("ravg_blender_command", SOURCE)
+assert spec is not None
+assert spec.loader is not None
+command = importlib.util.module_from_spec(spec)  # the package around it imports bpy
+spec.loader.exec_module(command)
+
+
+def run(code: str, tmp_path: Path, outputs: list[Path] | None = None) -> command.Run:
+    """Start Python in the place of ravg."""
+    return command.Run([sys.executable, "-c", code], outputs or [], tmp_path / "log")
+
+
+def test_a_command_is_found_by_path_and_by_name(tmp_path, monkeypatch):
+    tool = tmp_path / "ravg"
+    tool.write_text("#!/bin/sh\n", encoding="ascii")
+    tool.chmod(tool.stat().st_mode | stat.S_IXUSR)
+    assert command.find_command(str(tool)) == str(tool)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert command.find_command("ravg") == str(tool)
+    assert command.find_command(" ") == str(tool), "an empty preference is the default"
+
+
+def test_a_command_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no command 'gone': .*Preferences"):
+        command.find_command("gone")
+    (tmp_path / "text").write_text("no program", encoding="ascii")
+    with pytest.raises(FileNotFoundError):
+        command.find_command(str(tmp_path / "text"))
+
+
+def test_frames_count_when_they_are_whole_and_new(tmp_path):
+    """An old frame of an earlier run counts when it has been replaced; one half written never does."""
+    old, kept, new, half = (tmp_path / f"{name}.exr" for name in ("old", "kept", "new", "half"))
+    old.write_bytes(b"before")
+    kept.write_bytes(b"before")
+    code = """
+import os
+for name in ("old", "new"):
+    with open(f".{name}.tmp", "wb") as file:
+        file.write(b"after")
+    os.replace(f".{name}.tmp", f"{name}.exr")
+open(".half.tmp", "wb").write(b"ha")
+"""
+    made = run(f"import os; os.chdir({str(tmp_path)!r})\n{code}", tmp_path, [old, kept, new, half])
+    assert made.wait() == 0
+    assert (made.finished, made.total) == (2, 4)
+
+
+def test_what_goes_wrong_is_told_in_one_line(tmp_path):
+    failed = run(
+        "import sys; print('stages: warp'); print('error: out of luck', file=sys.stderr); sys.exit(1)", tmp_path
+    )
+    assert failed.wait() == 1
+    assert failed.error == "out of luck"
+    assert failed.log.splitlines() == ["stages: warp", "error: out of luck"]
+
+
+def test_the_last_line_stands_for_an_error_that_is_not_marked(tmp_path):
+    crashed = run("raise RuntimeError('a bug')", tmp_path)
+    assert crashed.wait() != 0
+    assert crashed.error == "RuntimeError: a bug"
+    silent = run("import os; os._exit(3)", tmp_path)
+    silent.wait()
+    assert silent.error == "ravg ended with code 3"
+
+
+def test_usage_errors_are_read_out_of_their_frame(tmp_path):
+    pytest.importorskip("typer")
+    usage = command.Run([sys.executable, "-m", "hybrid.cli", "denoise", "--no-such-option"], [], tmp_path / "log")
+    assert usage.wait() == 2
+    assert usage.error.startswith("No such option")
+
+
+def test_warnings_are_collected(tmp_path):
+    warned = run(
+        "print('warning: one seed'); print('no warning: this'); print('  warning: frame 3 is missing')", tmp_path
+    )
+    assert warned.wait() == 0
+    assert warned.warnings == ["one seed", "frame 3 is missing"]
+
+
+def test_letters_of_all_kinds_reach_the_log(tmp_path, monkeypatch):
+    monkeypatch.setenv("LC_ALL", "C")
+    spoken = run("print('1920×1080 – ≈')", tmp_path)
+    assert spoken.wait() == 0
+    assert spoken.log.strip() == "1920×1080 – ≈"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+def test_stopping_is_heard_as_ctrl_c(tmp_path):
+    ready = tmp_path / "ready"
+    code = f"""
+import pathlib, sys, time
+try:
+    pathlib.Path({str(ready)!r}).touch()
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("stopped: 0 of 1 frames are finished")
+    sys.exit(130)
+"""
+    made = run(code, tmp_path)
+    while not ready.exists():
+        assert made.code is None
+    made.stop()
+    assert made.stopped
+    assert made.wait() == 130
+    assert "stopped" in made.log
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+def test_what_does_not_stop_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "PATIENCE", 0.0)
+    ready = tmp_path / "ready"
+    code = "import pathlib, signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    made = run(code + f"pathlib.Path({str(ready)!r}).touch(); time.sleep(60)", tmp_path)
+    while not ready.exists():
+        assert made.code is None
+    made.stop()
+    assert made.wait() not in (None, 0)
+
+
+def test_a_command_that_cannot_start_is_an_error_of_the_system(tmp_path):
+    with pytest.raises(OSError, match=r"[Nn]o such file"):
+        command.Run([os.fspath(tmp_path / "gone")], [], tmp_path / "log")

@@ -1,0 +1,497 @@
+"""The extension in Blender itself, without a window: built, validated, installed, used on a small shot.
+
+Skipped where bpy is not installed; what runs `ravg`, which lives in another environment than bpy, needs its path in
+the environment variable RAVG_COMMAND.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+pytestmark = pytest.mark.cycles
+pytest.importorskip("bpy", reason="runs Blender: pip install ravg[simulate]")
+
+ROOT = Path(__file__).parents[2]
+EXTENSION = ROOT / "blender"
+NAME = "bl_ext.user_default.ravg"
+RAVG = os.environ.get("RAVG_COMMAND", "")
+needs_ravg = pytest.mark.skipif(not RAVG, reason="runs ravg: RAVG_COMMAND is to name it")
+
+# A camera that passes a wall and a ball under one lamp, rendered as new files are: PNG, one seed, no passes.
+SCENE = """
+bpy.ops.wm.read_factory_settings()
+scene = bpy.context.scene
+for item in list(bpy.data.objects):
+    bpy.data.objects.remove(item)
+def surface(scale):
+    made = bpy.data.materials.new("m"); made.use_nodes = True
+    tree = made.node_tree
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    noise.inputs["Scale"].default_value = scale
+    tree.links.new(noise.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
+    return made
+bpy.ops.mesh.primitive_plane_add(size=12, location=(0, 2, 0), rotation=(1.5708, 0, 0))
+bpy.context.active_object.data.materials.append(surface(3))
+bpy.ops.mesh.primitive_uv_sphere_add(radius=0.8)
+bpy.context.active_object.data.materials.append(surface(6))
+bpy.ops.object.light_add(type="AREA", location=(2, -3, 3), rotation=(0.9, 0, 0.5))
+bpy.context.active_object.data.energy = 400
+bpy.ops.object.camera_add(location=(0, -6, 0), rotation=(1.5708, 0, 0))
+scene.camera = bpy.context.active_object
+for frame in (1, 10):
+    scene.camera.location.x = 0.05 * frame
+    scene.camera.keyframe_insert("location", frame=frame)
+scene.render.engine = "CYCLES"
+scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 4, False, False
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 96, 54, 100
+scene.frame_start, scene.frame_end = 4, 6
+scene.render.filepath = "//frames/shot_"
+bpy.ops.wm.save_as_mainfile(filepath=FILE)
+"""
+
+
+@dataclass(frozen=True)
+class Blender:
+    """Blender with settings of its own, started anew for every script."""
+
+    resources: Path
+    archive: Path
+    installed: bool = True
+
+    def run(self, code: str, *, blend: Path | None = None, command: str = RAVG, **names: object) -> Any:
+        """Run a script, with the extension switched on where it is installed; return what it leaves in `answer`."""
+        script = "import bpy, json, sys, time\nimport addon_utils\nfrom pathlib import Path\nanswer = None\n"
+        if blend is not None:
+            script += f"bpy.ops.wm.open_mainfile(filepath={str(blend)!r})\n"
+        if self.installed:
+            script += f"addon_utils.enable({NAME!r}, default_set=True)\n"
+            script += f"bpy.context.preferences.addons[{NAME!r}].preferences.command = {command!r}\n"
+        script += "scene = bpy.context.scene\n" + "".join(f"{name} = {value!r}\n" for name, value in names.items())
+        script += textwrap.dedent(code) + "\nprint('ANSWER', json.dumps(answer, default=str))\n"
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "BLENDER_USER_RESOURCES": str(self.resources)},
+        )
+        found = re.search(r"^ANSWER (.*)$", done.stdout, re.MULTILINE)
+        assert found, done.stdout + done.stderr
+        return json.loads(found[1])
+
+
+def blender_extension(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """`blender --command extension …`, which Blender's module has as a function only."""
+    code = (
+        "import bpy, sys; from bl_pkg.bl_extension_cli import cli_extension_handler as run; sys.exit(run(sys.argv[1:]))"
+    )
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def blender(tmp_path_factory: pytest.TempPathFactory) -> Blender:
+    """Build the archive, install it as a user would, and enable it."""
+    folder = tmp_path_factory.mktemp("blender")
+    built = blender_extension("build", "--source-dir", str(EXTENSION), "--output-dir", str(folder))
+    assert built.returncode == 0, built.stdout + built.stderr
+    (archive,) = folder.glob("*.zip")
+    made = Blender(folder / "resources", archive)
+    install = """
+    bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
+    answer = NAME in bpy.context.preferences.addons
+    """
+    assert replace(made, installed=False).run(install, ARCHIVE=str(archive), NAME=NAME)
+    return made
+
+
+@pytest.fixture(scope="module")
+def untouched(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of somebody who has never heard of passes."""
+    path = tmp_path_factory.mktemp("scene") / "shot.blend"
+    replace(blender, installed=False).run(SCENE, FILE=str(path))
+    return path
+
+
+@pytest.fixture
+def blend(untouched: Path, tmp_path: Path) -> Path:
+    """A copy of the scene, in a folder of its own."""
+    return Path(shutil.copy(untouched, tmp_path))
+
+
+@pytest.fixture(scope="module")
+def rendered(blender: Blender, untouched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene set up and its frames rendered; the file's path."""
+    path = Path(shutil.copy(untouched, tmp_path_factory.mktemp("rendered")))
+    code = "bpy.ops.ravg.set_up(); bpy.ops.render.render(animation=True); bpy.ops.wm.save_mainfile()"
+    blender.run(code, blend=path)
+    return path
+
+
+@pytest.fixture
+def shot(rendered: Path, tmp_path: Path) -> Path:
+    """A copy of the scene with its frames."""
+    return Path(shutil.copytree(rendered.parent, tmp_path / "shot")) / rendered.name
+
+
+def channels(path: Path) -> dict[str, np.ndarray]:
+    """The channels of all parts of a file, less the name of the view layer."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        found = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
+    return {name.removeprefix("ViewLayer."): pixels for name, pixels in found.items()}
+
+
+def picture(path: Path) -> np.ndarray:
+    """What a file shows, (H, W, 3)."""
+    found = channels(path)
+    return np.stack([found[f"Combined.{c}"] for c in "RGB"], axis=-1).astype(np.float64)
+
+
+# --- the archive ---------------------------------------------------------------------------------------
+
+
+def test_blender_validates_the_archive(blender):
+    done = blender_extension("validate", str(blender.archive))
+    assert done.returncode == 0, done.stdout + done.stderr
+    with zipfile.ZipFile(blender.archive) as archive:
+        assert not [name for name in archive.namelist() if "__pycache__" in name]
+
+
+def test_blender_would_refuse_a_wrong_one(tmp_path):
+    """The validation of the test above is strict: one tag that Blender does not know fails it."""
+    copy = Path(shutil.copytree(EXTENSION, tmp_path / "ravg"))
+    manifest = copy / "blender_manifest.toml"
+    manifest.write_text(manifest.read_text(encoding="utf-8").replace('"Render"', '"Denoising"'), encoding="utf-8")
+    assert blender_extension("validate", str(copy)).returncode != 0
+
+
+def test_it_comes_and_goes_without_a_trace(blender):
+    code = """
+    def traces():
+        handlers = bpy.app.handlers
+        return [hasattr(bpy.types.Scene, "ravg"), hasattr(bpy.types, "RAVG_PT_output"),
+                "denoise" in dir(bpy.ops.ravg), len(handlers.load_pre) + len(handlers.render_complete)]
+    there = traces()
+    addon_utils.disable(NAME)
+    gone = traces()
+    addon_utils.enable(NAME)
+    answer = [there, gone, traces()]
+    """
+    there, gone, again = blender.run(code, NAME=NAME)
+    assert there[:3] == [True, True, True]
+    assert gone == [False, False, False, there[3] - 1]
+    assert again == there
+
+
+def test_blender_loads_no_torch(blender):
+    assert not blender.run("answer = [name for name in sys.modules if name in ('torch', 'hybrid', 'network')]")
+
+
+# --- what a scene lacks --------------------------------------------------------------------------------
+
+PROBLEMS = """
+from bl_ext.user_default.ravg import scenes
+def texts():
+    return [problem.text.partition(":")[0].partition(" is ")[0] for problem in scenes.problems(scene)]
+"""
+
+
+def test_a_new_scene_is_told_what_it_lacks_and_set_up(blender, blend):
+    code = PROBLEMS + "answer = [texts(), list(bpy.ops.ravg.set_up()), texts(), scenes.set_up(scene)]"
+    before, done, after, again = blender.run(code, blend=blend)
+    assert before == ["File format", "Denoising Data", "Vector pass", "Seed"]
+    assert done == ["FINISHED"]
+    assert after == again == []
+
+
+@pytest.mark.parametrize(
+    ("change", "warned"),
+    [
+        ("scene.render.use_motion_blur = True", ["Motion Blur leaves the Vector pass empty"]),
+        ("scene.render.use_motion_blur = True; scenes.set_up(scene)", ["Motion Blur"]),
+        ("scene.cycles.use_animated_seed = False", ["Seed"]),
+        ("scene.cycles.use_animated_seed = False; scene.cycles.driver_add('seed')", []),
+        ("scene.cycles.use_animated_seed = False; scene.cycles.keyframe_insert('seed', frame=1)", []),
+        ("scene.view_layers.new('second')", ["Denoising Data", "Vector pass"]),
+        ("scene.view_layers.new('second').use = False", []),
+        ("scene.render.engine = ENGINE", ["Engine"]),
+    ],
+)
+def test_what_spoils_the_result_is_warned_of(blender, rendered, change, warned):
+    eevee = "ENGINE = next(e for e in ('BLENDER_EEVEE', 'BLENDER_EEVEE_NEXT') if e in ENGINES)"
+    engines = "ENGINES = [i.identifier for i in bpy.types.RenderSettings.bl_rna.properties['engine'].enum_items]"
+    code = f"{PROBLEMS}{engines}\n{eevee}\n{change}\nanswer = texts()"
+    assert blender.run(code, blend=rendered) == warned
+
+
+def test_motion_blur_leaves_the_vectors_empty_as_the_panel_says(blender, shot):
+    code = """
+    scene.render.use_motion_blur, scene.frame_end, scene.render.filepath = True, 4, "//blurred/"
+    bpy.ops.render.render(animation=True)
+    """
+    blender.run(code, blend=shot)
+    moving, empty = (channels(shot.parent / name)["Vector.X"] for name in ("frames/shot_0004.exr", "blurred/0004.exr"))
+    assert moving.min() > 0.5
+    assert not empty.any()
+
+
+def test_the_rendered_frames_hold_what_ravg_reads(rendered):
+    frames = sorted((rendered.parent / "frames").iterdir())
+    assert [path.name for path in frames] == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
+    assert {"Combined.R", "Denoising Albedo.R", "Denoising Normal.X", "Vector.W"} <= channels(frames[0]).keys()
+
+
+@pytest.mark.parametrize(
+    ("filepath", "pattern", "fifth"),
+    [
+        ("//frames/shot_", "frames/shot_####.exr", "frames/shot_0005.exr"),
+        ("//frames/shot.####.exr", "frames/shot.####.exr", "frames/shot.0005.exr"),
+        ("//sh#t/v1_", "sh#t/v1_####.exr", "sh#t/v1_0005.exr"),
+        ("//12/00##_a", "12/00##_a.exr", "12/0005_a.exr"),
+        ("//", "####.exr", "0005.exr"),
+    ],
+)
+def test_frames_are_looked_for_where_blender_writes_them(blender, rendered, filepath, pattern, fifth):
+    code = (
+        PROBLEMS + "scene.render.filepath = PATH; answer = [scenes.frame_pattern(scene), scenes.frame_files(scene)[5]]"
+    )
+    found = blender.run(code, blend=rendered, PATH=filepath)
+    assert found == [str(rendered.parent / pattern), str(rendered.parent / fifth)]
+
+
+# --- from one button to the picture --------------------------------------------------------------------
+
+
+@needs_ravg
+def test_the_script_of_the_documentation_renders_denoises_and_loads(blender, blend):
+    script = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "blender.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert script
+    code = f"""
+    editor = bpy.context.window_manager.windows[0].screen.areas[0]
+    editor.type = "IMAGE_EDITOR"
+    exec({script[1]!r})
+    image, user = editor.spaces.active.image, editor.spaces.active.image_user
+    answer = [bpy.path.abspath(image.filepath), image.source,
+              [user.frame_start, user.frame_duration, user.frame_offset], bpy.data.texts["ravg.log"].as_string()]
+    """
+    path, source, shown, log = blender.run(code, blend=blend)
+    noisy, made = blend.parent / "frames", blend.parent / "frames" / "denoised"
+    assert Path(path) == made / "shot_0004.exr"
+    assert source == "SEQUENCE"
+    assert shown == [4, 3, 3]  # frame 4 of the scene shows file 4 - 4 + 1 + 3
+    assert "stages:" in log
+    assert sorted(p.name for p in made.glob("*.exr")) == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
+    code = "scene.cycles.samples, scene.render.filepath = 256, '//clean/'; bpy.ops.render.render(animation=True)"
+    blender.run("bpy.ops.ravg.set_up(); " + code, blend=blend)
+    for frame in (4, 5, 6):
+        files = (
+            noisy / f"shot_{frame:04d}.exr",
+            made / f"shot_{frame:04d}.exr",
+            blend.parent / f"clean/{frame:04d}.exr",
+        )
+        before, after, clean = (picture(path) for path in files)
+        assert ((after - clean) ** 2).mean() < 0.5 * ((before - clean) ** 2).mean()
+    with OpenEXR.File(str(made / "shot_0005.exr"), header_only=True) as file:
+        assert file.header()["ravg/preset"] == "fast"
+
+
+@needs_ravg
+def test_the_compositor_shows_each_denoised_frame_at_its_time(blender, shot):
+    """Blender itself reads the frames: what its compositor writes is what ravg has made."""
+    code = """
+    scene.ravg.preset = "average"
+    bpy.ops.ravg.denoise()
+    bpy.ops.ravg.add_to_compositor()
+    tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
+    node = next(node for node in tree.nodes if node.type == "IMAGE")
+    if hasattr(scene, "compositing_node_group"):
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        sink = tree.nodes.new("NodeGroupOutput")
+    else:
+        sink = next(node for node in tree.nodes if node.type == "COMPOSITE")
+        tree.nodes.remove(next(node for node in tree.nodes if node.type == "R_LAYERS"))
+    tree.links.new(node.outputs["Combined"], sink.inputs[0])
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+    scene.render.filepath = "//composed/"
+    bpy.ops.render.render(animation=True)
+    """
+    blender.run(code, blend=shot)
+    for frame in (4, 5, 6):
+        composed = shot.parent / "composed" / f"{frame:04d}.exr"
+        with OpenEXR.File(str(composed)) as file:
+            seen = file.channels()["RGB" if "RGB" in file.channels() else "RGBA"].pixels[..., :3]
+        denoised = picture(shot.parent / "frames" / "denoised" / f"shot_{frame:04d}.exr")
+        np.testing.assert_allclose(seen, denoised, rtol=1e-3, atol=1e-4)
+
+
+FOLLOWED = """
+from bl_ext.user_default.ravg import jobs
+job = jobs.begin(scene)
+{start}
+seen = []
+while (pause := jobs.follow()) is not None:
+    seen.append(job.text)
+    {between}
+    time.sleep(pause)
+answer = [sorted(set(seen)), jobs.current is None, bpy.ops.ravg.denoise.poll(), job.run.code, job.run.finished]
+"""
+
+
+@needs_ravg
+def test_a_timer_follows_it_to_its_end(blender, shot):
+    """As with a window: Blender goes on, the panel shows how far it is."""
+    code = FOLLOWED.format(start="job.start()", between="assert not bpy.ops.ravg.denoise.poll()")
+    seen, over, free, status, finished = blender.run("scene.ravg.preset = 'average'\n" + code, blend=shot)
+    assert "Denoising: 0 of 3 frames" in seen
+    assert (over, free, status, finished) == (True, True, 0, 3)
+
+
+@needs_ravg
+def test_it_starts_when_blender_has_rendered(blender, shot):
+    code = """
+    scene.ravg.preset = "average"
+    from bl_ext.user_default.ravg import jobs
+    count = len(bpy.app.handlers.render_complete)
+    job = jobs.begin(scene)
+    jobs.start_when_rendered(job)
+    waiting = [job.text, job.ended, jobs.follow() is not None]
+    bpy.ops.render.render(animation=True)
+    started = job.run is not None
+    while (pause := jobs.follow()) is not None:
+        time.sleep(pause)
+    answer = [waiting, started, job.run.code, len(bpy.app.handlers.render_complete) - count]
+    """
+    assert blender.run(code, blend=shot) == [["Rendering", False, True], True, 0, 0]
+
+
+@needs_ravg
+def test_stop_leaves_whole_frames_and_no_process(blender, shot):
+    code = FOLLOWED.format(start="job.start()", between="bpy.ops.ravg.cancel()")
+    _, over, free, status, finished = blender.run("scene.ravg.preset = 'average'\n" + code, blend=shot)
+    assert (over, free) == (True, True)
+    assert status not in (None, 0)
+    made = [path for path in (shot.parent / "frames").rglob("*") if path.parent.name == "denoised"]
+    assert len(made) == finished < 3
+
+
+@needs_ravg
+def test_another_file_stops_it_as_it_stops_a_render(blender, shot):
+    code = """
+    from bl_ext.user_default.ravg import jobs
+    job = jobs.begin(scene)
+    job.start()
+    bpy.ops.wm.read_homefile()
+    answer = [job.run.code, jobs.current]
+    """
+    status, current = blender.run(code, blend=shot)
+    assert status not in (None, 0)
+    assert current is None
+
+
+@needs_ravg
+def test_resume_leaves_finished_frames_alone(blender, shot):
+    code = """
+    scene.ravg.preset, scene.ravg.resume = "average", True
+    bpy.ops.ravg.denoise()
+    made = Path(bpy.path.abspath("//frames/denoised"))
+    first = {p.name: p.stat().st_mtime_ns for p in made.glob("*.exr")}
+    (made / "shot_0005.exr").unlink()
+    bpy.ops.ravg.denoise()
+    second = {p.name: p.stat().st_mtime_ns for p in made.glob("*.exr")}
+    answer = [sorted(second), sorted(name for name in second if first[name] == second[name])]
+    """
+    there, kept = blender.run(code, blend=shot)
+    assert there == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
+    assert kept == ["shot_0004.exr", "shot_0006.exr"]
+
+
+# --- what goes wrong -----------------------------------------------------------------------------------
+
+FAILING = """
+try:
+    bpy.ops.ravg.denoise()
+except RuntimeError as error:
+    answer = [str(error).strip(), bpy.ops.ravg.denoise.poll(), "ravg.log" in bpy.data.texts]
+"""
+
+
+def test_a_command_that_is_not_there_is_an_error_in_blender(blender, shot):
+    error, free, _ = blender.run(FAILING, blend=shot, command="no-such-ravg")
+    assert error.endswith("no command 'no-such-ravg': name the path of ravg in Preferences > Add-ons > ravg")
+    assert free
+
+
+def test_frames_that_are_not_there_are_an_error_in_blender(blender, blend):
+    error, free, _ = blender.run(FAILING, blend=blend, command=sys.executable)
+    assert "render the animation first" in error
+    assert free
+
+
+@needs_ravg
+def test_an_error_of_ravg_is_an_error_in_blender(blender, shot):
+    error, free, log = blender.run("scene.ravg.folder = '//frames'\n" + FAILING, blend=shot)
+    assert "would overwrite an input frame" in error
+    assert "ravg.log" in error
+    assert free
+    assert log
+
+
+def test_there_is_nothing_to_show_before_it_has_run(blender, shot):
+    code = FAILING.replace("ravg.denoise()", "ravg.show()")
+    assert "no denoised frames" in blender.run(code, blend=shot)[0]
+
+
+# --- the panel -----------------------------------------------------------------------------------------
+
+# Blender draws panels only in a window. This stands in for its layout, and refuses what Blender would.
+DRAWN = """
+from types import SimpleNamespace
+from bl_ext.user_default.ravg import jobs, panel
+icons = {i.identifier for i in bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items}
+drawn = []
+class Layout:
+    def row(self, **how): return self
+    box = column = row
+    def label(self, text, icon): drawn.append(text); assert icon in icons
+    def prop(self, data, name, **how): drawn.append(data.bl_rna.properties[name].name)
+    def progress(self, text, factor): drawn.append(text); assert 0 <= factor <= 1
+    def operator(self, name, text=None, icon="NONE"):
+        kind = getattr(bpy.types, "RAVG_OT_" + name.partition(".")[2])
+        drawn.append(text or kind.bl_label); assert icon in icons
+        return SimpleNamespace()
+def draw():
+    drawn.clear()
+    panel.OutputPanel.draw(SimpleNamespace(layout=Layout()), bpy.context)
+    return list(drawn)
+"""
+
+
+def test_the_panel_of_a_new_scene_has_warnings_and_the_button_that_mends_them(blender, blend):
+    drawn = blender.run(DRAWN + "answer = draw()", blend=blend)
+    assert drawn[0].startswith("File format is not OpenEXR MultiLayer")
+    assert drawn[4:] == [
+        *("Set Up Passes", "Preset", "Folder", "Resume"),
+        *("Render and Denoise", "Denoise Frames", "Show", "Add to Compositor"),
+    ]
+
+
+def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, rendered):
+    code = DRAWN + "jobs.begin(scene); answer = draw()"
+    drawn = blender.run(code, blend=rendered, command=sys.executable)
+    assert drawn == ["Preset", "Folder", "Resume", "Rendering", "Stop"]
