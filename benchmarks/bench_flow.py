@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flow.confidence import estimate_confidence, mix_centre
 from flow.guide import prefilter_guide
-from flow.motion import compose_flow, forward_backward_error, invert_flow, normalize_motion
+from flow.motion import CYCLES, compose_flow, forward_backward_error, invert_flow, normalize_motion
 from flow.tvl1 import dense_flow, refine_flow, select_flow
 from flow.warp import warp
 
@@ -79,7 +79,7 @@ def main(argv: list[str]) -> int:
     warped, inside = warp(albedo, flow)
     light = {"scales": 2, "warps": 2, "iterations": 15}
     stages: dict[str, Callable[[], object]] = {
-        "normalize_motion": lambda: normalize_motion(pair["vectors"], "cycles"),
+        "normalize_motion": lambda: normalize_motion(pair["vectors"], CYCLES),
         "compose_flow": lambda: compose_flow(flow, flow),
         "invert_flow": lambda: invert_flow(flow),
         "forward_backward_error": lambda: forward_backward_error(flow, -flow),

@@ -16,6 +16,27 @@ def _luminance(image: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(luminance, nan=0.0, posinf=1e30), 0, np.float32(1e30))
 
 
+def median_luminance(color: np.ndarray) -> float:
+    """Median of the positive luminances of (H, W, 3) radiance; 1 where there are none."""
+    luminance = _luminance(color)
+    positive = luminance[luminance > 0]
+    return float(np.median(positive)) if positive.size else 1.0
+
+
+def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
+    """Luminance of (H, W, 3) radiance in [0, 1], ``L / (L + exposure)``; NaN is 0, Inf is 1.
+
+    Raises
+    ------
+    ValueError
+        If `exposure` is not positive.
+    """
+    if not exposure > 0:
+        raise ValueError(f"exposure is {exposure}, expected a positive number")
+    # As 1 − e / (L + e), which is 1 and not NaN for the largest float.
+    return 1 - np.float32(exposure) / (_luminance(color) + np.float32(exposure))
+
+
 def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
     """Estimate the local noise of an image from the image alone.
 
@@ -98,14 +119,7 @@ def prefilter_guide(
     for name, aov in (("albedo", albedo), ("normal", normal)):
         if aov is not None and aov.shape != color.shape:
             raise ValueError(f"{name} has shape {aov.shape}, expected that of color, {color.shape}")
-    luminance = _luminance(color)
-    if exposure is None:
-        positive = luminance[luminance > 0]
-        exposure = float(np.median(positive)) if positive.size else 1.0
-    if not exposure > 0:
-        raise ValueError(f"exposure is {exposure}, expected a positive number")
-    # As 1 − e / (L + e), which is 1 and not NaN for the largest float.
-    tone = 1 - np.float32(exposure) / (luminance + np.float32(exposure))
+    tone = tone_map(color, median_luminance(color) if exposure is None else exposure)
     steer = []
     if albedo is not None:
         reflectance = _luminance(albedo)

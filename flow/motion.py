@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import cv2
@@ -13,58 +14,175 @@ from flow.warp import warp
 # Longer than any frame is wide: renderers write 1e9, 1e10 or similar where they know no motion.
 ABSURD_LENGTH = 1e4
 
+DIRECTIONS = {
+    "previous": "from this frame to the previous one",
+    "next": "from this frame to the next one",
+    "both": "two vectors: from this frame to the previous one, then from it to the next",
+    "cycles": "two vectors: from this frame to the previous one, then from the next to this one",
+}
+UNITS = {
+    "pixels": "1 is a pixel",
+    "ndc": "1 is the width of the picture in x, its height in y",
+    "half-ndc": "1 is half the width of the picture in x, half its height in y",
+    "screen": "1 is the width of the picture in x and in y",
+}
+VERTICAL = {"down": "y points down", "up": "y points up"}
+ENCODINGS = {
+    "plain": "x, y",
+    "gray": "x, y in [0, 1], one half is still: v = 2 c - 1",
+    "magnitude": "a direction in [0, 1] and a length: v = (2 c - 1) length",
+}
+
+
+@dataclass(frozen=True)
+class MotionConvention:
+    """What a renderer means by its motion vectors.
+
+    Attributes
+    ----------
+    direction : str
+        A key of `DIRECTIONS`.
+    unit : str
+        A key of `UNITS`.
+    y : str
+        A key of `VERTICAL`.
+    scale : float
+        What vectors are multiplied by, not 0: -1 where they point the other way, 2 where they span half a frame (a
+        shutter of 180 degrees).
+    offset : float
+        What is added to each decoded component before that, where the still is not 0.
+    encoding : str
+        A key of `ENCODINGS`.
+
+    Raises
+    ------
+    ValueError
+        If a word is unknown or a number is not finite.
+
+    Notes
+    -----
+    v = scale · unit · (decode(c) + offset), y turned to point down.
+    """
+
+    direction: str = "previous"
+    unit: str = "pixels"
+    y: str = "down"
+    scale: float = 1.0
+    offset: float = 0.0
+    encoding: str = "plain"
+
+    def __post_init__(self) -> None:
+        words = {"direction": DIRECTIONS, "unit": UNITS, "y": VERTICAL, "encoding": ENCODINGS}
+        for name, known in words.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} of motion is {getattr(self, name)!r}, expected one of {', '.join(known)}")
+        for name in ("scale", "offset"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise ValueError(f"{name} of motion is {value!r}, expected a number")
+        if self.scale == 0:
+            raise ValueError("scale of motion is 0, expected a number that is not 0")
+
+    @property
+    def pair(self) -> bool:
+        """Whether there are vectors to both neighbours."""
+        return self.direction in ("both", "cycles")
+
+    @property
+    def channels(self) -> int:
+        """How many channels the vectors have at least."""
+        return (3 if self.encoding == "magnitude" else 2) * (2 if self.pair else 1)
+
+    def factors(self, resolution: tuple[int, int]) -> tuple[float, float]:
+        """What decoded vectors are multiplied by to be pixels, x right and y down, in a picture of height and width."""
+        height, width = resolution
+        x, y = {"pixels": (1, 1), "screen": (width, width)}.get(self.unit, (width, height))
+        scale = self.scale / 2 if self.unit == "half-ndc" else self.scale
+        return scale * x, scale * (y if self.y == "down" else -y)
+
+    def __str__(self) -> str:
+        """Say it in the words of `--motion`, without what is as always."""
+        said = [self.direction, self.unit, f"y-{self.y}"]
+        said += [] if self.encoding == "plain" else [self.encoding]
+        said += [f"{name}={getattr(self, name):.6g}" for name in ("scale", "offset") if self._differs(name)]
+        return ",".join(said)
+
+    def _differs(self, name: str) -> bool:
+        return any(f.name == name and f.default != getattr(self, name) for f in fields(self))
+
+
+# Blender's Vector: the previous frame is sampled at (x + X, y - Y), the next one at (x - Z, y + W), y pointing down.
+CYCLES = MotionConvention("cycles", y="up")
+
+
+class Vectors(NamedTuple):
+    """A flow (H, W, 2), pixels, and where it is known (H, W); it is 0 where it is not."""
+
+    flow: np.ndarray
+    valid: np.ndarray
+
 
 class Motion(NamedTuple):
-    """Flows of one frame to its neighbours; the `next` pair is None where the renderer gives no such vectors."""
+    """Flows of one frame to its neighbours; None where the renderer gives no such vectors."""
 
-    to_previous: np.ndarray
-    previous_valid: np.ndarray
-    to_next: np.ndarray | None
-    next_valid: np.ndarray | None
+    to_previous: Vectors | None
+    to_next: Vectors | None
 
 
-def _sanitize(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stack two components into a flow, 0 where they are not finite or absurdly long."""
-    # Written so that NaN compares false.
-    valid = (np.abs(u) <= ABSURD_LENGTH) & (np.abs(v) <= ABSURD_LENGTH)
-    flow = np.stack([u, v], axis=-1).astype(np.float32)
-    flow[~valid] = 0
-    return flow, valid
-
-
-def normalize_motion(vectors: np.ndarray, convention: str) -> Motion:
+def normalize_motion(
+    vectors: np.ndarray, convention: MotionConvention, *, resolution: tuple[int, int] | None = None
+) -> Motion:
     """Turn a renderer's motion vectors into flows to the previous and to the next frame.
 
     Parameters
     ----------
     vectors
-        (H, W, 4) or (H, W, 2) float, pixels, as the renderer wrote them.
+        (H, W, C) float as the renderer wrote them, C at least `convention.channels`; what is beyond is not looked at.
     convention
-        "cycles": four channels X, Y, Z, W; the previous frame is sampled at (x + X, y - Y), the next one at
-        (x - Z, y + W), y pointing down. "backward": two channels, the offset to the previous frame, y down.
+        What they mean.
+    resolution
+        Height and width, pixels, of the whole picture, which NDC units are fractions of. Missing: those of `vectors`.
 
     Returns
     -------
     Motion
-        Flows (H, W, 2) float32, pixels, x right then y down, and masks (H, W) bool. Vectors that are NaN,
-        infinite, or longer than `ABSURD_LENGTH` in a component are 0 in the flow and False in the mask.
+        Flows (H, W, 2) float32, pixels, x right then y down, and masks (H, W) bool, one of them at least. Vectors that
+        are NaN, infinite, or longer than `ABSURD_LENGTH` in a component are 0 in the flow and False in the mask.
 
     Raises
     ------
     ValueError
-        Unknown convention, or a shape it does not have.
+        Fewer channels than the convention has.
     """
-    channels = {"cycles": 4, "backward": 2}
-    if convention not in channels:
-        raise ValueError(f"convention is {convention!r}, expected one of {', '.join(channels)}")
-    if vectors.ndim != 3 or vectors.shape[2] != channels[convention]:
-        raise ValueError(
-            f"vectors has shape {vectors.shape}, expected (H, W, {channels[convention]}) for {convention!r}"
-        )
-    if convention == "backward":
-        return Motion(*_sanitize(vectors[..., 0], vectors[..., 1]), None, None)
-    x, y, z, w = np.moveaxis(vectors, -1, 0)
-    return Motion(*_sanitize(x, -y), *_sanitize(-z, w))
+    if vectors.ndim != 3 or vectors.shape[2] < convention.channels:
+        expected = f"(H, W, {convention.channels} or more) for {convention}"
+        raise ValueError(f"vectors has shape {vectors.shape}, expected {expected}")
+    unit = np.array(convention.factors(resolution or (vectors.shape[0], vectors.shape[1])), np.float32)
+    size = convention.channels // (2 if convention.pair else 1)
+    first = _to_pixels(vectors[..., :size], convention, unit)
+    if convention.direction == "previous":
+        return Motion(first, None)
+    if convention.direction == "next":
+        return Motion(None, first)
+    second = _to_pixels(vectors[..., size : 2 * size], convention, -unit if convention.direction == "cycles" else unit)
+    return Motion(first, second)
+
+
+def _to_pixels(vectors: np.ndarray, convention: MotionConvention, unit: np.ndarray) -> Vectors:
+    """Decode one vector a pixel; 0 and False where it is not finite or absurdly long."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        flow = np.array(vectors[..., :2], np.float32)
+        if convention.encoding != "plain":
+            flow = 2 * flow - 1
+        if convention.encoding == "magnitude":
+            flow *= vectors[..., 2:3]
+        if convention.offset:
+            flow += np.float32(convention.offset)
+        flow *= unit
+    # Written so that NaN compares false; by planes, which is faster than over so short an axis.
+    valid = (np.abs(flow[..., 0]) <= ABSURD_LENGTH) & (np.abs(flow[..., 1]) <= ABSURD_LENGTH)
+    flow[~valid] = 0
+    return Vectors(flow, valid)
 
 
 def compose_flow(

@@ -127,7 +127,7 @@ def _planes(
     kept = frames * frame + 3 + aovs  # and the result
     if "warp" in plan.stages:
         kept += 2.25 * 4 * max(radius - 1, 0)
-        if plan.stages & {"refine", "dense-flow"} or layers.motion_convention == "backward":
+        if plan.stages & {"refine", "dense-flow"} or (layers.motion_convention and not layers.motion_convention.pair):
             kept += 2.25 * 2 * (frames - 1)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = len(header.channel_names) + frame + 14

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.motion import Motion, invert_flow, normalize_motion
+from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame
 from nlm.average import reject_outliers, replace_nonfinite
@@ -105,9 +105,6 @@ def prepare(frame: Frame, stages: Collection[str]) -> PreparedFrame:
         layers[name] = layer
     albedo, normal, variance = layers.values()
     albedo = None if albedo is None else np.maximum(albedo, 0)
-    motion = None
-    if frame.motion is not None and frame.motion_convention is not None:
-        motion = normalize_motion(frame.motion, frame.motion_convention)
     aovs = {}
     for name, layer in frame.aovs.items():
         aovs[name], bad_here = replace_nonfinite(layer)
@@ -132,7 +129,7 @@ def prepare(frame: Frame, stages: Collection[str]) -> PreparedFrame:
         normal=normal,
         valid=~bad,
         repaired=int(np.count_nonzero(repaired)),
-        motion=motion,
+        motion=frame.flows(),
         depth=frame.depth,
         variance=None if variance is None else np.maximum(variance, 0),
         aovs=aovs,
@@ -159,16 +156,13 @@ def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mas
     """
     step = abs(there.number - here.number)
     forward = there.number > here.number
-    if here.motion is not None:
-        motion = here.motion
-        if not forward:
-            return _times(motion.to_previous, step), motion.previous_valid
-        if motion.to_next is not None and motion.next_valid is not None:
-            return _times(motion.to_next, step), motion.next_valid
-    if forward and there.motion is not None:
-        # Only backward vectors: the next frame knows where each of its pixels was here.
-        previous = _times(there.motion.to_previous, step)
-        return invert_flow(previous, valid=there.motion.previous_valid, depth=there.depth)
+    direct = here.motion and (here.motion.to_next if forward else here.motion.to_previous)
+    if direct is not None:
+        return _times(direct.flow, step), direct.valid
+    reverse = there.motion and (there.motion.to_previous if forward else there.motion.to_next)
+    if reverse is not None:
+        # The other frame knows where each of its pixels is in this one.
+        return invert_flow(_times(reverse.flow, step), valid=reverse.valid, depth=there.depth)
     return None
 
 

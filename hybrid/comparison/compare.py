@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from flow.motion import forward_backward_error, normalize_motion
+from flow.motion import Vectors, forward_backward_error, invert_flow
 from flow.warp import warp
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.metrics import (
@@ -450,20 +450,20 @@ def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.b
     flow : (H, W, 2) array, pixels, from `current` to `previous`.
     valid : (H, W) mask; True where it leads to the same point of the scene: inside the frame, and back again
         by the previous frame's own vectors; where it has none, to the same albedo.
-    None where `current` has no vectors.
+    None where neither has vectors between them.
     """
-    if current.motion is None or current.motion_convention is None:
+    here, before = current.flows(), previous.flows()
+    known, back = here and here.to_previous, before and before.to_next
+    if known is None and back is not None:
+        known = Vectors(*invert_flow(back.flow, valid=back.valid, depth=previous.depth))
+    if known is None:
         return None
-    motion = normalize_motion(current.motion, current.motion_convention)
-    flow, valid = motion.to_previous, motion.previous_valid
-    back = None
-    if previous.motion is not None and previous.motion_convention is not None:
-        back = normalize_motion(previous.motion, previous.motion_convention).to_next
+    flow, valid = known
     if back is not None:
-        there, inside = warp(back, flow)
+        there, inside = warp(back.flow, flow)
         lengths = np.sum(flow**2, axis=-1) + np.sum(there**2, axis=-1)
         # Sundaram et al. 2010, eq. 5: a hundredth of the motion, and half a square pixel for interpolation.
-        agree = forward_backward_error(flow, back) ** 2 < 0.01 * lengths + 0.5
+        agree = forward_backward_error(flow, back.flow) ** 2 < 0.01 * lengths + 0.5
     elif previous.albedo is not None and current.albedo is not None:
         there, inside = warp(previous.albedo, flow)
         # Albedo is in [0, 1]. Another surface seldom differs by less; film sampling and a lens by less than this.

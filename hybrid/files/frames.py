@@ -15,6 +15,7 @@ from pathlib import Path
 import fileseq
 import numpy as np
 
+from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import ROLES, Layers, find_layers
 from hybrid.files.sequences import PADDING, find_files, format_frames, parse_frames
@@ -36,8 +37,10 @@ class Frame:
     depth, alpha
         (H, W) float32 or None.
     motion
-        (H, W, 2 or 4) float32, pixels, or None; what it means is `motion_convention`'s to say
-        (`hybrid.files.layers.Layers`).
+        (H, W, C) float32 as the renderer wrote it, C at least 2, or None; `motion_convention` says what it means.
+    resolution
+        Height and width, pixels, of the whole picture, which NDC units of the motion are fractions of; without,
+        those of `color`.
     aovs
         Name → (H, W, C) float32, those that were asked for.
     source
@@ -50,7 +53,8 @@ class Frame:
     normal: np.ndarray | None = None
     depth: np.ndarray | None = None
     motion: np.ndarray | None = None
-    motion_convention: str | None = None
+    motion_convention: MotionConvention | None = None
+    resolution: tuple[int, int] | None = None
     variance: np.ndarray | None = None
     alpha: np.ndarray | None = None
     estimate: np.ndarray | None = None
@@ -65,7 +69,7 @@ class Frame:
             "color": ((*size, 3),),
             **{name: ((*size, 3),) for name in ("albedo", "normal", "variance", "estimate")},
             **{name: (size,) for name in ("depth", "alpha")},
-            "motion": ((*size, 2), (*size, 4)),
+            "motion": tuple((*size, count) for count in range(2, 9)),
         }
         for name, shapes in expected.items():
             array = getattr(self, name)
@@ -77,6 +81,12 @@ class Frame:
                 raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
         if (self.motion is None) != (self.motion_convention is None):
             raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
+
+    def flows(self) -> Motion | None:
+        """The motion in our own convention; None where there is none."""
+        if self.motion is None or self.motion_convention is None:
+            return None
+        return normalize_motion(self.motion, self.motion_convention, resolution=self.resolution)
 
 
 class Shot:
@@ -439,6 +449,7 @@ def _frame(
         number=number,
         **taken,
         motion_convention=layers.motion_convention,
+        resolution=_size(image.parts[layers.color.part])[::-1],
         aovs={name: pixels(image.layer(name)) for name in aovs},
         source=image.path,
     )

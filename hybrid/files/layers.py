@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from flow.motion import CYCLES, MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
 
 # The last component of a layer's name, in order of preference, whatever the case. Cycles; then our own plain
@@ -38,9 +39,8 @@ class Layers:
     `target` is where the denoised picture belongs: the color itself, except where Cycles denoised already:
     there the color is ``Noisy Image``, which stays, and ``Combined`` is replaced.
 
-    `motion_convention` is "cycles" for four channels (Blender's Vector: previous frame at (x + X, y − Y),
-    next at (x − Z, y + W), in pixels) and "backward" for two: the offset in pixels, x right and y down,
-    from a pixel of this frame to where it was in the previous one.
+    `motion_convention` is Blender's for four channels, and for two the plain one: the offset in pixels, x right and y
+    down, from a pixel of this frame to where it was in the previous one.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
     """
@@ -56,7 +56,7 @@ class Layers:
     half_b: Layer | None = None
     alpha: Layer | None = None
     estimate: Layer | None = None
-    motion_convention: str | None = None
+    motion_convention: MotionConvention | None = None
     view: str | None = None
     views: tuple[str, ...] = ()
 
@@ -110,7 +110,7 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None) -> 
         found["target"] = found["estimate"] or color
 
     motion = found["motion"]
-    convention = None if motion is None else "cycles" if len(motion.channels) == 4 else "backward"
+    convention = None if motion is None else CYCLES if len(motion.channels) == 4 else MotionConvention()
     view = color.view or (image.views[0] if image.views else None)
     return Layers(**found, motion_convention=convention, view=view, views=image.views)  # type: ignore[arg-type]
 

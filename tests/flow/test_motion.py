@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.motion import compose_flow, forward_backward_error, invert_flow, normalize_motion
+from flow.motion import (
+    CYCLES,
+    MotionConvention,
+    compose_flow,
+    forward_backward_error,
+    invert_flow,
+    normalize_motion,
+)
 from flow.warp import warp
 
 DATA = Path(__file__).parents[1] / "data"
@@ -28,15 +35,15 @@ def test_cycles_convention_on_a_render_of_a_known_translation() -> None:
     """The plane of `data/render_translation.py` moves by (+3, -2) and then by (+4, +1) pixels."""
     with np.load(DATA / "translation_cycles.npz") as data:
         previous, centre, following = (data[f"frame{i}"].astype(np.float32) for i in (1, 2, 3))
-        motion = normalize_motion(data["vector"], "cycles")
+        motion = normalize_motion(data["vector"], CYCLES)
+    assert motion.to_previous is not None
     assert motion.to_next is not None
-    assert motion.next_valid is not None
     # What moved by (+3, -2) came from (-3, +2). 1e-3 px: the render's own rounding.
-    np.testing.assert_allclose(motion.to_previous, translation(*centre.shape, -3, 2), atol=1e-3)
-    np.testing.assert_allclose(motion.to_next, translation(*centre.shape, 4, 1), atol=1e-3)
-    assert motion.previous_valid.all()
-    assert motion.next_valid.all()
-    for neighbour, flow in ((previous, motion.to_previous), (following, motion.to_next)):
+    np.testing.assert_allclose(motion.to_previous.flow, translation(*centre.shape, -3, 2), atol=1e-3)
+    np.testing.assert_allclose(motion.to_next.flow, translation(*centre.shape, 4, 1), atol=1e-3)
+    assert motion.to_previous.valid.all()
+    assert motion.to_next.valid.all()
+    for neighbour, flow in ((previous, motion.to_previous.flow), (following, motion.to_next.flow)):
         warped, inside = warp(neighbour, flow)
         right = np.abs(warped - centre)[inside].mean()
         others = [
@@ -48,32 +55,82 @@ def test_cycles_convention_on_a_render_of_a_known_translation() -> None:
         assert min(others) > 0.02
 
 
-def test_backward_convention_keeps_offsets_and_has_no_next() -> None:
+def test_plain_vectors_are_offsets_to_the_previous_frame() -> None:
     vectors = np.random.default_rng(0).normal(size=(4, 6, 2)).astype(np.float32)
-    motion = normalize_motion(vectors, "backward")
-    np.testing.assert_array_equal(motion.to_previous, vectors)
+    motion = normalize_motion(vectors, MotionConvention())
+    np.testing.assert_array_equal(motion.to_previous.flow, vectors)
     assert motion.to_next is None
-    assert motion.next_valid is None
+
+
+# One motion of 6 px to the right and 3 px down, to the next frame, in a picture of 120 x 60, as others write it.
+@pytest.mark.parametrize(
+    ("written", "convention"),
+    [
+        ([6, 3], MotionConvention("next")),
+        ([6, -3], MotionConvention("next", y="up")),
+        ([0.05, 0.05], MotionConvention("next", "ndc")),
+        ([0.1, -0.1], MotionConvention("next", "half-ndc", y="up")),
+        ([0.05, 0.025], MotionConvention("next", "screen")),
+        ([3, 1.5], MotionConvention("next", scale=2)),
+        ([-6, -3], MotionConvention("next", scale=-1)),
+        ([6.25, 3.25], MotionConvention("next", offset=-0.25)),
+        ([0.875, 0.6875], MotionConvention("next", scale=8, encoding="gray")),
+        ([0.5 + 0.5 * 0.8, 0.5 - 0.5 * 0.6, 5], MotionConvention("next", y="up", scale=1, encoding="magnitude")),
+        ([9, 9, 6, 3], MotionConvention("both")),
+        ([9, 9, -6, 3], MotionConvention("cycles", y="up")),
+        ([6, 3, 7, 7], MotionConvention("next")),
+    ],
+    ids=str,
+)
+def test_every_convention_gives_the_same_flow(written: list[float], convention: MotionConvention) -> None:
+    expected = (4, 3) if convention.encoding == "magnitude" else (6, 3)
+    vectors = np.broadcast_to(np.float32(written), (2, 3, len(written)))
+    motion = normalize_motion(vectors, convention, resolution=(60, 120))
+    assert (motion.to_previous is None) == (not convention.pair)
+    assert motion.to_next is not None
+    assert motion.to_next.valid.all()
+    # Rounding of float32 below 10.
+    np.testing.assert_allclose(motion.to_next.flow, np.broadcast_to(np.float32(expected), (2, 3, 2)), atol=1e-5)
+
+
+def test_ndc_counts_in_the_whole_picture_and_not_in_what_is_stored_of_it() -> None:
+    vectors = np.full((2, 3, 2), 0.5, np.float32)
+    cropped = normalize_motion(vectors, MotionConvention(unit="ndc"), resolution=(60, 120)).to_previous
+    assert cropped is not None
+    np.testing.assert_array_equal(cropped.flow[0, 0], [60, 30])
+    whole = normalize_motion(vectors, MotionConvention(unit="ndc")).to_previous
+    assert whole is not None
+    np.testing.assert_array_equal(whole.flow[0, 0], [1.5, 1])
+
+
+def test_conventions_say_themselves_in_the_words_of_the_option() -> None:
+    assert str(CYCLES) == "cycles,pixels,y-up"
+    assert str(MotionConvention("next", "ndc", scale=0.5, encoding="gray")) == "next,ndc,y-down,gray,scale=0.5"
 
 
 def test_absurd_vectors_are_zero_and_reported() -> None:
     vectors = np.ones((3, 4, 4), np.float32)
     vectors[0, 0, 0], vectors[1, 1, 1], vectors[2, 2, 2], vectors[0, 3] = np.nan, np.inf, 1e9, -1e10
-    motion = normalize_motion(vectors, "cycles")
+    motion = normalize_motion(vectors, CYCLES)
     assert motion.to_next is not None
-    assert motion.next_valid is not None
-    np.testing.assert_array_equal(np.argwhere(~motion.previous_valid), [[0, 0], [0, 3], [1, 1]])
-    np.testing.assert_array_equal(np.argwhere(~motion.next_valid), [[0, 3], [2, 2]])
-    assert not motion.to_previous[~motion.previous_valid].any()
-    assert not motion.to_next[~motion.next_valid].any()
-    assert np.isfinite(motion.to_previous).all()
+    np.testing.assert_array_equal(np.argwhere(~motion.to_previous.valid), [[0, 0], [0, 3], [1, 1]])
+    np.testing.assert_array_equal(np.argwhere(~motion.to_next.valid), [[0, 3], [2, 2]])
+    assert not motion.to_previous.flow[~motion.to_previous.valid].any()
+    assert not motion.to_next.flow[~motion.to_next.valid].any()
+    assert np.isfinite(motion.to_previous.flow).all()
 
 
-def test_unknown_convention_and_wrong_channels() -> None:
-    with pytest.raises(ValueError, match="convention is 'houdini', expected one of cycles, backward"):
-        normalize_motion(np.zeros((2, 2, 4)), "houdini")
-    with pytest.raises(ValueError, match=r"expected \(H, W, 4\)"):
-        normalize_motion(np.zeros((2, 2, 2)), "cycles")
+def test_what_is_no_convention_is_refused() -> None:
+    with pytest.raises(ValueError, match="direction of motion is 'houdini', expected one of previous, next,"):
+        MotionConvention("houdini")
+    with pytest.raises(ValueError, match="unit of motion is 'inches', expected one of pixels, ndc"):
+        MotionConvention(unit="inches")
+    with pytest.raises(ValueError, match="scale of motion is nan, expected a number"):
+        MotionConvention(scale=float("nan"))
+    with pytest.raises(ValueError, match="scale of motion is 0, expected"):
+        MotionConvention(scale=0)
+    with pytest.raises(ValueError, match=r"expected \(H, W, 4 or more\) for cycles,pixels,y-up"):
+        normalize_motion(np.zeros((2, 2, 2)), CYCLES)
 
 
 def test_composition_of_translations_is_their_sum() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from flow.motion import CYCLES
 from hybrid.alignment.align import AlignedWindow, Aligner
 from hybrid.files.frames import Frame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
@@ -52,7 +53,7 @@ def frame(index: int, scene: Scene = SCENE, *, clean: bool = False, scale: float
         normal=layers["ViewLayer.Denoising Normal"],
         depth=layers["ViewLayer.Depth"],
         motion=layers["ViewLayer.Vector"],
-        motion_convention="cycles",
+        motion_convention=CYCLES,
     )
 
 
@@ -72,7 +73,7 @@ def constant(value: float = 0.7, size: tuple[int, int] = (24, 32), frames: int =
             normal=np.broadcast_to(np.float32([0, 0, 1]), flat.shape).copy(),
             depth=np.ones(size, np.float32),
             motion=np.zeros((*size, 4), np.float32),
-            motion_convention="cycles",
+            motion_convention=CYCLES,
         )
         for index in range(frames)
     ]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from flow.motion import CYCLES, MotionConvention
 from hybrid.comparison.metrics import psnr
 from tests.hard_cases.hard import SCENE, STAGES, denoise, frame, shot, spoil, truth, within_range
 
@@ -52,9 +53,9 @@ def test_wrong_vectors_cost_no_more_than_time(vectors, refine):
     assert psnr(image, truth()) > psnr(alone, truth()) - 0.5
 
 
-@pytest.mark.parametrize("convention", ["cycles", "backward"])
+@pytest.mark.parametrize("convention", [CYCLES, MotionConvention()], ids=str)
 def test_half_of_the_vectors_are_enough(convention):
-    channels = 4 if convention == "cycles" else 2
+    channels = convention.channels
     frames = [
         spoil(f, motion=np.ascontiguousarray(_backward(f.motion)[..., :channels]), motion_convention=convention)
         for f in shot()

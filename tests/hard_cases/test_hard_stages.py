@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 
 from flow.confidence import estimate_confidence, mix_centre
 from flow.guide import estimate_noise, prefilter_guide
-from flow.motion import compose_flow, forward_backward_error, invert_flow, normalize_motion
+from flow.motion import (
+    CYCLES,
+    MotionConvention,
+    compose_flow,
+    forward_backward_error,
+    invert_flow,
+    normalize_motion,
+)
 from flow.tvl1 import dense_flow, refine_flow, select_flow
 from flow.warp import warp
 from hybrid.alignment.transfer import compress, demodulate, expand, measure_exposure, remodulate
@@ -78,13 +85,14 @@ def between(image, low, high, slack=1e-5):
 
 
 @anything
-@given(images(4, wrong=True, negative=True), st.sampled_from(["cycles", "backward"]))
+@given(images(4, wrong=True, negative=True), st.sampled_from([CYCLES, MotionConvention()]))
 def test_vectors_are_finite_and_bounded(drawn, convention):
     vectors, rng = drawn
     vectors = np.where(rng.random(vectors.shape) < 0.1, np.float32(1e9), vectors)
-    motion = normalize_motion(vectors if convention == "cycles" else vectors[..., :2], convention)
-    for flow, valid in (motion[:2], motion[2:]):
-        if flow is not None:
+    motion = normalize_motion(vectors, convention)
+    for known in motion:
+        if known is not None:
+            flow, valid = known
             assert np.isfinite(flow).all()
             assert (np.abs(flow) <= 1e4).all()
             assert (flow[~valid] == 0).all()

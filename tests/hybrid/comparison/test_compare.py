@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
+from flow.motion import CYCLES, MotionConvention
 from hybrid.comparison import compare
 from hybrid.comparison.compare import (
     Run,
@@ -69,7 +70,7 @@ def make_shots(numbers: tuple[int, ...] = (4, 5, 6)) -> tuple[MemoryShot, Memory
         clean[number] = Frame(number, albedo)
         color = (albedo * rng.gamma(4, 0.25, (*SIZE, 1))).astype(np.float32)
         vectors = np.zeros((*SIZE, 4), np.float32)
-        rendered[number] = Frame(number, color, albedo, normal, motion=vectors, motion_convention="cycles")
+        rendered[number] = Frame(number, color, albedo, normal, motion=vectors, motion_convention=CYCLES)
     return MemoryShot(rendered), MemoryShot(clean)
 
 
@@ -256,7 +257,7 @@ def test_static_pixels_flicker_by_what_was_put_in() -> None:
         tone = frame.color / (1 + frame.color) + sigma * rng.normal(size=frame.color.shape)
         vectors = np.zeros((*SIZE, 4), np.float32)
         color = (tone / (1 - tone)).astype(np.float32)
-        frames[number] = Frame(number, color, motion=vectors, motion_convention="cycles")
+        frames[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
     comparison = compare_shot(MemoryShot(frames), clean, NOISY, measures=QUICK)
     assert comparison.facts["Pixels that stand still"] == "100.0%"
     # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
@@ -336,7 +337,7 @@ class TestMotionBetween:
     def frame(vector: tuple[float, ...] | None, albedo: Array | None = None) -> Frame:
         color = np.ones((*SIZE, 3), np.float32)
         motion = None if vector is None else np.tile(np.float32(vector), (*SIZE, 1))
-        convention = {None: None, 4: "cycles", 2: "backward"}[vector and len(vector)]
+        convention = {None: None, 4: CYCLES, 2: MotionConvention()}[vector and len(vector)]
         return Frame(1, color, albedo, motion=motion, motion_convention=convention)
 
     def test_valid_where_it_leads_back(self) -> None:

@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flow import motion
+from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, read_exr, write_exr, write_layers
 from hybrid.files.layers import describe_layers, find_layers
 
@@ -77,7 +79,7 @@ def test_pixels_stacks_channels_as_float32_in_the_order_asked_for(tmp_path):
 
 def test_headers_alone_are_enough_to_find_layers_and_give_no_pixels(tmp_path):
     image = read_exr(save(tmp_path / "a.exr", planes(cycles_names())), pixels=False)
-    assert find_layers(image).motion_convention == "cycles"
+    assert find_layers(image).motion_convention == motion.CYCLES
     with pytest.raises(ValueError, match="not read"):
         image.channel("ViewLayer.Combined.R")
 
@@ -177,7 +179,7 @@ def test_cycles_layers_are_found(tmp_path):
     assert str(layers.normal) == "ViewLayer.Denoising Normal.XYZ"
     assert str(layers.depth) == "ViewLayer.Denoising Depth.Z"
     assert str(layers.motion) == "ViewLayer.Vector.XYZW"
-    assert (layers.motion_convention, layers.variance, layers.estimate) == ("cycles", None, None)
+    assert (layers.motion_convention, layers.variance, layers.estimate) == (motion.CYCLES, None, None)
 
 
 def test_where_cycles_has_denoised_combined_is_the_estimate_and_is_replaced(tmp_path):
@@ -229,7 +231,7 @@ def test_other_names_are_found(tmp_path, names, expected):
     found = {role: str(getattr(layers, role)) for role in roles if getattr(layers, role)}
     assert found == expected
     if "motion" in expected:
-        assert layers.motion_convention == "backward"
+        assert layers.motion_convention == MotionConvention()
 
 
 def test_layers_of_another_view_layer_are_not_mixed_in(tmp_path):
@@ -275,7 +277,7 @@ def test_overrides_win_and_say_what_there_is(tmp_path):
     layers = find_layers(image, {"color": "rgba_KEY", "motion": "m", "depth": "P.Z", "alpha": "A"})
     assert str(layers.color) == "RGBA_key.RGB"
     assert layers.motion.channels == ("m.u", "m.v")
-    assert layers.motion_convention == "backward"
+    assert layers.motion_convention == MotionConvention()
     assert layers.depth.channels == ("P.Z",)
     assert layers.alpha.channels == ("A",)
     with pytest.raises(ExrError, match=r"no layer 'beauty'; it has RGBA, .*P\.XYZ, RGBA_key\.RGB, m\.uv"):
@@ -305,7 +307,7 @@ def test_description_names_what_is_taken_and_what_is_missing(tmp_path):
     rows = describe_layers(find_layers(read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False)))
     by_role = {role: rest for role, *rest in rows}
     assert by_role["color"] == ["ViewLayer.Combined.RGB", ""]
-    assert by_role["motion"] == ["ViewLayer.Vector.XYZW", "convention: cycles"]
+    assert by_role["motion"] == ["ViewLayer.Vector.XYZW", "convention: cycles,pixels,y-up"]
     assert by_role["albedo"][0] == "missing"
     assert all(note for _, taken, note in rows if taken == "missing")
 

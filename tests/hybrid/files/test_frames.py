@@ -8,6 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from flow.motion import CYCLES
 from hybrid.alignment.align import Aligner
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import ExrError, read_exr, write_layers
@@ -158,7 +159,7 @@ def test_frame_has_all_roles_with_their_shapes(tmp_path):
     np.testing.assert_array_equal(frame.aovs["glow"], layers["glow"])
     for name in ("albedo", "normal", "motion", "variance", "depth"):
         np.testing.assert_array_equal(getattr(frame, name), layers[name])
-    assert frame.motion_convention == "cycles"
+    assert frame.motion_convention == CYCLES
     assert frame.source == tmp_path / "a.0001.exr"
 
 

@@ -1,0 +1,477 @@
+"""Which convention motion vectors follow, measured: readings of them are tried on pairs of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import product
+
+import cv2
+import numpy as np
+from numba import njit
+
+from flow.guide import estimate_noise, median_luminance, prefilter_guide, tone_map
+from flow.motion import UNITS, VERTICAL, MotionConvention, normalize_motion
+from flow.tvl1 import dense_flow
+from flow.warp import locate
+
+# Patches of 9 x 9 pixels: the noise of their means is a ninth of a pixel's.
+RADIUS = 4
+# Enough for 0.2 % of the picture to be eight of them, few enough for a reading to take milliseconds.
+MOST_PATCHES = 4096
+# Readings are screened on this many of one pair: half are those that change most, half lie anywhere.
+SCREENED = 192
+# So many of those that leave least are tried on all patches of all pairs.
+FINALISTS = 4
+# A difference of means that is taken for noise: the scale of `nlm.gate.color_gate`, a third of a pixel's noise and
+# one step of 8 bits. Noise alone brings twice that once in a thousand patches.
+NOISE_SHARE, NOISE_FLOOR = 0.3, 0.004
+# A reading of which a greater share leaves the picture than stays says nothing.
+INSIDE = 0.5
+# Standard errors, of the differences patch by patch, by which one reading is clearly better than another.
+CLEARLY = 3.0
+# What noise alone gives is known to about 1 % of the picture: a reading that leaves less than this is good.
+LEAST = 0.02
+# Readings that leave this share of what changes need no comparison with any others. Half as long as they should be,
+# vectors left 0.4 of it on the bundled shot, right ones less than 0.02.
+GOOD = 0.25
+# Where nothing is known of the scale, other lengths are tried unless a plain one leaves less than this share.
+EXACT = 0.05
+# What overrules what was stated leaves less than this share of what that leaves.
+OVERRULES = 0.5
+# Vectors explain at least this share of what a flow found in the pictures does, where that explains as much.
+WORTH = 0.5
+# The flow is found in pictures of at most so many pixels.
+FOUND_PIXELS = 2**17
+# Vectors may span half a frame (a shutter of 180 degrees) or two, and point either way.
+SCALES = (1.0, -1.0, 2.0, -2.0, 0.5, -0.5)
+# Readings whose vectors (their ninth decile) are shorter, pixels, or longer, picture widths, are not tried.
+SHORTEST, LONGEST = 0.02, 1.0
+# Lengths, pixels, tried for the ninth decile of the vectors where nothing better explains the pictures.
+LENGTHS = 0.5 * 2 ** np.arange(0, 8.5, 0.5)
+
+PARTS = tuple(field.name for field in fields(MotionConvention))
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two neighbouring frames, with the vectors of each as the renderer wrote them.
+
+    Attributes
+    ----------
+    earlier, later : (H, W, 3) array
+        Linear radiance, as noisy as it is. NaN counts as 0, Inf as white.
+    earlier_vectors, later_vectors : (H, W, C) array
+        Their motion vectors.
+    resolution : (int, int)
+        Height and width, pixels, of the whole picture.
+    frames : int
+        How many frames lie from one to the other; vectors span one.
+    """
+
+    earlier: np.ndarray
+    later: np.ndarray
+    earlier_vectors: np.ndarray
+    later_vectors: np.ndarray
+    resolution: tuple[int, int]
+    frames: int = 1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One reading, and the share of the picture that it leaves unexplained."""
+
+    convention: MotionConvention
+    unexplained: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What vectors were found to mean.
+
+    Attributes
+    ----------
+    convention : MotionConvention or None
+        The reading to take; None: none explains the pictures.
+    unexplained : float
+        Share of the picture, in [0, 1], that it leaves unexplained; without a reading, that the best leaves.
+    still : float
+        The same without any motion.
+    found : float or None
+        The same with a flow found in the pictures, where that was needed to decide.
+    open : tuple of str
+        Parts that nobody has stated and these pictures do not settle: they are as was assumed.
+    trials : tuple of Trial
+        What was tried on all patches, best first.
+    """
+
+    convention: MotionConvention | None
+    unexplained: float
+    still: float
+    found: float | None
+    open: tuple[str, ...]
+    trials: tuple[Trial, ...]
+
+
+def choose_convention(
+    pairs: Sequence[FramePair], assumed: MotionConvention, settled: Collection[str] = PARTS
+) -> Choice:
+    """Find the reading of motion vectors that explains the pictures.
+
+    Parameters
+    ----------
+    pairs : sequence of FramePair
+        At least one.
+    assumed : MotionConvention
+        What is taken where the pictures cannot tell.
+    settled : collection of str
+        The parts of it that are known. They are tried otherwise only if they explain little.
+
+    Returns
+    -------
+    Choice
+        `convention` is None if vectors are clearly worse than no motion, or explain less than half of what a flow found
+        in the pictures explains.
+
+    Raises
+    ------
+    ValueError
+        No pairs, or vectors with fewer channels than `assumed` has.
+
+    Notes
+    -----
+    Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a patch of
+    neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1, (m/2q)²)
+    less what noise alone gives; patches that leave the picture say nothing. One reading is clearly better than another
+    if the mean difference, patch by patch, is three times its standard error.
+    """
+    if not pairs:
+        raise ValueError("pairs is empty, expected at least one")
+    trials, settled = _Trials(pairs), frozenset(settled)
+    chosen = trials.best(assumed, settled)
+    harms = trials.clearly_better(None, chosen)
+    if settled and (harms or not trials.good(chosen)):
+        other = trials.best(assumed, frozenset())
+        clearly = trials.clearly_better(other, chosen) and trials.clearly_better(other, None)
+        if clearly and trials.left(other) <= OVERRULES * trials.left(chosen):
+            chosen, harms = other, trials.clearly_better(None, other)
+    believed, found = not harms, None
+    if believed and not trials.good(chosen):
+        # A change of light is explained by no motion. Vectors are wrong where a search explains what they do not.
+        found = trials.search()
+        possible = trials.left(None) - found
+        gained = trials.left(None) - trials.left(chosen)
+        believed = gained >= WORTH * possible or possible <= WORTH * trials.left(None)
+    return Choice(
+        convention=chosen if believed else None,
+        unexplained=trials.left(chosen),
+        still=trials.left(None),
+        found=found,
+        open=trials.open_parts(chosen, settled) if believed else (),
+        trials=trials.table(),
+    )
+
+
+class _Patches:
+    """A pair of frames, seen through patches at the same places of both."""
+
+    def __init__(self, pair: FramePair) -> None:
+        self.pair = pair
+        exposure = median_luminance(pair.earlier)
+        self.pictures = tuple(tone_map(color, exposure) for color in (pair.earlier, pair.later))
+        height, width = self.pictures[0].shape
+        self.radius = min(RADIUS, (min(height, width) - 1) // 2)
+        size = 2 * self.radius + 1
+        spacing = max(size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
+        inner = (np.arange(self.radius, side - self.radius, spacing) for side in (height, width))
+        self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
+        noise = [estimate_noise(picture)[self.rows, self.columns] ** 2 for picture in self.pictures]
+        deviation = np.sqrt(np.mean(noise, axis=0))
+        # The scale is made for patches of 9 x 9; the means of smaller ones are as much noisier as they are smaller.
+        self.scale = 2 * (NOISE_SHARE * deviation * ((2 * RADIUS + 1) / size) + NOISE_FLOOR)
+        # Two means differ by noise with the variance 2 s² / size².
+        self.expected = 2 * np.square(deviation / (size * self.scale))
+        self.all = np.arange(len(self.rows))
+        self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all)
+        self.few = _informative(self.still, SCREENED)
+
+    @cached_property
+    def _vectors(self) -> list[np.ndarray]:
+        return [self.gather(layer, self.all) for layer in (self.pair.earlier_vectors, self.pair.later_vectors)]
+
+    @cached_property
+    def _few_vectors(self) -> list[np.ndarray]:
+        return [self.gather(layer, self.few) for layer in (self.pair.earlier_vectors, self.pair.later_vectors)]
+
+    def costs(self, convention: MotionConvention, *, few: bool = False) -> np.ndarray:
+        """What a reading leaves of each patch, or of the `few` that tell most, in [0, 1]; NaN outside."""
+        sides = []
+        for centre, vectors in enumerate(self._few_vectors if few else self._vectors):
+            motion = normalize_motion(vectors, convention, resolution=self.pair.resolution)
+            toward = motion.to_previous if centre else motion.to_next
+            if toward is not None:
+                flow = toward.flow * np.float32(self.pair.frames)
+                flow[~toward.valid] = np.inf  # leaves the picture
+                sides.append(self._costs(centre, flow, self.few if few else self.all))
+        if len(sides) == 1:
+            return sides[0]
+        return np.where(np.isnan(sides[0]), sides[1], np.where(np.isnan(sides[1]), sides[0], (sides[0] + sides[1]) / 2))
+
+    def costs_along(self, flow: np.ndarray) -> np.ndarray:
+        """What a flow (H, W, 2) from the later frame to the earlier leaves of each patch."""
+        return self._costs(1, self.gather(flow, self.all), self.all)
+
+    def length(self, convention: MotionConvention) -> float:
+        """Ninth decile of the lengths of the vectors, pixels; 0 without any."""
+        lengths = []
+        for vectors in self._few_vectors:
+            motion = normalize_motion(vectors, convention, resolution=self.pair.resolution)
+            lengths += [np.hypot(v.flow[..., 0], v.flow[..., 1])[v.valid] for v in motion if v is not None]
+        every = np.concatenate(lengths)
+        return float(np.quantile(every, 0.9)) if every.size else 0.0
+
+    def gather(self, layer: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """The patches `at` of a layer (H, W, C), one below the other, (P · size, size, C)."""
+        reach = np.arange(-self.radius, self.radius + 1)
+        rows = self.rows[at, None, None] + reach[:, None]
+        columns = self.columns[at, None, None] + reach
+        return layer[rows, columns].reshape(-1, len(reach), layer.shape[2])
+
+    def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray) -> np.ndarray:
+        difference = np.empty(len(at), np.float32)
+        flow = np.ascontiguousarray(flow, np.float32)
+        _compare(
+            self.pictures[centre],
+            self.pictures[1 - centre],
+            flow,
+            self.rows[at],
+            self.columns[at],
+            self.radius,
+            difference,
+        )
+        return np.minimum(np.square(difference / self.scale[at]), 1)
+
+
+@njit(nogil=True, cache=True)
+def _compare(
+    centre: np.ndarray,
+    other: np.ndarray,
+    flow: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    radius: int,
+    difference: np.ndarray,
+) -> None:
+    """Mean of other(x + v) − centre(x) over each patch; NaN where less than half of it stays in the picture."""
+    height, width = other.shape
+    size = 2 * radius + 1
+    one = np.float32(1)
+    for p in range(len(rows)):
+        total, count = np.float32(0), 0
+        for j in range(size):
+            for i in range(size):
+                y, x = rows[p] - radius + j, columns[p] - radius + i
+                u, v = flow[p * size + j, i, 0], flow[p * size + j, i, 1]
+                inside, x0, y0, x1, y1, fx, fy = locate(np.float32(x) + u, np.float32(y) + v, width, height)
+                if inside:
+                    total -= centre[y, x]
+                    total += (one - fy) * ((one - fx) * other[y0, x0] + fx * other[y0, x1])
+                    total += fy * ((one - fx) * other[y1, x0] + fx * other[y1, x1])
+                    count += 1
+        difference[p] = total / count if 2 * count >= size * size else np.nan
+
+
+class _Trials:
+    """What readings leave of some pairs; each is tried once."""
+
+    def __init__(self, pairs: Sequence[FramePair]) -> None:
+        self.pairs = [_Patches(pair) for pair in pairs]
+        self.expected = float(np.mean(np.concatenate([pair.expected for pair in self.pairs])))
+        # The pair that tells most.
+        self.screen = max(self.pairs, key=lambda pair: float(np.mean(pair.still - pair.expected)))
+        self.tried: dict[MotionConvention, np.ndarray] = {}
+
+    def costs(self, reading: MotionConvention | None) -> np.ndarray:
+        """What a reading leaves of each patch of all pairs; None: no motion."""
+        if reading is None:
+            return np.concatenate([pair.still for pair in self.pairs])
+        if reading not in self.tried:
+            self.tried[reading] = np.concatenate([pair.costs(reading) for pair in self.pairs])
+        return self.tried[reading]
+
+    def _screened(self, reading: MotionConvention) -> float:
+        return _mean(self.screen.costs(reading, few=True), self.screen.still[self.screen.few])
+
+    def mean(self, reading: MotionConvention | None) -> float:
+        """Mean of what a reading leaves, noise included."""
+        return _mean(self.costs(reading), self.costs(None))
+
+    def left(self, reading: MotionConvention | None) -> float:
+        """Share of the picture that a reading leaves unexplained."""
+        return max(self.mean(reading) - self.expected, 0.0)
+
+    def good(self, reading: MotionConvention, share: float = GOOD) -> bool:
+        """Whether a reading leaves so little of what changes that there is nothing more to ask."""
+        return self.left(reading) <= max(share * self.left(None), LEAST)
+
+    def clearly_better(self, a: MotionConvention | None, b: MotionConvention | None) -> bool:
+        """Whether a leaves less than b where both stay in the picture, by more than chance."""
+        difference = self.costs(b) - self.costs(a)
+        difference = difference[~np.isnan(difference)]
+        enough = len(difference) >= INSIDE * len(self.costs(None))
+        return enough and float(difference.mean()) > CLEARLY * float(difference.std()) / np.sqrt(len(difference))
+
+    def best(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
+        """The reading that leaves least, or one that is preferred to it and not clearly worse."""
+        readings = self._readings(assumed, settled)
+        if len(readings) > FINALISTS:
+            rank = sorted(readings, key=self._screened)
+            readings = [reading for reading in readings if reading == assumed or reading in rank[:FINALISTS]]
+        least = min(readings, key=self.mean)
+        if "scale" not in settled:
+            fitted = self._fit_scale(least if self.good(least, EXACT) else self._fit_length(assumed, settled))
+            if self.clearly_better(fitted, least) and self.left(fitted) <= OVERRULES * self.left(least):
+                return fitted
+        return next(reading for reading in readings if not self.clearly_better(least, reading))
+
+    def _readings(self, assumed: MotionConvention, settled: frozenset[str]) -> list[MotionConvention]:
+        """The readings that agree with what is settled and lead to plausible places, the preferred ones first."""
+        if settled >= set(PARTS):
+            return [assumed]
+        pair = self.screen.pair
+        width = pair.resolution[1]
+        lengths: dict[tuple[str, str], float] = {}
+        readings: dict[object, MotionConvention] = {}
+        for reading in _agreeing(assumed, settled, (pair.earlier_vectors, pair.later_vectors)):
+            kind = reading.direction, reading.encoding
+            if kind not in lengths:
+                lengths[kind] = self.screen.length(replace(reading, unit="pixels", scale=1.0))
+            x, y = reading.factors(pair.resolution)
+            if reading == assumed or SHORTEST <= lengths[kind] * abs(x) <= LONGEST * width:
+                # Half NDC twice as long is NDC.
+                readings.setdefault((kind, reading.offset, x, y), reading)
+        # As many vectors as are assumed; forward rather than backward turned round; then what changes least.
+        changes = {r: sum(getattr(r, part) != getattr(assumed, part) for part in PARTS) for r in readings.values()}
+        return sorted(readings.values(), key=lambda r: (r.pair != assumed.pair, r.scale < 0, changes[r]))
+
+    def _fit_length(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
+        """Of vectors of about any length, those that leave least."""
+        pair = self.screen.pair
+        fits: dict[MotionConvention, float] = {assumed: np.inf}
+        for reading in _agreeing(assumed, settled, (pair.earlier_vectors, pair.later_vectors)):
+            # Units differ in their length, which is free here, and in the aspect of the picture.
+            alike = reading.unit in {"screen", "half-ndc"} - {assumed.unit} or abs(reading.scale) != 1
+            length = 0.0 if alike or reading.pair != assumed.pair else self.screen.length(reading)
+            if length > 0:
+                tried = [replace(reading, scale=reading.scale * float(scale)) for scale in LENGTHS / length]
+                costs = [self._screened(one) for one in tried]
+                fits[tried[int(np.argmin(costs))]] = min(costs)
+        # A quarter: the step of the lengths is coarse.
+        return next(reading for reading, cost in fits.items() if cost <= 1.25 * min(fits.values()))
+
+    def _fit_scale(self, reading: MotionConvention) -> MotionConvention:
+        """The reading with the scale nearby that leaves least."""
+        best = min(_near(reading, 0.5), key=self._screened)
+        if best == reading:
+            return reading
+        for octaves in (0.125, 0.03):
+            best = min(_near(best, octaves), key=self.mean)
+        return best
+
+    def search(self) -> float:
+        """Share of the picture that flows found in the pictures leave unexplained; 0 to 1."""
+        costs = np.concatenate([pair.costs_along(_found(pair.pair)) for pair in self.pairs])
+        return max(_mean(costs, self.costs(None)) - self.expected, 0.0)
+
+    def open_parts(self, chosen: MotionConvention, settled: frozenset[str]) -> tuple[str, ...]:
+        """Parts in which readings differ that explain no less than the chosen one; all, if that explains nothing."""
+        if not self.clearly_better(chosen, None):
+            return tuple(part for part in PARTS if part not in settled)
+        # Not those that differ by a fitted scale alone, nor those that tell less.
+        others = [r for r in self.tried if r.pair == chosen.pair and not 0.8 < r.scale / chosen.scale < 1 / 0.8]
+        others += [r for r in self.tried if r.pair == chosen.pair and r.scale == chosen.scale]
+        equals = [r for r in others if not self.clearly_better(chosen, r)]
+        differ = {part for r in equals for part in PARTS if getattr(r, part) != getattr(chosen, part)}
+        return tuple(part for part in PARTS if part in differ - settled)
+
+    def table(self) -> tuple[Trial, ...]:
+        """Every reading that was tried on all patches, best first."""
+        order = sorted(self.tried, key=self.mean)
+        return tuple(Trial(reading, self.left(reading)) for reading in order)
+
+
+def _mean(costs: np.ndarray, still: np.ndarray) -> float:
+    """Mean of the costs of patches that stay in the picture; where few do, as without motion."""
+    inside = ~np.isnan(costs)
+    return float((costs[inside] if inside.mean() >= INSIDE else still).mean())
+
+
+def _informative(still: np.ndarray, count: int) -> np.ndarray:
+    """Indices of patches: half of them those that change most, half spread evenly."""
+    if len(still) <= count:
+        return np.arange(len(still))
+    changing = np.argpartition(still, -(count // 2))[-(count // 2) :]
+    spread = np.linspace(0, len(still) - 1, count - count // 2).round().astype(int)
+    return np.union1d(changing, spread)
+
+
+def _near(reading: MotionConvention, octaves: float) -> list[MotionConvention]:
+    """The reading, and others up to so many octaves longer and shorter."""
+    factors = 2.0 ** np.linspace(-octaves, octaves, 9)
+    return [reading, *(replace(reading, scale=reading.scale * float(factor)) for factor in factors)]
+
+
+def _agreeing(
+    assumed: MotionConvention, settled: frozenset[str], vectors: Sequence[np.ndarray]
+) -> Iterator[MotionConvention]:
+    """All readings that agree with what is settled, the preferred ones first."""
+    # The scale varies slowest: vectors of the length they are in their unit go before all others.
+    options: dict[str, Sequence[object]] = {
+        "scale": SCALES,
+        "offset": (0.0,),
+        "direction": ("cycles", "both", "previous", "next"),
+        "unit": tuple(UNITS),
+        "y": tuple(VERTICAL),
+        "encoding": () if "encoding" in settled else _encodings(vectors),
+    }
+    for part, others in options.items():
+        first = getattr(assumed, part)
+        options[part] = [first] if part in settled else [first, *(other for other in others if other != first)]
+    for values in product(*options.values()):
+        reading = MotionConvention(**dict(zip(options, values, strict=True)))  # type: ignore[arg-type]
+        if reading.channels <= vectors[0].shape[2]:
+            yield reading
+
+
+def _encodings(vectors: Sequence[np.ndarray]) -> list[str]:
+    """How vectors with such values may be encoded."""
+    sample = np.concatenate([layer[::16, ::16].reshape(-1, layer.shape[2]) for layer in vectors])
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    if not sample.size or not sample[:, :2].any() or sample[:, :2].min() < 0 or sample[:, :2].max() > 1:
+        return ["plain"]
+    if sample.shape[1] >= 3:
+        moving = sample[sample[:, 2] > 0]
+        length = np.hypot(*(2 * moving[:, :2] - 1).T)
+        # A unit direction, up to the rounding of half floats.
+        if len(moving) and float(np.quantile(np.abs(length - 1), 0.5)) < 0.01:
+            return ["magnitude", "plain", "gray"]
+    return ["plain", "gray"]
+
+
+def _found(pair: FramePair) -> np.ndarray:
+    """A flow (H, W, 2) from the later frame to the earlier, found in the pictures."""
+    height, width = pair.later.shape[:2]
+    factor = min(1.0, float(np.sqrt(FOUND_PIXELS / (height * width))))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    exposure = median_luminance(pair.earlier)
+    guides, noises = [], []
+    for color in (pair.later, pair.earlier):
+        small = color if factor == 1 else cv2.resize(np.nan_to_num(color), size, interpolation=cv2.INTER_AREA)
+        guide, noise = prefilter_guide(small, exposure=exposure)
+        guides.append(guide)
+        noises.append(noise)
+    flow = dense_flow(*guides, noise=np.maximum(*noises))
+    if factor == 1:
+        return flow
+    return cv2.resize(flow, (width, height)) * np.array([width / size[0], height / size[1]], np.float32)
