@@ -20,17 +20,20 @@ from hybrid.commands.options import (
     KeepOption,
     LayerOption,
     MemoryOption,
+    MotionOption,
     OffOption,
     OnOption,
     OutputOption,
     PixelsOption,
     PreviewOption,
+    ProfileOption,
     ResumeOption,
     ShotArgument,
     choose,
     import_neural,
     open_input,
     plan_input,
+    printable,
 )
 from hybrid.interrupt import INTERRUPTED, interruptible
 
@@ -51,6 +54,8 @@ def pseudoref(
     preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
     resume: ResumeOption = False,
@@ -68,7 +73,7 @@ def pseudoref(
     from hybrid.timing import Timings
 
     chosen = choose(CLASSICAL_PRESETS, preset, "preset")
-    opened = open_input(shot, frames, layer, max_pixels=max_pixels)
+    opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     _spare_input(opened, output, source.files, preview=preview)
@@ -85,7 +90,7 @@ def pseudoref(
             source,
             command="pseudoref",
             preset=preset,
-            settings={"layer": layer, "estimate": estimate},
+            settings={"layer": layer, "profile": profile, "motion": motion, "estimate": estimate},
             stages=(stages, no_stages),
             resume=resume,
             max_memory=max_memory,
@@ -124,6 +129,8 @@ def denoise(
     preview: PreviewOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
     tile: Annotated[
@@ -148,7 +155,7 @@ def denoise(
         raise typer.BadParameter(f"--passes is {passes}, expected at least 1")
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
-    opened = open_input(shot, frames, layer, aov, max_pixels=max_pixels)
+    opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -171,6 +178,8 @@ def denoise(
     _spare_input(opened, output, source.files, preview=preview, breakdown=breakdown)
     settings = {
         "layer": layer,
+        "profile": profile,
+        "motion": motion,
         "estimate": estimate,
         "aov": aov,
         "tile": tile,
@@ -312,6 +321,7 @@ def _denoise(job: Job, done: list[int]) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Table
 
+    from hybrid.files.layers import summarize_layers
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
     from hybrid.pipeline import denoise_shot
     from hybrid.plan import Plan
@@ -330,6 +340,7 @@ def _denoise(job: Job, done: list[int]) -> None:
     plan = plan_input(shot, *job.stages)
     rows = None if fit is None else fit(plan)
     console = Console(stderr=True)
+    console.print(f"layers: {printable(summarize_layers(shot.layers(shot.numbers[0])))}", highlight=False, markup=False)
     console.print("stages: " + ", ".join(d.stage for d in plan.decisions if d.on), highlight=False)
     for decision in plan.decisions:
         if not decision.on:

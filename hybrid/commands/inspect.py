@@ -5,9 +5,11 @@ from __future__ import annotations
 from hybrid.commands.options import (
     FramesOption,
     LayerOption,
+    MotionOption,
     OffOption,
     OnOption,
     PixelsOption,
+    ProfileOption,
     ShotArgument,
     open_input,
     plan_input,
@@ -19,6 +21,8 @@ def inspect(
     shot: ShotArgument,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
     max_pixels: PixelsOption = None,
@@ -32,12 +36,14 @@ def inspect(
     from hybrid.plan import STAGES
 
     console = Console()
-    opened = open_input(shot, frames, layer, max_pixels=max_pixels)
+    opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     first = opened.numbers[0]
     height, width = opened.shape
     console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
     table = Table("role", "taken from", "note", title="Layers", title_justify="left")
-    for row in describe_layers(opened.layers(first)):
+    layers = opened.layers(first)
+    console.print(f"profile: {printable(layers.profile)} ({printable(layers.reason)})", highlight=False, markup=False)
+    for row in describe_layers(layers):
         table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
     console.print(table)
     plan = plan_input(opened, stages, no_stages)

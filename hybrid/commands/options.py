@@ -25,6 +25,21 @@ LayerOption = Annotated[
         help="take a layer for color, albedo, normal, depth, motion, variance, half_a, half_b, estimate",
     ),
 ]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|FILE",
+        help="whose names and conventions to take: a renderer, or a TOML file (docs/renderers.md); else found",
+    ),
+]
+MotionOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WORDS",
+        help="what vectors mean, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: measured, none: not used; "
+        "else as the renderer writes them",
+    ),
+]
 PreviewOption = Annotated[
     Path | None, typer.Option(help="a PNG to look at: the middle frame, noisy and denoised side by side")
 ]
@@ -78,10 +93,20 @@ def open_input(
     layer: Sequence[str] | None,
     aovs: Sequence[str] | None = None,
     *,
+    profile: str | None = None,
+    motion: str | None = None,
     max_pixels: int | None = None,
 ) -> Shot:
     from hybrid.files.exr import MAX_PIXELS
     from hybrid.files.frames import open_shot
+    from hybrid.files.profile import open_profile, parse_motion
+
+    try:
+        if motion not in (None, "auto", "none"):
+            parse_motion(motion or "")
+        chosen = None if profile is None else open_profile(profile)
+    except ValueError as error:
+        raise typer.BadParameter(f"--{error}") from None
 
     overrides = {}
     for item in layer or ():
@@ -94,6 +119,8 @@ def open_input(
         shot,
         frames=frames,
         layers=overrides,
+        profile=chosen,
+        motion=motion,
         aovs=tuple(aovs or ()),
         keep=0,
         max_pixels=MAX_PIXELS if max_pixels is None else max_pixels,

@@ -17,7 +17,8 @@ import numpy as np
 
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
-from hybrid.files.layers import ROLES, Layers, find_layers
+from hybrid.files.layers import Layers, find_layers
+from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.sequences import PADDING, find_files, format_frames, parse_frames
 from nlm.variance import variance_from_halves
 
@@ -121,6 +122,8 @@ class Shot:
         *,
         frames: str | None = None,
         layers: Mapping[str, str] | None = None,
+        profile: Profile | None = None,
+        motion: str | None = None,
         aovs: Sequence[str] = (),
         keep: int = 2,
         max_pixels: int = MAX_PIXELS,
@@ -139,6 +142,8 @@ class Shot:
             self.warnings.append(f"missing frames {format_frames(missing)}: the windows beside them are narrower")
         self._files = dict(files)
         self._overrides = dict(layers or {})
+        self._profile = profile
+        self._motion = motion
         self._aovs = tuple(aovs)
         self._keep = keep
         self._max_pixels = max_pixels
@@ -188,6 +193,8 @@ class Shot:
         made = Shot(
             files,
             layers={**self._overrides, "color": color},
+            profile=self.profile,
+            motion="none" if self._motion == "none" else None,
             aovs=self._aovs,
             keep=self._keep,
             max_pixels=self._max_pixels,
@@ -213,7 +220,17 @@ class Shot:
 
     def layers(self, number: int) -> Layers:
         """Which channels of a frame's file are taken for what; reads the header only."""
-        return find_layers(self.header(number), self._overrides)
+        return self._find(self.header(number))
+
+    @cached_property
+    def profile(self) -> Profile:
+        """Whose names and conventions are taken: the one asked for, or that which fits the first of all files."""
+        taken = self._profile or find_profile(self._read(self._files[min(self._files)], pixels=False))
+        return taken if self._motion in (None, "none") else taken.with_motion(self._motion)
+
+    def _find(self, image: ExrImage) -> Layers:
+        found = find_layers(image, self._overrides, self.profile)
+        return found.without({"motion"}) if self._motion == "none" else found
 
     def header(self, number: int) -> ExrImage:
         """Parts and channels of a frame's file, without pixels."""
@@ -235,7 +252,7 @@ class Shot:
             self._held.move_to_end(number)
             return self._held[number]
         image = self.source(number)
-        layers = find_layers(image, self._overrides)
+        layers = self._find(image)
         size = _size(image.parts[layers.color.part])
         if size != self._size:
             first, second = ("x".join(map(str, s)) for s in (self._size, size))
@@ -276,7 +293,7 @@ class Shot:
             How many values were too large for a half channel.
         """
         source = self.source(number)
-        layers = find_layers(source, self._overrides)
+        layers = self._find(source)
         replaced: dict[str, np.ndarray] = {}
         for name, image in images.items():
             taken = layers.target if name == "color" else getattr(layers, name) if name in ROLES else None
@@ -316,7 +333,7 @@ class Shot:
     def _size(self) -> tuple[int, int]:
         """Width and height of the first frame's display window."""
         image = self._read(self.path(self.numbers[0]), pixels=False)
-        return _size(image.parts[find_layers(image, self._overrides).color.part])
+        return _size(image.parts[self._find(image).color.part])
 
     @cached_property
     def _canvas(self) -> tuple[int, int, int, int]:
@@ -326,7 +343,7 @@ class Shot:
             # A file that cannot be read, or is of another size, is an error when its turn comes, not now.
             with suppress(ExrError, OSError):
                 image = self._read(path, pixels=False)
-                home = image.parts[find_layers(image, self._overrides).color.part]
+                home = image.parts[self._find(image).color.part]
                 if _size(home) == size:
                     boxes.append(_data_window(home))
         lefts, tops, rights, bottoms = zip(*boxes, strict=True)
@@ -338,6 +355,8 @@ def open_shot(
     *,
     frames: str | None = None,
     layers: Mapping[str, str] | None = None,
+    profile: Profile | None = None,
+    motion: str | None = None,
     aovs: Sequence[str] = (),
     keep: int = 2,
     max_pixels: int = MAX_PIXELS,
@@ -352,6 +371,11 @@ def open_shot(
         A range such as ``1001-1010x2``; all by default.
     layers
         Overrides for `hybrid.files.layers.find_layers`.
+    profile
+        Whose names and conventions to take; without, the one that fits the files.
+    motion
+        What vectors mean, where the profile does not say so or is wrong (`hybrid.files.profile.Profile.with_motion`);
+        "none": they are not used.
     aovs
         Names of further layers to load into `Frame.aovs`.
     keep
@@ -366,7 +390,16 @@ def open_shot(
     ValueError
         If the folder has several sequences, or `frames` is not a range.
     """
-    return Shot(find_files(str(spec)), frames=frames, layers=layers, aovs=aovs, keep=keep, max_pixels=max_pixels)
+    return Shot(
+        find_files(str(spec)),
+        frames=frames,
+        layers=layers,
+        profile=profile,
+        motion=motion,
+        aovs=aovs,
+        keep=keep,
+        max_pixels=max_pixels,
+    )
 
 
 def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = False) -> Path:
@@ -442,6 +475,12 @@ def _frame(
         taken[role] = np.ascontiguousarray(taken[role][..., 0])
     if "variance" in taken and taken["variance"].shape[2] == 1:
         taken["variance"] = np.repeat(taken["variance"], 3, axis=2)
+    if "variance" in taken and layers.variance_scale not in (None, 1):
+        taken["variance"] = taken["variance"] * np.float32(layers.variance_scale)
+    following = taken.pop("motion_next", None)
+    if following is not None and layers.motion_convention is not None:
+        one = layers.motion_convention.channels // 2
+        taken["motion"] = np.concatenate([taken["motion"][..., :one], following[..., :one]], axis=-1)
     halves = taken.pop("half_a", None), taken.pop("half_b", None)
     if "variance" not in taken and halves[0] is not None and halves[1] is not None:
         taken["variance"] = variance_from_halves(halves[0], halves[1])

@@ -2,30 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
-from flow.motion import CYCLES, MotionConvention
+from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
-
-# The last component of a layer's name, in order of preference, whatever the case. Cycles; then our own plain
-# names, which others use too; then Arnold (noice: RGBA, denoise_albedo, diffuse_albedo, N, Z, variance),
-# RenderMan (denoise: Ci, albedo, normal, mse), Karma (C, N), V-Ray (diffuse filter, normals, zDepth).
-# "" are the bare channels of a file, or of its first part with such. Motion is not guessed beyond these two:
-# the others' conventions differ, and wrong vectors are worse than none (--layer motion=… takes any).
-_NAMES: dict[str, tuple[str, ...]] = {
-    "color": ("noisy image", "combined", "color", "beauty", "rgba", "rgb", "ci", "c", ""),
-    "albedo": ("denoising albedo", "albedo", "denoise_albedo", "diffuse_albedo", "diffusefilter"),
-    "normal": ("denoising normal", "normal", "n", "normals"),
-    "depth": ("denoising depth", "depth", "z", "zdepth", ""),
-    "motion": ("vector", "motion"),
-    "variance": ("variance", "mse"),
-    "half_a": ("half a", "half_a"),
-    "half_b": ("half b", "half_b"),
-    "alpha": (),
-    "estimate": ("denoised", "estimate"),
-}
-ROLES = tuple(_NAMES)
+from hybrid.files.profile import ROLES, Profile, find_profile, plain_name
 
 
 @dataclass(frozen=True)
@@ -33,14 +15,16 @@ class Layers:
     """Which channels of a file are taken for what; None where there is nothing.
 
     A layer here holds just the channels that are used: three for `color`, `albedo`, `normal`, `estimate`, one
-    or three for `variance`, one for `depth` and `alpha`, four or two for `motion`. `half_a` and `half_b` are the color
-    of two independent halves of the samples, whose difference gives the variance.
+    or three for `variance`, one for `depth` and `alpha`, two to four for `motion`; vectors to the next frame may lie in
+    a layer of their own, `motion_next`. `half_a` and `half_b` are the color of two independent halves of the samples,
+    whose difference gives the variance.
 
     `target` is where the denoised picture belongs: the color itself, except where Cycles denoised already:
     there the color is ``Noisy Image``, which stays, and ``Combined`` is replaced.
 
-    `motion_convention` is Blender's for four channels, and for two the plain one: the offset in pixels, x right and y
-    down, from a pixel of this frame to where it was in the previous one.
+    `profile` says whose names and conventions were taken, `reason` why. Of `motion_convention`, its parts `settled` are
+    documented, the others assumed. `variance_scale` is what the variance is multiplied by to be that of a pixel; None
+    where nobody has said what it is.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
     """
@@ -51,17 +35,28 @@ class Layers:
     normal: Layer | None = None
     depth: Layer | None = None
     motion: Layer | None = None
+    motion_next: Layer | None = None
     variance: Layer | None = None
     half_a: Layer | None = None
     half_b: Layer | None = None
     alpha: Layer | None = None
     estimate: Layer | None = None
+    profile: str = ""
+    reason: str = ""
     motion_convention: MotionConvention | None = None
+    settled: frozenset[str] = frozenset()
+    variance_scale: float | None = None
     view: str | None = None
     views: tuple[str, ...] = ()
 
+    def without(self, roles: Collection[str]) -> Layers:
+        """The same with some roles left out; motion goes as a whole."""
+        gone = {*roles, "motion_next"} if "motion" in roles else {*roles}
+        kept = None if "motion" in gone else self.motion_convention
+        return replace(self, **dict.fromkeys(gone), motion_convention=kept)  # type: ignore[arg-type]
 
-def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None) -> Layers:
+
+def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None, profile: Profile | None = None) -> Layers:
     """Say which channels of a file are the color, albedo, normal, depth, motion, variance, alpha, estimate.
 
     Parameters
@@ -70,6 +65,8 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None) -> 
         From `read_exr`; pixels are not needed.
     overrides
         Role → name of a layer, as `ExrImage.layer` takes it; goes before what would be found.
+    profile
+        Whose names to look for; without, that of the renderer that the file seems to be from.
 
     Raises
     ------
@@ -86,6 +83,7 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None) -> 
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLES):
         raise ValueError(f"layer role {sorted(unknown)[0]!r} is unknown, expected one of {', '.join(ROLES)}")
+    taken = profile or find_profile(image)
 
     found: dict[str, Layer | None] = {}
     for role, name in overrides.items():
@@ -94,25 +92,68 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None) -> 
         if found[role] is None:
             raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {_NEEDS[role]}")
 
-    color = found.get("color") or _search(image, "color", None)
+    color = found.get("color") or _search(image, "color", None, taken) or _only_picture(image, taken)
     if color is None:
         raise ExrError(f"{image.path}: no color layer (--layer color=NAME); {image.listing()}")
     found["color"] = found["target"] = color
     for role in ROLES[1:]:
         if role not in found:
-            found[role] = _search(image, role, color)
-    if "alpha" not in overrides:
+            found[role] = _search(image, role, color, taken)
+    if found["alpha"] is None:
         whole = [x for x in image.layers if x.part == color.part and set(color.channels) <= set(x.channels)]
         found["alpha"] = _fit("alpha", whole[0], named=False) if whole else None
-    if "estimate" not in overrides and "noisy image" in _tails(image, color):
+    if "estimate" not in overrides and "noisyimage" in _tails(image, color):
         combined = [x for x in _same_group(image, color) if "combined" in _tails(image, x)]
         found["estimate"] = _fit("estimate", combined[0], named=True) if combined else None
         found["target"] = found["estimate"] or color
+    convention = _convention(found, taken)
+    return Layers(
+        **found,  # type: ignore[arg-type]
+        profile=taken.name,
+        reason=taken.why,
+        motion_convention=convention,
+        settled=taken.settled,
+        variance_scale=_variance_scale(image, taken),
+        view=color.view or (image.views[0] if image.views else None),
+        views=image.views,
+    )
 
-    motion = found["motion"]
-    convention = None if motion is None else CYCLES if len(motion.channels) == 4 else MotionConvention()
-    view = color.view or (image.views[0] if image.views else None)
-    return Layers(**found, motion_convention=convention, view=view, views=image.views)  # type: ignore[arg-type]
+
+def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConvention | None:
+    """What the vectors mean; where one of two layers is missing, the other is `motion` afterwards."""
+    motion, following = found["motion"], found["motion_next"]
+    if motion is None and following is None:
+        return None
+    if motion is not None and following is not None:
+        return replace(profile.convention(len(motion.channels)), direction="both")
+    found["motion"], found["motion_next"] = motion or following, None
+    convention = profile.convention(len((motion or following).channels))  # type: ignore[union-attr]
+    if following is not None:
+        return replace(convention, direction="next")
+    return replace(convention, direction="previous") if profile.layers.get("motion_next") else convention
+
+
+def _variance_scale(image: ExrImage, profile: Profile) -> float | None:
+    if profile.variance == "mean":
+        return 1.0
+    headers = [part.header for part in image.parts]
+    named = profile.samples or ""
+    samples = next((header[named] for header in headers if named in header), None)
+    try:
+        count = float(samples)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return None
+    return 1 / count if profile.variance == "sample" and count >= 1 else None
+
+
+def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:
+    """The one layer with R, G, B and A, or else with R, G and B, that no role has a name for; None of several."""
+    named = {name for role in ROLES for name in profile.names(role) if name}
+    layers = [x for x in image.layers if x.view in (None, *image.views[:1]) and not named & set(_tails(image, x))]
+    pictures = [layer for layer in layers if _fit("color", layer, named=True)]
+    opaque = [layer for layer in pictures if _fit("alpha", layer, named=False)]
+    only = opaque if len(opaque) == 1 else pictures
+    return _fit("color", only[0], named=True) if len(only) == 1 else None
 
 
 _NEEDS = {
@@ -121,7 +162,8 @@ _NEEDS = {
     "estimate": "it needs channels R, G and B",
     "normal": "it needs channels X, Y and Z, or R, G and B",
     "depth": "it needs one channel, or Z",
-    "motion": "it needs channels X, Y, Z and W, or two (X Y, U V or R G)",
+    "motion": "it needs channels X and Y, U and V, or R and G, or X, Y, Z and W",
+    "motion_next": "it needs channels X and Y, U and V, or R and G",
     "variance": "it needs channels R, G and B, or one channel",
     "half_a": "it needs channels R, G and B",
     "half_b": "it needs channels R, G and B",
@@ -135,7 +177,8 @@ _COMPONENTS = {
     "estimate": ["RGB"],
     "normal": ["XYZ", "RGB"],
     "depth": ["Z"],
-    "motion": ["XYZW", "XY", "UV", "RG"],
+    "motion": ["XYZW", "XYZ", "XY", "UV", "RGB", "RG"],
+    "motion_next": ["XYZ", "XY", "UV", "RGB", "RG"],
     "variance": ["RGB"],
     "half_a": ["RGB"],
     "half_b": ["RGB"],
@@ -157,15 +200,19 @@ def _fit(role: str, layer: Layer, *, named: bool) -> Layer | None:
     return None
 
 
-def _search(image: ExrImage, role: str, color: Layer | None) -> Layer | None:
-    """The layer whose name comes first in the table; the first of the file among equals."""
+def _search(image: ExrImage, role: str, color: Layer | None, profile: Profile) -> Layer | None:
+    """The layer whose name comes first in the profile; the first of the file among equals."""
     if color is None:
         layers = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
     else:
         layers = _same_group(image, color)
-    for name in _NAMES[role]:
-        for layer in layers:
-            if name in _tails(image, layer) and (fitted := _fit(role, layer, named=bool(name))):
+    named = [(_tails(image, layer), layer) for layer in layers]
+    # A bare channel may have a name too: depth, a.
+    bare = [layer for layer in layers if not layer.name]
+    named += [([plain_name(c)], Layer("", layer.part, layer.view, (c,))) for layer in bare for c in layer.channels]
+    for name in profile.names(role):
+        for tails, layer in named:
+            if name in tails and (fitted := _fit(role, layer, named=bool(name))):
                 return fitted
     return None
 
@@ -188,7 +235,7 @@ def _paths(image: ExrImage, layer: Layer) -> list[str]:
 
 
 def _tails(image: ExrImage, layer: Layer) -> list[str]:
-    return [path.rpartition(".")[2].lower() for path in _paths(image, layer)]
+    return [plain_name(path.rpartition(".")[2]) for path in _paths(image, layer)]
 
 
 # What each role is for, that is, what happens without it.
@@ -203,6 +250,12 @@ _LACK = {
 }
 
 
+def summarize_layers(layers: Layers) -> str:
+    """Say in one line what was taken."""
+    taken = [f"{role} {getattr(layers, role)}" for role in ROLES if getattr(layers, role) is not None]
+    return f"{layers.profile} ({layers.reason}): {', '.join(taken)}"
+
+
 def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
     """Rows for `ravg inspect`: role, channels taken or "missing", and what it means.
 
@@ -211,7 +264,7 @@ def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
     rows = []
     for role in ROLES:
         layer = getattr(layers, role)
-        if layer is None and role in ("half_a", "half_b"):
+        if layer is None and role in ("half_a", "half_b", "motion_next"):
             continue  # rare: nothing is wrong without them
         if layer is None:
             rows.append((role, "missing", _LACK[role]))
