@@ -46,6 +46,20 @@ def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarr
                 )  # fmt: skip
 
 
+@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+def _nearest(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
+    height, width, channels = image.shape
+    half = np.float32(0.5)
+    for y in prange(flow.shape[0]):
+        for x in range(width):
+            inside[y, x], x0, y0, x1, y1, fx, fy = locate(
+                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
+            )
+            row, column = y1 if fy >= half else y0, x1 if fx >= half else x0
+            for c in range(channels):
+                out[y, x, c] = image[row, column, c]
+
+
 @njit(inline="always")
 def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Weights of the samples at -1, 0, 1, 2 for a position t in [0, 1); they sum to 1."""
@@ -89,7 +103,7 @@ def _bicubic(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarra
                 out[y, x, c] = min(max(total, low), high)
 
 
-_KERNELS: dict[str, Callable] = {"bilinear": _bilinear, "bicubic": _bicubic}
+_KERNELS: dict[str, Callable] = {"nearest": _nearest, "bilinear": _bilinear, "bicubic": _bicubic}
 
 
 def warp(
@@ -105,8 +119,8 @@ def warp(
     flow
         (H, W, 2) float, pixels, x right then y down; or (h, W, 2), of some of the rows.
     interpolation
-        "bilinear", or "bicubic": Catmull-Rom clamped to the range of the four pixels around the position,
-        so that it never rings (nor goes below zero) beside a firefly.
+        "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position,
+        so that it never rings (nor goes below zero) beside a firefly; or "nearest", which leaves noise as it is.
     first_row
         The image's row that the first row of `flow` belongs to.
 

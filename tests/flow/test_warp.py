@@ -29,7 +29,7 @@ def bilinear_reference(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear", "bicubic"])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (6, 1, 2), (5, 5, 3), (13, 17, 10)])
 def test_no_motion_is_the_identity(interpolation: str, shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).normal(size=shape).astype(np.float32)
@@ -39,7 +39,7 @@ def test_no_motion_is_the_identity(interpolation: str, shape: tuple[int, ...]) -
     assert inside.all()
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear", "bicubic"])
 def test_whole_pixels_are_copied_and_spread_no_nan(interpolation: str) -> None:
     image = np.random.default_rng(1).random((9, 11), np.float32)
     image[4, 5] = np.nan
@@ -57,6 +57,20 @@ def test_bilinear_matches_the_definition() -> None:
     image, flow = rng.random((14, 19, 10), np.float32), random_flow(rng, 14, 19, 6)
     # float32 positions below 32 have steps of 2e-6, times a slope of at most 1.
     np.testing.assert_allclose(warp(image, flow)[0], bilinear_reference(image, flow), atol=1e-5)
+
+
+def test_nearest_takes_the_pixel_that_the_position_lies_on() -> None:
+    rng = np.random.default_rng(2)
+    image, flow = rng.random((14, 19, 3), np.float32), random_flow(rng, 14, 19, 6)
+    flow[3, 4] = np.nan
+    warped, inside = warp(image, flow, interpolation="nearest")
+    assert not inside[3, 4]
+    y, x = np.mgrid[:14, :19]
+    flow[3, 4] = -x[3, 4], -y[3, 4]  # what is not finite falls to the first pixel
+    # Half a pixel belongs to the next: np.rint would take the even one.
+    column = np.clip(np.floor(x + flow[..., 0] + 0.5), 0, 18).astype(int)
+    row = np.clip(np.floor(y + flow[..., 1] + 0.5), 0, 13).astype(int)
+    np.testing.assert_array_equal(warped, image[row, column])
 
 
 def test_bilinear_agrees_with_opencv() -> None:
@@ -107,7 +121,7 @@ def test_outside_has_the_edge_value_and_half_a_pixel_is_still_inside() -> None:
     np.testing.assert_array_equal(np.argwhere(~inside), [[1, 0], [2, 3]])
 
 
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear", "bicubic"])
 def test_vectors_that_are_not_finite_are_outside(interpolation: str) -> None:
     image = np.ones((5, 6, 2), np.float32)
     flow = np.zeros((5, 6, 2), np.float32)
