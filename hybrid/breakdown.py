@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.frames import Shot, open_shot, output_path
+from hybrid.files.frames import Shot, output_path
 from hybrid.files.pictures import encode_srgb, write_png
 from nlm.average import replace_nonfinite
 
@@ -96,8 +96,7 @@ def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> 
     names = frame_names(frames)
     number = shot.numbers[len(shot.numbers) // 2]
     layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
-    finished = open_shot(output_path(output, shot, number), aovs=layers)
-    denoised = finished.read(finished.numbers[0])
+    denoised = shot.remade({number: output_path(output, shot, number)}, aovs=layers).read(number)
     noisy, _ = replace_nonfinite(shot.read(number).color)
     exposure = np.float32(measure_exposure(noisy) / 0.18)
     rows = [

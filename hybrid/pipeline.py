@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
-from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.exr import ExrError, read_exr
-from hybrid.files.frames import Shot, open_shot, output_path
-from hybrid.files.pictures import encode_srgb, write_png
+from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import remove_leftovers
 from hybrid.plan import Plan
 from hybrid.timing import Timings
-from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
@@ -169,23 +166,3 @@ def _is_finished(path: Path, attributes: Mapping[str, str], sources: Iterable[Pa
     except (OSError, ExrError):
         return False
     return fresh and all(header.get(name) == value for name, value in attributes.items())
-
-
-def write_preview(shot: Shot, output: str | Path, path: Path) -> None:
-    """Write a PNG of the middle frame, noisy on the left and denoised on the right.
-
-    Parameters
-    ----------
-    shot : Shot
-        The input.
-    output : str or Path
-        Where `denoise_shot` has written.
-    path : Path
-        Of the PNG. Both halves are exposed alike, to a mean of 0.18 of the noisy frame, and sRGB encoded.
-    """
-    number = shot.numbers[len(shot.numbers) // 2]
-    noisy, _ = replace_nonfinite(shot.read(number).color)
-    finished = open_shot(output_path(output, shot, number))
-    denoised = finished.read(finished.numbers[0]).color
-    exposure = measure_exposure(noisy) / 0.18
-    write_png(path, encode_srgb(np.concatenate([noisy, denoised], axis=1) / np.float32(exposure)))

@@ -27,7 +27,9 @@ from hybrid.commands.options import (
     PixelsOption,
     PreviewOption,
     ProfileOption,
+    RateOption,
     ResumeOption,
+    SheetOption,
     ShotArgument,
     choose,
     import_neural,
@@ -52,6 +54,8 @@ def pseudoref(
     estimate: EstimateOption = "none",
     keep_estimates: KeepOption = None,
     preview: PreviewOption = None,
+    fps: RateOption = 24,
+    contact: SheetOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -76,7 +80,7 @@ def pseudoref(
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
-    _spare_input(opened, output, source.files, preview=preview)
+    _spare_input(opened, output, source.files, preview=preview, contact=contact)
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -96,7 +100,7 @@ def pseudoref(
             max_memory=max_memory,
         )
     )
-    _preview(opened, output, preview)
+    _look(opened, output, preview, fps, contact)
 
 
 def denoise(
@@ -127,6 +131,8 @@ def denoise(
     ] = None,
     aov: AovOption = None,
     preview: PreviewOption = None,
+    fps: RateOption = 24,
+    contact: SheetOption = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -175,7 +181,7 @@ def denoise(
         source = EstimateSource("none", None, "this network takes none")
     else:
         raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
-    _spare_input(opened, output, source.files, preview=preview, breakdown=breakdown)
+    _spare_input(opened, output, source.files, preview=preview, contact=contact, breakdown=breakdown)
     settings = {
         "layer": layer,
         "profile": profile,
@@ -207,7 +213,7 @@ def denoise(
         if breakdown is not None:
             denoiser.breakdown = Breakdown()
         _run(last)
-    _preview(opened, output, preview)
+    _look(opened, output, preview, fps, contact)
     if breakdown is not None and denoiser.breakdown is not None:
         write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
         if denoiser.breakdown.pixels:
@@ -222,8 +228,9 @@ def denoise(
 
 
 def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictures: Path | None) -> None:
-    """Refuse to write over a frame of the shot, or of estimates, before anything is made."""
+    """Refuse, before anything is made, to write over a frame of the shot or of estimates, and what is no preview."""
     from hybrid.files.frames import output_path
+    from hybrid.preview import check_preview, check_sheet
 
     for number in shot.numbers:
         frame = output_path(output, shot, number)
@@ -232,6 +239,10 @@ def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictu
     for option, path in pictures.items():
         if path is not None and shot.reads(path):
             raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
+    if (preview := pictures.get("preview")) is not None:
+        check_preview(preview)
+    if (contact := pictures.get("contact")) is not None:
+        check_sheet(contact)
 
 
 def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str) -> str:
@@ -407,10 +418,13 @@ def _denoise(job: Job, done: list[int]) -> None:
     )
 
 
-def _preview(shot: Shot, output: str, path: Path | None) -> None:
-    """Write the preview if one is asked for, and say so."""
-    from hybrid.pipeline import write_preview
+def _look(shot: Shot, output: str, preview: Path | None, fps: float, contact: Path | None) -> None:
+    """Write the preview and the sheet that are asked for, and say so."""
+    from hybrid.preview import write_contact_sheet, write_preview
 
-    if path is not None:
-        write_preview(shot, output, path)
-        typer.echo(f"wrote {path}", err=True)
+    if preview is not None:
+        write_preview(shot, output, preview, rate=fps)
+        typer.echo(f"wrote {preview}", err=True)
+    if contact is not None:
+        write_contact_sheet(shot, output, contact)
+        typer.echo(f"wrote {contact}", err=True)

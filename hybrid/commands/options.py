@@ -41,7 +41,14 @@ MotionOption = Annotated[
     ),
 ]
 PreviewOption = Annotated[
-    Path | None, typer.Option(help="a PNG to look at: the middle frame, noisy and denoised side by side")
+    Path | None,
+    typer.Option(
+        help="to look at: a .png of the middle frame, noisy and denoised, or a .mp4 or .webp of all as they play"
+    ),
+]
+RateOption = Annotated[float, typer.Option("--fps", min=1, max=240, help="frames per second of a preview that plays")]
+SheetOption = Annotated[
+    Path | None, typer.Option("--contact", metavar="PNG", help="a sheet of frames from all over the shot")
 ]
 OnOption = Annotated[
     list[str] | None, typer.Option("--stages", "--effects", metavar="NAME", help="run a stage, whatever the plan says")

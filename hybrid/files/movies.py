@@ -1,0 +1,117 @@
+"""Movies and loops to look at: MP4 by PyAV, animated WebP by Pillow."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hybrid.files.replace import replace_file
+
+Picture = NDArray[np.uint8]
+
+# The largest width or height of a picture: a movie fills a screen, a loop stands in a page.
+LARGEST = {".mp4": 1920, ".webp": 960}
+
+
+def check_movie(path: Path) -> None:
+    """Refuse what `write_movie` could not write, before any work is done.
+
+    Raises
+    ------
+    ValueError
+        If the name does not end in .mp4 or .webp.
+    ImportError
+        If it needs PyAV, and that is not installed.
+    """
+    if path.suffix.lower() not in LARGEST:
+        raise ValueError(f"{path} is no movie, expected a name that ends in {' or '.join(LARGEST)}")
+    if path.suffix.lower() == ".mp4" and importlib.util.find_spec("av") is None:
+        raise ImportError(f"{path} needs PyAV, which is not installed; expected: pip install 'ravg[video]'")
+
+
+def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
+    """Write a movie, as a whole or not at all, and make the folder.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in .mp4 (H.264, for any player and browser) or .webp (plays for ever in a page).
+    pictures : iterable of (H, W, 3) uint8 arrays
+        sRGB encoded, all of one size, at least one. Larger ones than `LARGEST` are made smaller.
+    rate : float
+        Pictures per second.
+
+    Raises
+    ------
+    ValueError, ImportError
+        As `check_movie`.
+    """
+    check_movie(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()
+    fitted = (_fit(picture, LARGEST[suffix]) for picture in pictures)
+    with replace_file(path) as temporary:
+        if suffix == ".mp4":
+            _write_mp4(temporary, fitted, rate)
+        else:
+            _write_webp(temporary, fitted, rate)
+
+
+def _fit(picture: Picture, largest: int) -> Picture:
+    height, width = picture.shape[:2]
+    scale = min(1.0, largest / max(height, width))
+    if scale == 1:
+        return picture
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+
+def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
+    first = next(pictures)
+    # H.264 with color at half resolution, which is what all players know, holds even sizes only.
+    height, width = (side + side % 2 for side in first.shape[:2])
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": "20", "preset": "veryfast"}
+        context = stream.codec_context
+        context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
+        context.color_primaries = context.color_trc = 1  # BT.709, as the matrix above
+        for picture in chain([first], pictures):
+            padding = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+            even = np.pad(picture, padding, mode="edge") if (height, width) != picture.shape[:2] else picture
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24").reformat(
+                format="yuv420p",
+                src_color_range=ColorRange.JPEG,
+                dst_color_range=ColorRange.MPEG,
+                dst_colorspace=Colorspace.ITU709,
+            )
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def _write_webp(path: Path, pictures: Iterator[Picture], rate: float) -> None:
+    first, *later = (Image.fromarray(picture) for picture in pictures)
+    # Whole milliseconds each, which add up to the true time.
+    ends = np.round(np.arange(len(later) + 2) * 1000 / rate).astype(int)
+    first.save(
+        path,
+        format="webp",
+        save_all=True,
+        append_images=later,
+        duration=np.diff(ends).tolist(),
+        loop=0,
+        quality=75,
+        method=2,
+    )
