@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from hybrid.simulate.run import missing, parse_center, parse_frames, parse_numbers, parse_size, shots_of, simulate
-from hybrid.simulate.shot import ShotSettings
+from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
 
 def simulate_command(
-    scene: Annotated[str, typer.Argument(help="A .blend file, random, or validation.")],
+    scene: Annotated[str, typer.Argument(help="A .blend file, random, hard, validation, test, or one as test:NAME.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the frames and meta.json.")],
     frames: Annotated[str, typer.Option(help="How many, or FIRST-LAST.")] = "7",
     size: Annotated[str, typer.Option(help="Of what is rendered, WxH.")] = "320x180",
@@ -38,8 +38,9 @@ def simulate_command(
     python: Annotated[str | None, typer.Option(help="A Python that has bpy, if this one has not.")] = None,
 ) -> None:
     """Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for."""
-    if scene not in ("random", "validation") and not Path(scene).is_file():
-        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file, random or validation")
+    known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]
+    if scene not in known and not Path(scene).is_file():
+        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or one of {', '.join(known)}")
     if jobs < 1:
         raise ValueError(f"jobs: got {jobs}, expected at least 1")
     first = ShotSettings(
@@ -106,7 +107,7 @@ def _one_line(description: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the command by itself: `python -m hybrid.simulate.run`."""
+    """Run the command by itself: `python -m hybrid.commands.simulate`."""
     application = typer.Typer(pretty_exceptions_enable=False)
     application.command()(simulate_command)
     try:

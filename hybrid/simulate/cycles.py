@@ -20,9 +20,10 @@ import bpy
 import numpy as np
 import OpenEXR
 
-from hybrid.simulate import scenes, validation
+from hybrid.simulate import scenes
 from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
-from hybrid.simulate.shot import ShotSettings, frame_seed
+from hybrid.simulate.fixed import fixed_shot
+from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, frame_seed
 
 PILOT_SAMPLES = 8
 PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
@@ -124,10 +125,10 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
     """Make the scene of a shot in Blender, ready to be planned, and return its description."""
-    if shot.scene == "random":
+    if shot.scene in RANDOM:
         description = scenes.random_shot(shot, attempt)
-    elif shot.scene.startswith("validation:"):
-        description = validation.validation_shot(shot)
+    elif shot.scene.partition(":")[0] in FIXED:
+        description = fixed_shot(shot)
     else:
         description = scenes.open_shot(shot)
     settings = EVERYTHING if shot.effects == "all" else {**EVERYTHING, **dict.fromkeys(PASSES, False)}
@@ -149,7 +150,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
         description = build(shot, attempt, threads)
         scene = bpy.context.scene
         scene.frame_set(middle)
-        if shot.scene != "random":
+        if shot.scene not in RANDOM:
             break
         passes = render_small(scene, {}, PILOT_SAMPLES, 1)
         worth = scenes.worth_rendering(passes)

@@ -6,7 +6,7 @@ Speeds are drawn in pixels of the film per frame, and turned into keys by measur
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
@@ -160,7 +160,7 @@ def screen_axes(scene: Any, position: Vector) -> tuple[Vector, Vector]:
     return right * pixel, -up * pixel
 
 
-def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None) -> Any:
+def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None, kind: str | None = None) -> Any:
     """Add a thing that floats in the rendered region, between the camera and what lies behind."""
     scene = bpy.context.scene
     points = visible_points(scene)
@@ -169,7 +169,7 @@ def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None) -> Any:
     behind = points[int(rng.integers(len(points)))][0] if points else eye + 5 * forward
     position = eye + float(rng.uniform(0.45, 0.85)) * (behind - eye)
     across, _ = screen_axes(scene, position)
-    item = add_thing(rng, material(rng, surface), "box" if surface == "mirror" else None)
+    item = add_thing(rng, material(rng, surface), "box" if surface == "mirror" else kind)
     size = across.length * shot.size[1] * log_uniform(rng, 0.2, 0.7)
     item.scale = (size, 0.05 * size, size) if surface == "mirror" else (size, size, size)
     item.location = position
@@ -177,12 +177,12 @@ def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None) -> Any:
     return item
 
 
-def move_object(rng: Rng, shot: ShotSettings, item: Any) -> dict[str, Any]:
+def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None) -> dict[str, Any]:
     """Key an object's motion: along a line, swinging, turning, deforming; a few pixels a frame, at most 40."""
     scene = bpy.context.scene
     middle = shot.frames[len(shot.frames) // 2]
     pixels = log_uniform(rng, 1, 20) if rng.random() < 0.85 else log_uniform(rng, 10, 40)
-    kind = choose(rng, {"line": 4, "swing": 1.5, "turn": 2.5, "deform": 1.5 if item.type == "MESH" else 0})
+    kind = kind or choose(rng, {"line": 4, "swing": 1.5, "turn": 2.5, "deform": 1.5 if item.type == "MESH" else 0})
     right, down = screen_axes(scene, item.matrix_world.translation)
     angle = rng.uniform(0, 2 * math.pi)
     toward = Vector(scene.camera.matrix_world.to_3x3().col[2]) * right.length * float(rng.normal(0, 0.7))
@@ -292,3 +292,21 @@ def add_motion(rng: Rng, shot: ShotSettings, own_things: bool) -> dict[str, Any]
         pixels = log_uniform(rng, 1, 12 if small else 25)
         found["camera_pixels"] = round(move_camera(rng, shot, found["camera"], pixels), 2)
     return found
+
+
+def look(eye: Sequence[float], focus: Sequence[float], lens: float) -> Any:
+    """Stand the camera at `eye`, looking at `focus`."""
+    camera = bpy.context.scene.camera
+    camera.data.lens, camera.location = lens, eye
+    camera.rotation_euler = (Vector(focus) - Vector(eye)).to_track_quat("-Z", "Y").to_euler()
+    return camera
+
+
+def move(item: Any, frames: range, velocity: Sequence[float] = (0, 0, 0), spin: Sequence[float] = (0, 0, 0)) -> None:
+    """Key steady motion, in metres and radians per frame; where the item stands now is where it is in the middle."""
+    place, turn, middle = Vector(item.location), Vector(item.rotation_euler), frames[len(frames) // 2]
+    for frame in frames:
+        item.location = place + Vector(velocity) * (frame - middle)
+        item.rotation_euler = turn + Vector(spin) * (frame - middle)
+        item.keyframe_insert("location", frame=frame)
+        item.keyframe_insert("rotation_euler", frame=frame)

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hybrid.simulate.shot import VALIDATION, ShotSettings, parse_levels, spp_of
+from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, spp_of
 
 NO_BLENDER = (
     "Blender's Python module (bpy) is not installed in {python}: `pip install ravg[simulate]` with Python 3.11, "
@@ -130,7 +130,7 @@ def _read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
         # More frames may be asked for; the ones there were rendered with the plan that is there.
         if name != "frames" and meta["shot"].get(name) != value:
             raise ValueError(f"{out}: holds a shot with {name} {meta['shot'].get(name)!r}, expected {value!r}")
-    if meta["shot"]["frames"] != asked["frames"] and shot.scene == "random":
+    if meta["shot"]["frames"] != asked["frames"] and shot.scene in RANDOM:
         raise ValueError(f"{out}: holds a random shot of other frames; its motion is drawn for them")
     return {**meta, "shot": asked}
 
@@ -210,16 +210,19 @@ def shots_of(
 ) -> list[tuple[ShotSettings, Path]]:
     """Return `count` shots with seeds that count up from that of `first`, and their folders.
 
-    One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` into `out/NAME`. Samples
-    given as a range are drawn per shot.
+    One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` and `test` into `out/NAME`.
+    Samples given as a range are drawn per shot.
     """
     if count < 1:
         raise ValueError(f"shots: got {count}, expected at least 1")
-    if scene == "validation":
+    kind, _, name = scene.partition(":")
+    if kind in FIXED:
         if count > 1:
-            raise ValueError(f"shots: got {count}, expected 1, as the validation shots are fixed")
+            raise ValueError(f"shots: got {count}, expected 1, as the {kind} shots are fixed")
         chosen = parse_levels(levels, spp_of(spp, first.seed))
-        return [(replace(first, scene=f"validation:{name}", levels=chosen), out / name) for name in VALIDATION]
+        if name:
+            return [(replace(first, levels=chosen), out)]
+        return [(replace(first, scene=f"{kind}:{name}", levels=chosen), out / name) for name in FIXED[kind]]
     shots = []
     for seed in range(first.seed, first.seed + count):
         shot = replace(first, seed=seed, levels=parse_levels(levels, spp_of(spp, seed)))

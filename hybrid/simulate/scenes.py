@@ -17,7 +17,8 @@ import numpy as np
 from mathutils import Vector
 
 from hybrid.simulate.effects import visible_points
-from hybrid.simulate.motion import MARGIN, add_motion, aim_crop, place_camera, set_crop
+from hybrid.simulate.motion import MARGIN, add_motion, aim_crop, move_object, place_camera, set_crop, spawn
+from hybrid.simulate.props import fill_with_smoke, fur, hair_material
 from hybrid.simulate.shot import ShotSettings
 from hybrid.simulate.things import (
     Rng,
@@ -254,12 +255,24 @@ SETS: dict[str, tuple[float, Callable[[Rng], View]]] = {
 }
 
 
+HARD = {"hair": 0.21, "glass": 0.21, "metal": 0.19, "lens": 0.19, "volume": 0.06, "dim": 0.14}
+HAIRY = {"sphere": 2.0, "monkey": 1.0, "blob": 1.0}
+SHAPES = {"turned": 4, "sphere": 1, "torus": 1.5, "monkey": 1.5, "box": 1, "cage": 1, "blob": 1, "text": 0.5}
+
+
 def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
     """Build a random shot in an empty Blender scene; return what it came to be.
 
-    Every attempt with one seed is another shot: when the first shows nothing, the next is tried.
+    Every attempt with one seed is another shot: when the first shows nothing, the next is tried. A shot of `hard` is
+    one of `random` with one to three of `HARD` in it.
     """
     rng = np.random.default_rng([shot.seed, attempt])
+    # Drawn apart, so that the same seeds give the same random shots with what is hard and without.
+    hard_rng = np.random.default_rng([shot.seed, attempt, 1])
+    hard: list[str] = []
+    if shot.scene == "hard":
+        count = int(hard_rng.choice([1, 2, 3], p=[0.45, 0.4, 0.15]))
+        hard = sorted(hard_rng.choice(list(HARD), count, replace=False, p=list(HARD.values())).tolist())
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
@@ -272,22 +285,111 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
     center = shot.center or (0.5, 0.5)
     if shot.center is None and film != shot.size:
         center = aim_crop(rng, shot, film)
-    if rng.random() < 0.15:
+    added = [motion for name in hard for motion in make_hard(hard_rng, shot, name)]
+    if rng.random() < 0.15 or "lens" in hard:
         points = visible_points(scene)
         focus = (points[int(rng.integers(len(points)))][0] - camera.location).length if points else 3.0
         camera.data.dof.use_dof, camera.data.dof.focus_distance = True, focus
         camera.data.dof.aperture_fstop = log_uniform(rng, 0.7, 5.6)
+        if "lens" in hard:
+            open_aperture(camera, [(position - camera.location).length for position, _ in points],
+                          log_uniform(hard_rng, 4, 25) / film[0])  # fmt: skip
     if rng.random() < 0.04:
         density = log_uniform(rng, 0.1, 0.6) / (view.focus - view.eye).length  # so deep is the fog up to the focus
         fill_with_fog((0, 0, 4), (28, 28, 9), density, rng.uniform(0, 0.7))
     motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_things=True)
     return {
         "set": kind,
+        **({"hard": hard, "added": added} if hard else {}),
         "film": list(film),
         "center": [round(c, 4) for c in center],
         "lens": camera.data.lens,
         **motion,
     }
+
+
+def open_aperture(camera: Any, distances: Sequence[float], blur: float) -> None:
+    """Open the aperture until what is farthest out of focus is a disc of `blur` times the picture's width."""
+    data = camera.data
+    # The disc's diameter on the sensor is that of the aperture times lens · |1/focus − 1/distance|.
+    apart = max((abs(1 / data.dof.focus_distance - 1 / distance) for distance in distances), default=0.0)
+    diameter = blur * data.sensor_width / data.lens / max(apart, 1e-3)  # metres; a flat picture has no blur to make
+    data.dof.aperture_fstop = max(data.lens / 1000 / diameter, 0.1)
+
+
+def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
+    """Put one of `HARD` into a scene whose camera stands; return how what was added moves.
+
+    An open aperture is up to `random_shot`; for it, things are added that float before and behind the focus.
+    """
+    scene = bpy.context.scene
+    first, last = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
+    if name == "dim":
+        dim(rng)
+        return []
+    if name == "volume":
+        points = visible_points(scene)
+        eye = scene.camera.matrix_world.translation
+        focus = points[int(rng.integers(len(points)))][0] if points else Vector((0, 0, 0.5))
+        distance = (focus - eye).length
+        deep = log_uniform(rng, 0.15, 1.0) / distance  # so deep up to what is looked at
+        if rng.random() < 0.5:
+            fill_with_fog((0, 0, 4), (28, 28, 9), deep, rng.uniform(0, 0.7))
+        else:
+            scale = log_uniform(rng, 1, 5) / distance
+            fill_with_smoke(range(first, last + 1), (0, 0, 4), (28, 28, 9), (0.2 * deep, 2 * deep), scale,
+                            rng.uniform(0, 0.7))  # fmt: skip
+        # A beam through it, from the side, between the camera and what it looks at.
+        aim = eye.lerp(focus, float(rng.uniform(0.5, 1)))
+        side = Vector(scene.camera.matrix_world.to_3x3().col[0]) * float(rng.choice([-1, 1]) * rng.uniform(0.4, 1))
+        source = aim + distance * (side + Vector((0, 0, rng.uniform(0.2, 0.9))))
+        beam = add_lamp("SPOT", source, 400 * distance**2 * log_uniform(rng, 0.3, 3), 0.02 * distance, aim, warm(rng))
+        beam.data.spot_size, beam.data.spot_blend = float(rng.uniform(0.12, 0.6)), float(rng.uniform(0, 0.4))
+        return []
+    surfaces = {"hair": ("diffuse",), "glass": ("glass",), "metal": ("metal", "metal", "mirror"), "lens": (None,)}[name]
+    motions = []
+    for _ in range(int(rng.integers(2, 5))):
+        surface = surfaces[int(rng.integers(len(surfaces)))]
+        item = spawn(rng, shot, surface, choose(rng, HAIRY if name == "hair" else SHAPES))
+        if name == "hair":
+            if rng.random() < 0.7:
+                coat = hair_material(float(rng.uniform(0.05, 0.95)), float(rng.uniform(0, 1)), rng.uniform(0.15, 0.5))
+            else:
+                coat = material(rng, "diffuse")
+            lean, length = [*rng.normal(0, 0.3, 2), rng.normal(-0.4, 0.3)], log_uniform(rng, 0.06, 0.35)
+            fur(rng, item, int(log_uniform(rng, 3000, 16000)), length, coat, radius=log_uniform(rng, 0.0012, 0.005),
+                lean=lean, wave=rng.uniform(0, 0.6), clumps=int(log_uniform(rng, 40, 400)),
+                clump=rng.uniform(0, 0.8))  # fmt: skip
+        if rng.random() < 0.75:
+            motions.append(move_object(rng, shot, item, "turn" if name == "metal" else None))
+    return motions
+
+
+def dim(rng: Rng) -> None:
+    """Put out all lights of a scene, and light it by small bulbs instead, some of them in the picture."""
+    scene = bpy.context.scene
+    for item in [item for item in scene.objects if item.type == "LIGHT"]:
+        bpy.data.objects.remove(item)
+    set_world(rng, "none", 0)
+    eye = scene.camera.matrix_world.translation
+    points = [position for position, _ in visible_points(scene)] or [Vector((0, 0, 0.5))]
+    distance = float(np.median([(position - eye).length for position in points]))
+    shades = [material(rng, "emission") for _ in range(3)]
+    for shade in shades:
+        inputs = shade.node_tree.nodes["Principled BSDF"].inputs
+        inputs["Emission Color"].default_value = (*warm(rng), 1)
+        inputs["Emission Strength"].default_value = log_uniform(rng, 50, 500)
+    for number in range(int(log_uniform(rng, 5, 40))):
+        # In front of what is seen and around it, as far as the picture is wide.
+        behind = points[int(rng.integers(len(points)))]
+        where = eye.lerp(behind, float(rng.uniform(0.6, 0.95))) + Vector(rng.normal(0, 0.12 * distance, 3))
+        where.z = max(where.z, 0.03)
+        radius = distance * log_uniform(rng, 0.002, 0.01)
+        if number % 2:
+            add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
+        else:
+            bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, radius=radius, location=where)
+            bpy.context.active_object.data.materials.append(shades[number // 2 % 3])
 
 
 def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:

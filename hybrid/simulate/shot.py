@@ -9,7 +9,12 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-VALIDATION = ("table", "night", "garden")  # the shots of `validation`
+RANDOM = ("random", "hard")  # shots that are drawn from the seed; the second kind holds what is hard to denoise
+# The fixed shots, by kind: to choose by, and to judge on.
+FIXED = {
+    "validation": ("table", "night", "garden"),
+    "test": ("lens", "closeup", "lamps", "shadow", "volume"),
+}
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,7 @@ class ShotSettings:
     may be None: drawn from the seed for random shots, else the whole picture of the scene's own camera.
     """
 
-    scene: str  # a .blend file, "random", or "validation:NAME"
+    scene: str  # a .blend file, one of RANDOM, or "KIND:NAME", a fixed shot
     seed: int
     frames: tuple[int, ...]
     size: tuple[int, int]

@@ -11,11 +11,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
-import numpy as np
 from mathutils import Vector
 
-from hybrid.simulate.motion import MARGIN, set_crop
-from hybrid.simulate.shot import ShotSettings
+from hybrid.simulate.motion import look, move
+from hybrid.simulate.props import plain
 from hybrid.simulate.things import (
     Rng,
     add_box,
@@ -27,52 +26,6 @@ from hybrid.simulate.things import (
     material,
     set_world,
 )
-
-
-def validation_shot(shot: ShotSettings) -> dict[str, Any]:
-    """Build the validation shot that `shot.scene` names, `validation:NAME`; return its description."""
-    name = shot.scene.partition(":")[2]
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
-    scene.render.resolution_x, scene.render.resolution_y = shot.film or shot.size
-    scene.camera = add_object("camera", bpy.data.cameras.new("camera"), None)
-    frames = range(scene.frame_start, scene.frame_end + 1)
-    # The drawings on things are the same whatever the seed of the samples.
-    SHOTS[name](np.random.default_rng(7), frames)
-    film, center = shot.film or shot.size, shot.center or (0.5, 0.5)
-    set_crop(scene.render, film, shot.size, center)
-    scene.frame_set(shot.frames[len(shot.frames) // 2])
-    return {"validation": name, "film": list(film), "center": list(center)}
-
-
-def plain(name: str, color: Sequence[float], **inputs: float) -> Any:
-    """Make a material of one colour; `inputs` are those of the Principled shader, blanks as underscores."""
-    made = bpy.data.materials.new(name)
-    made.use_nodes = True
-    shader = made.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = (*color, 1)
-    for key, value in inputs.items():
-        shader.inputs[key.replace("_", " ")].default_value = value
-    return made
-
-
-def look(eye: Sequence[float], focus: Sequence[float], lens: float) -> Any:
-    """Stand the camera at `eye`, looking at `focus`."""
-    camera = bpy.context.scene.camera
-    camera.data.lens, camera.location = lens, eye
-    camera.rotation_euler = (Vector(focus) - Vector(eye)).to_track_quat("-Z", "Y").to_euler()
-    return camera
-
-
-def move(item: Any, frames: range, velocity: Sequence[float] = (0, 0, 0), spin: Sequence[float] = (0, 0, 0)) -> None:
-    """Key steady motion, in metres and radians per frame; where the item stands now is where it is in the middle."""
-    place, turn, middle = Vector(item.location), Vector(item.rotation_euler), frames[len(frames) // 2]
-    for frame in frames:
-        item.location = place + Vector(velocity) * (frame - middle)
-        item.rotation_euler = turn + Vector(spin) * (frame - middle)
-        item.keyframe_insert("location", frame=frame)
-        item.keyframe_insert("rotation_euler", frame=frame)
 
 
 def put(item: Any, place: Sequence[float], size: float, turn: float = 0.0) -> Any:

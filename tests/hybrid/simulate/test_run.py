@@ -143,15 +143,26 @@ def test_a_data_set_is_many_seeds_each_in_its_folder(tmp_path):
     assert [folder.name for _, folder in shots] == ["random_0003", "random_0004", "random_0005"]
     assert all(shot.levels["a"] == shot.levels["b"] > shot.levels["c"] for shot, _ in shots)
     assert shots_of("random", tmp_path, 1, "8", "n", SHOT)[0][1] == tmp_path
+    hard = shots_of("hard", tmp_path, 2, "8", "n", replace(SHOT, scene="hard"))
+    assert [(shot.scene, folder.name) for shot, folder in hard] == [("hard", "hard_0003"), ("hard", "hard_0004")]
 
 
-def test_validation_is_three_fixed_shots(tmp_path):
-    shots = shots_of("validation", tmp_path, 1, "8", "n", SHOT)
-    assert [(shot.scene, folder.name) for shot, folder in shots] == [
-        (f"validation:{name}", name) for name in ("table", "night", "garden")
-    ]
-    with pytest.raises(ValueError, match="shots: got 2"):
-        shots_of("validation", tmp_path, 2, "8", "n", SHOT)
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("validation", ["table", "night", "garden"]),
+        ("test", ["lens", "closeup", "lamps", "shadow", "volume"]),
+    ],
+)
+def test_fixed_shots_come_all_together_or_one_by_one(kind, names, tmp_path):
+    shots = shots_of(kind, tmp_path, 1, "32", "noisy=n,half=n/e", SHOT)
+    assert [(shot.scene, folder) for shot, folder in shots] == [(f"{kind}:{name}", tmp_path / name) for name in names]
+    first = replace(SHOT, scene=f"{kind}:{names[0]}")
+    assert shots_of(first.scene, tmp_path, 1, "32", "noisy=n,half=n/e", first) == [(shots[0][0], tmp_path)]
+    assert shots[0][0].levels == {"noisy": 32, "half": 11}
+    for scene in (kind, first.scene):
+        with pytest.raises(ValueError, match=f"shots: got 2, expected 1, as the {kind} shots are fixed"):
+            shots_of(scene, tmp_path, 2, "8", "n", first)
 
 
 def test_a_shot_is_rendered_and_described(tmp_path, stub):
@@ -208,6 +219,10 @@ def test_without_blender_the_message_says_how_to_get_it(stub):
 def test_a_missing_scene_is_one_line(tmp_path):
     with pytest.raises(FileNotFoundError, match="no file"):
         simulate_command(str(tmp_path / "no.blend"), tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=r"no file test:lense; expected a \.blend file or one of random, .*test:lens"
+    ):
+        simulate_command("test:lense", tmp_path)
 
 
 def test_importing_the_command_loads_no_renderer():

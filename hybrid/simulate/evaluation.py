@@ -1,0 +1,477 @@
+"""Five fixed shots to judge on, never to train on: what time helps least, framed as film frames it.
+
+*lens*: a table through an open aperture; things move in focus, behind it, and through it. *closeup*: hair, cut glass
+and turning metal. *lamps*: a pan over a dim bar of many small lamps. *shadow*: sunlight that wanders over a wall, a
+pendulum and leaves that sway in it. *volume*: a fan that turns in front of a light, in smoke. Where there is a sky, it
+is Blender's *courtyard* or *night*, which random shots never take. Units are metres, z is up; made for a camera of
+1920×1080 pixels, of which the middle is rendered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from hybrid.simulate.motion import look, move
+from hybrid.simulate.props import (
+    bevelled,
+    bottle,
+    curtain,
+    fill_with_smoke,
+    fur,
+    gear,
+    glow,
+    hair_material,
+    leaf_shape,
+    node,
+    place,
+    plain,
+    printed,
+    turned,
+    two_tone,
+    wire,
+    wood,
+)
+from hybrid.simulate.things import Rng, add_box, add_lamp, add_mesh, add_object
+
+WARM, COOL = (1.0, 0.62, 0.3), (0.62, 0.78, 1.0)
+
+
+def sky(name: str, strength: float, turn: float = 0.0) -> None:
+    """Light the scene by one of Blender's images of the sky."""
+    scene = bpy.context.scene
+    scene.world = bpy.data.worlds.new("world")
+    scene.world.use_nodes = True
+    scene.world.cycles.sampling_method, scene.world.cycles.sample_map_resolution = "MANUAL", 1024
+    tree = scene.world.node_tree
+    where = node(tree, "TexCoord").outputs["Generated"]
+    image = node(tree, "TexEnvironment", Vector=node(tree, "Mapping", Vector=where, Rotation=(0, 0, turn)).outputs[0])
+    folder = Path(bpy.utils.system_resource("DATAFILES", path="studiolights/world"))
+    image.image = bpy.data.images.load(str(folder / f"{name}.exr"))
+    background = tree.nodes["Background"]
+    background.inputs["Strength"].default_value = strength
+    tree.links.new(image.outputs["Color"], background.inputs["Color"])
+
+
+def dark() -> None:
+    """Give the scene a black world."""
+    bpy.context.scene.world = bpy.data.worlds.new("world")
+    bpy.context.scene.world.use_nodes = True
+    bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0
+
+
+def swing(item: Any, frames: range, axis: str, reach: float, rate: float, phase: float = 0.0) -> None:
+    """Key a pendulum's turn around its origin: `reach` radians to each side, `rate` radians of phase a frame."""
+    rest = getattr(item.rotation_euler, axis)
+    for frame in frames:
+        setattr(item.rotation_euler, axis, rest + reach * math.sin(phase + rate * (frame - frames[len(frames) // 2])))
+        item.keyframe_insert("rotation_euler", frame=frame)
+
+
+def twig(rng: Rng, leaves: int, length: float, surface: Any, stem: Any, size: float) -> Any:
+    """Add a twig along x with leaves on both sides; return its stem, which the leaves go with."""
+    bend = [(length * t, 0, 0.08 * length * math.sin(2.5 * t)) for t in np.linspace(0, 1, 6)]
+    made = wire(bend, 0.012 * size + 0.0008, stem, "twig")
+    for k in range(leaves):
+        t = 0.15 + 0.85 * k / max(leaves - 1, 1)
+        item = leaf_shape(size * float(rng.uniform(0.8, 1.15)), 0.42 * size, surface)
+        side = 0.0 if k == leaves - 1 else (1.0 if k % 2 else -1.0) * float(rng.uniform(0.7, 1.1))
+        place(item, (length * t, 0, 0.08 * length * math.sin(2.5 * t)), (float(rng.normal(0, 0.5)), -0.35, side))
+        item.parent = made
+    return made
+
+
+def lens(rng: Rng, frames: range) -> None:
+    """Build a café table at dusk: a top that spins in focus, a marble that rolls through it, lights far behind."""
+    sky("night", 0.6, 1.0)
+    boards = [wood(light=(0.34 * f, 0.17 * f, 0.07 * f)) for f in (0.7, 1.0, 0.85, 1.15)]
+    for k in range(-4, 5):
+        board = bevelled((0, 0.11 * k + 0.02, -0.012), (2.4, 0.108, 0.024), boards[k % 4], 0.002, "board")
+        board.location.x = float(rng.uniform(-0.3, 0.3))
+    china = plain("china", (0.78, 0.76, 0.72), Roughness=0.12, Coat_Weight=0.6, Coat_Roughness=0.05)
+    blue = plain("glaze", (0.03, 0.09, 0.24), Roughness=0.1, Coat_Weight=1.0)
+    silver = plain("silver", (0.9, 0.88, 0.85), Metallic=1.0, Roughness=0.12)
+    brass = two_tone("brass", (0.62, 0.38, 0.12), (0.9, 0.62, 0.25), scale=60, stretch=(1, 1, 12), Metallic=1.0,
+                     roughness=(0.12, 0.3))  # fmt: skip
+    saucer = [(0, 0.004), (0.022, 0.002), (0.024, 0), (0.03, 0.002), (0.052, 0.012), (0.057, 0.016), (0.0555, 0.0175),
+              (0.05, 0.014), (0.028, 0.0045), (0, 0.0045)]  # fmt: skip
+    place(turned(saucer, china, name="saucer"), (-0.046, 0.02, 0))
+    place(turned([(0.0537, 0.0158), (0.0571, 0.0182)], blue, name="line"), (-0.046, 0.02, 0.0003))
+    cup = [(0, 0.006), (0.017, 0.006), (0.019, 0.005), (0.021, 0.008), (0.029, 0.024), (0.0325, 0.045), (0.034, 0.055),
+           (0.033, 0.0557), (0.0315, 0.045), (0.028, 0.025), (0.019, 0.0105), (0, 0.0095)]  # fmt: skip
+    place(turned(cup, china, name="cup"), (-0.046, 0.02, 0))
+    place(turned([(0.0331, 0.0478), (0.0338, 0.0532)], blue, name="line"), (-0.046, 0.02, 0))
+    coffee = two_tone("coffee", (0.012, 0.004, 0.002), (0.28, 0.13, 0.045), scale=90, edges=(0.42, 0.6), Roughness=0.08)
+    place(turned([(0.0315, 0.0), (0.012, 0.0004), (0, 0.0004)], coffee, name="coffee"), (-0.046, 0.02, 0.0455))
+    handle = [(0.031, 0.044), (0.044, 0.05), (0.053, 0.043), (0.052, 0.03), (0.042, 0.02), (0.027, 0.02)]
+    ear = wire([(x, 0, z) for x, z in handle], 0.0032, china, "handle")
+    place(ear, (-0.046, 0.02, 0), (0, 0, math.pi + 0.5))
+    spoon = turned([(0, -0.5), (0.35, -0.42), (0.5, 0), (0.35, 0.42), (0, 0.5)], silver, name="spoon")
+    place(spoon, (0.006, -0.018, 0.016), (math.pi / 2, 0.12, 0.55))
+    spoon.scale = (0.016, 0.004, 0.026)
+    stick = wire([(0.016, -0.034, 0.0165), (0.045, -0.083, 0.0125), (0.07, -0.13, 0.004)], 0.0013, silver, "handle")
+    place(stick, (-0.004, 0.007, 0))
+    roast = two_tone("bean", (0.03, 0.012, 0.005), (0.13, 0.055, 0.02), scale=300, roughness=(0.3, 0.5), bump=0.0002)
+    bean = turned([(0, -0.5), (0.3, -0.4), (0.42, 0), (0.3, 0.4), (0, 0.5)], roast, 24, "bean")
+    for k in range(34):
+        item = bean if k == 0 else add_object("bean", bean.data, None)
+        x, y = float(rng.normal(0.075, 0.05)), float(rng.normal(0.05, 0.07))
+        x += 0.06 * (x < 0.06 and y < 0.03)  # there the marble rolls
+        place(item, (x, y, 0.0028), (math.pi / 2, float(rng.uniform(0, 6)), float(rng.uniform(0, 6))))
+        item.scale = (0.0085, 0.0062, 0.0105)
+    # The top stands in the plane of focus and spins; its marks show it.
+    top = turned([(0, 0), (0.0012, 0.004), (0.004, 0.0085), (0.0135, 0.014), (0.0145, 0.0165), (0.012, 0.019),
+                  (0.004, 0.0205), (0.0022, 0.023), (0.002, 0.033), (0, 0.034)], brass, name="top")  # fmt: skip
+    for k in range(5):
+        mark = turned([(0, -0.0006), (0.0016, -0.0006), (0.0018, 0.0004), (0, 0.0008)], blue, 20, "mark")
+        place(mark, (0.0098 * math.cos(1.2566 * k), 0.0098 * math.sin(1.2566 * k), 0.0192), (0, 0.1, 0))
+        mark.parent = top
+    place(top, (0.056, 0.0, 0), (0.1, 0.06, 0))
+    move(top, frames, velocity=(0.0007, 0.0003, 0), spin=(0, 0, 0.22))
+    swirl = two_tone("swirl", (0.5, 0.03, 0.02), (0.9, 0.75, 0.5), scale=45, stretch=(1, 1, 3), distortion=2.5,
+                     edges=(0.46, 0.54), Roughness=0.05, Coat_Weight=1.0)  # fmt: skip
+    marble = turned([(0.0085 * math.sin(a), -0.0085 * math.cos(a)) for a in np.linspace(0, math.pi, 24)], swirl,
+                    name="marble")  # fmt: skip
+    place(marble, (0.034, -0.03, 0.0085))
+    move(marble, frames, velocity=(-0.0016, 0.008, 0), spin=(-0.94, -0.19, 0))
+    # Behind, lower than the table: a glass at its edge, candles and lamps of the room, a lantern that is carried by.
+    tumbler = plain("glass", (1, 1, 1), Roughness=0, Transmission_Weight=1, IOR=1.45)
+    glass = [(0, 0), (0.03, 0), (0.036, 0.09), (0.0345, 0.09), (0.029, 0.008), (0, 0.007)]
+    place(turned(glass, tumbler, name="glass"), (0.1, 0.33, 0.0))
+    wall = two_tone("plaster", (0.09, 0.055, 0.04), (0.2, 0.13, 0.1), scale=3, bump=0.002)
+    add_box((0, 4.6, 0), (8, 0.1, 4), wall)
+    shelf = wood(gloss=0.5)
+    for row, height in enumerate((-0.62, -0.3, 0.02)):
+        add_box((0, 4.4, height), (6, 0.3, 0.03), shelf)
+        for k in range(40):
+            tone = ((0.3, 0.12, 0.05), (0.08, 0.2, 0.12), (0.45, 0.35, 0.2), (0.1, 0.13, 0.3))[int(rng.integers(4))]
+            made = plain("ware", tone, Roughness=0.25)
+            place(bottle(int(rng.integers(5)), made), (-2.1 + 0.108 * k + 0.02 * row, 4.35, height + 0.015), size=0.85)
+    ball = [(0.014 * math.sin(a), -0.014 * math.cos(a)) for a in np.linspace(0, math.pi, 9)]
+    for k in range(24):
+        y = float(rng.uniform(1.2, 3.9))
+        x, z = float(rng.uniform(-0.16, 0.16)) * (y + 0.9), 0.115 - (y + 0.85) * float(rng.uniform(0.02, 0.1))
+        hue = (WARM, (1, 0.8, 0.55), (1, 0.35, 0.16), COOL)[k % 4]
+        place(turned(ball, glow(hue, float(rng.uniform(1.2, 5))), 20, "bulb"), (x, y, z))
+    lantern = turned([(2 * r, 2 * z) for r, z in ball], glow((1, 0.45, 0.12), 2.5), 24, "lantern")
+    place(lantern, (-0.06, 1.15, 0.02))
+    move(lantern, frames, velocity=(0.008, 0, 0.001))
+    green = two_tone("leaf", (0.03, 0.1, 0.02), (0.1, 0.26, 0.05), scale=40, roughness=(0.35, 0.5))
+    sprig = twig(rng, 7, 0.1, green, wood(), 0.04)
+    place(sprig, (-0.115, -0.36, 0.125), (0.3, 0.45, 0.25))
+    swing(sprig, frames, "z", 0.12, 0.45)
+    add_lamp("AREA", (-0.75, 0.25, 0.85), 26, 0.4, (0, 0, 0), (0.75, 0.87, 1.0))
+    add_lamp("AREA", (0.7, 0.6, 0.5), 16, 0.12, (0, 0, 0.03), (1, 0.72, 0.42))
+    camera = look((0.01, -0.8, 0.115), (0.004, 0, 0.037), 26)
+    camera.data.dof.use_dof, camera.data.dof.aperture_fstop, camera.data.dof.aperture_blades = True, 1.8, 7
+    camera.data.dof.focus_distance = 0.805
+    camera.data.clip_start = 0.01
+    move(camera, frames, velocity=(0.0014, 0, 0.0002))
+
+
+def closeup(rng: Rng, frames: range) -> None:
+    """Build a close-up: a furry animal that turns its head, cut glass, and the wheels of a clockwork."""
+    sky("courtyard", 0.35, 2.2)
+    leather = two_tone("leather", (0.05, 0.02, 0.012), (0.13, 0.05, 0.028), scale=350, detail=3, bump=0.0004,
+                       roughness=(0.35, 0.6))  # fmt: skip
+    add_box((0, 0.3, -0.01), (1.6, 1.4, 0.02), leather)
+    velvet = plain("velvet", (0.05, 0.012, 0.02), Roughness=0.9, Sheen_Weight=0.6)
+    place(curtain(1.2, 0.6, 9, 0.03, velvet), (0, 0.28, 0))
+    # The animal: a head, ears, a muzzle, all under one coat that goes with the head.
+    skin = plain("skin", (0.25, 0.12, 0.06), Roughness=0.8)
+    coat = hair_material(0.42, 0.75, 0.28)
+    head = add_object("head", None, None)
+    parts = [((0, 0, 0.028), 0.0225, 15000), ((-0.0165, 0.004, 0.0475), 0.0075, 2600),
+             ((0.0165, 0.004, 0.0475), 0.0075, 2600), ((0, -0.017, 0.0215), 0.0095, 2600)]  # fmt: skip
+    for where, radius, strands in parts:
+        outline = [(radius * math.sin(a), -radius * math.cos(a)) for a in np.linspace(0, math.pi, 18)]
+        ball = place(turned(outline, skin, 40, "head"), where)
+        ball.parent = head
+        fur(rng, ball, strands, 0.0075 if radius > 0.02 else 0.004, coat, lean=(0.05, 0.25, -0.65), wave=0.35,
+            clumps=strands // 40, clump=0.55, radius=0.00009)  # fmt: skip
+    black = plain("eye", (0.01, 0.008, 0.006), Roughness=0.03, Coat_Weight=1.0)
+    for where, radius in (((-0.0095, -0.0215, 0.0325), 0.0032), ((0.0095, -0.0215, 0.0325), 0.0032),
+                          ((0, -0.0285, 0.0245), 0.0027)):  # fmt: skip
+        outline = [(radius * math.sin(a), -radius * math.cos(a)) for a in np.linspace(0, math.pi, 14)]
+        place(turned(outline, black, 28, "eye"), where).parent = head
+    place(head, (-0.032, 0.012, 0), (0, 0, 0.35))
+    move(head, frames, spin=(0, 0, 0.028))
+    # The clockwork: three wheels in mesh, a plate behind them, a spring barrel.
+    brass = two_tone("brass", (0.55, 0.32, 0.1), (0.88, 0.6, 0.24), scale=900, stretch=(10, 1, 1), Metallic=1.0,
+                     roughness=(0.16, 0.34), bump=0.00002)  # fmt: skip
+    steel = two_tone("steel", (0.42, 0.43, 0.45), (0.7, 0.7, 0.72), scale=1200, stretch=(1, 14, 1), Metallic=1.0,
+                     roughness=(0.1, 0.26), bump=0.00002)  # fmt: skip
+    plate = bevelled((0.03, 0.052, 0.03), (0.075, 0.004, 0.06), steel, 0.001, "plate")
+    plate.rotation_euler.z = -0.12
+    frame = add_object("clockwork", None, None)
+    place(frame, (0.03, 0.044, 0.03), (0, 0, -0.12))
+    radii = (0.021, 0.0105, 0.014)
+    teeth = (40, 20, 27)
+    centers = [(-0.009, 0.0), (-0.009 + 0.0222, 0.0222), (-0.009 + 0.0352, -0.0012)]
+    phases = (0.0, 0.5 * 2 * math.pi / 20, 0.2)
+    for number, ((x, z), radius, count) in enumerate(zip(centers, radii, teeth, strict=True)):
+        wheel = gear(count, radius, 0.0024, (brass, steel, brass)[number], (6, 4, 5)[number])
+        wheel.parent = frame
+        # Around its own axis, which looks at the camera: x first, then the turn, in the order ZXY.
+        wheel.rotation_mode = "ZXY"
+        place(wheel, (x, -0.004 * number, z), (math.pi / 2, 0, phases[number]))
+        sign = -1 if number == 1 else 1
+        move(wheel, frames, spin=(0, 0, sign * 0.0021 / radius))
+        axle = turned([(0, 0.008), (0.0016, 0.0075), (0.0018, 0.006), (0.0018, -0.012)], steel, 24, "axle")
+        place(axle, (x, -0.004 * number, z), (math.pi / 2, 0, 0)).parent = frame
+        jewel = plain("jewel", (0.7, 0.02, 0.05), Roughness=0, Transmission_Weight=1, IOR=1.76)
+        stone = turned([(0.0028, 0), (0.0024, 0.0009), (0, 0.0011)], jewel, 24, "jewel")
+        place(stone, (x, -0.004 * number - 0.0072, z), (math.pi / 2, 0, 0)).parent = frame
+    for x, z in ((-0.005, 0.005), (0.064, 0.0048), (0.064, 0.0555), (-0.0045, 0.0555)):
+        screw = turned([(0, 0.0012), (0.0016, 0.0011), (0.002, 0.0006), (0.002, -0.001)], brass, 24, "screw")
+        place(screw, (x, 0.0475 - 0.12 * (x - 0.03), z), (math.pi / 2, 0, 0.4))
+    # Glass: a stopper cut in facets, and a small tumbler, half full.
+    clear = plain("crystal", (1, 1, 1), Roughness=0, Transmission_Weight=1, IOR=1.6)
+    cut = [(0, 0), (0.0045, 0), (0.0075, 0.0035), (0.0095, 0.0085), (0.0075, 0.0125), (0.004, 0.015), (0, 0.0152)]
+    angle = np.arange(9) * 2 * math.pi / 9
+    vertices = [
+        (r * math.cos(a + k * 0.35), r * math.sin(a + k * 0.35), z) for k, (r, z) in enumerate(cut) for a in angle
+    ]
+    faces = [(i * 9 + j, i * 9 + (j + 1) % 9, (i + 1) * 9 + (j + 1) % 9, (i + 1) * 9 + j)
+             for i in range(len(cut) - 1) for j in range(9)]  # fmt: skip
+    place(add_mesh("stopper", vertices, faces, clear), (0.006, -0.03, 0), (0, 0.0, 0.2), 1.15)
+    amber = plain("amber", (1.0, 0.62, 0.22), Roughness=0, Transmission_Weight=1, IOR=1.36)
+    tumbler = [(0, 0), (0.011, 0), (0.0118, 0.001), (0.0135, 0.026), (0.0127, 0.026), (0.0109, 0.003), (0, 0.0028)]
+    place(turned(tumbler, clear, name="tumbler"), (0.04, -0.018, 0))
+    drink = [(0, 0.0028), (0.01075, 0.0031), (0.0117, 0.0145), (0, 0.0145)]
+    place(turned(drink, amber, name="drink"), (0.04, -0.018, 0))
+    add_lamp("AREA", (-0.35, -0.28, 0.42), 6, 0.22, (0, 0, 0.02), (1, 0.93, 0.84))
+    add_lamp("AREA", (0.32, 0.2, 0.22), 3.2, 0.06, (-0.01, 0, 0.03), (0.8, 0.9, 1.0))
+    add_lamp("POINT", (-0.13, 0.16, 0.12), 1.0, 0.006, (0, 0, 0), (1, 0.7, 0.4))
+    camera = look((0.012, -0.62, 0.17), (0.003, 0, 0.0255), 31)
+    camera.data.clip_start = 0.01
+    move(camera, frames, velocity=(0.0002, 0, 0))
+
+
+def lamps(rng: Rng, frames: range) -> None:
+    """Build a bar at night: shelves of bottles in front of a mirror, lit by many small lamps; the camera pans."""
+    dark()
+    timber, oak = wood((0.03, 0.012, 0.006), (0.12, 0.05, 0.022)), wood()
+    paper = two_tone("paper", (0.16, 0.035, 0.03), (0.34, 0.11, 0.075), scale=26, distortion=1.5, edges=(0.45, 0.5))
+    for y in (10.25, -1.0):
+        add_box((0, y, 1.6), (9, 0.1, 3.4), paper)
+    add_box((0, 4.6, -0.05), (9, 11.4, 0.1), oak)
+    add_box((0, 4.6, 3.35), (9, 11.4, 0.1), timber)
+    mirror = two_tone("mirror", (0.62, 0.6, 0.55), (0.8, 0.78, 0.74), scale=2, Metallic=1.0, roughness=(0.02, 0.09))
+    bevelled((0, 10.19, 1.63), (1.15, 0.02, 1.1), mirror, 0.004, "mirror")
+    for x in (-1.85, -0.62, 0.62, 1.85):
+        bevelled((x, 10.03, 1.6), (0.07, 0.34, 1.75), timber, 0.008, "post")
+    tints = ((0.9, 0.55, 0.2), (0.35, 0.7, 0.4), (0.95, 0.9, 0.82), (0.75, 0.2, 0.1), (0.3, 0.5, 0.75))
+    glasses = [plain("bottle", tint, Roughness=0, Transmission_Weight=1, IOR=1.5) for tint in tints[:2]]
+    # What is full of something dark lets no light through.
+    glasses += [plain("bottle", tuple(0.12 * c for c in tint), Roughness=0.06, Coat_Weight=0.5) for tint in tints]
+    labels = [printed(rng) for _ in range(6)]
+    for row, height in enumerate((1.06, 1.44, 1.82, 2.2)):
+        bevelled((0, 10.03, height), (3.75, 0.32, 0.03), oak, 0.004, "shelf")
+        x = -1.78
+        while x < 1.78:
+            item = bottle(int(rng.integers(5)), glasses[int(rng.integers(7))], labels[int(rng.integers(6))])
+            y, turn = 9.98 + float(rng.uniform(-0.05, 0.06)), float(rng.uniform(0, 6))
+            place(item, (x, y, height + 0.016), (0, 0, turn), float(rng.uniform(0.8, 1.0)))
+            x += float(rng.uniform(0.09, 0.17))
+        for k in range(10):  # little lamps under the edge of each shelf
+            bulb = turned([(0.014 * math.sin(a), -0.014 * math.cos(a)) for a in np.linspace(0, math.pi, 9)],
+                          glow(WARM, 130), 16, "bulb")  # fmt: skip
+            place(bulb, (-1.7 + 0.37 * k + 0.05 * row, 9.9, height - 0.028))
+    # The counter, with glasses and candles on it.
+    bevelled((0, 8.7, 0.98), (4.4, 0.62, 0.05), oak, 0.012, "counter")
+    for k in range(14):
+        bevelled((-2.1 + 0.33 * k, 8.5, 0.48), (0.28, 0.03, 0.9), timber, 0.012, "panel")
+    clear = plain("glass", (1, 1, 1), Roughness=0, Transmission_Weight=1, IOR=1.45)
+    goblet = [(0, 0), (0.034, 0), (0.034, 0.002), (0.005, 0.006), (0.004, 0.075), (0.02, 0.088), (0.036, 0.13),
+              (0.031, 0.185), (0.03, 0.185), (0.0348, 0.13), (0.019, 0.09), (0, 0.082)]  # fmt: skip
+    wax = plain("wax", (0.85, 0.75, 0.55), Subsurface_Weight=1.0, Subsurface_Scale=0.02, Roughness=0.45)
+    for k in range(9):
+        x, y = -1.1 + 0.27 * k + float(rng.uniform(-0.05, 0.05)), 8.62 + float(rng.uniform(-0.12, 0.15))
+        if k % 3 == 1:
+            candle = [(0, 0), (0.028, 0), (0.028, 0.085), (0.024, 0.09), (0, 0.083)]
+            place(turned(candle, wax, 40, "candle"), (x, y, 1.006))
+            flame = [(0, 0), (0.006, 0.008), (0.0045, 0.018), (0, 0.032)]
+            place(turned(flame, glow((1, 0.5, 0.16), 200), 16, "flame"), (x, y, 1.098))
+        else:
+            place(turned(goblet, clear, 48, "goblet"), (x, y, 1.006))
+    # Three lamps under metal shades; one of them swings.
+    shade = two_tone("copper", (0.5, 0.2, 0.1), (0.85, 0.42, 0.24), scale=40, Metallic=1.0, roughness=(0.2, 0.4))
+    cone = [(0.018, 0), (0.03, -0.02), (0.1, -0.1), (0.125, -0.16), (0.122, -0.16), (0.096, -0.1), (0.026, -0.024)]
+    for k, x in enumerate((-0.95, 0.05, 1.05)):
+        hook = add_object("pendant", None, None)
+        place(hook, (x, 8.7, 3.0))
+        place(turned(cone, shade, name="shade"), (0, 0, -1.0)).parent = hook
+        wire([(0, 0, 0), (0, 0, -0.5), (0, 0, -1.0)], 0.004, plain("cable", (0.01, 0.01, 0.01)), "cable").parent = hook
+        bulb = turned([(0.024 * math.sin(a), -0.024 * math.cos(a)) for a in np.linspace(0, math.pi, 13)],
+                      glow((1, 0.68, 0.36), 110), 24, "bulb")  # fmt: skip
+        place(bulb, (0, 0, -1.105)).parent = hook
+        if k == 1:
+            swing(hook, frames, "y", 0.05, 0.35)
+    for k in range(24):  # a string of coloured lamps above
+        t = k / 23
+        bulb = turned([(0.012 * math.sin(a), -0.012 * math.cos(a)) for a in np.linspace(0, math.pi, 9)],
+                      glow((WARM, (1, 0.25, 0.12), (0.3, 0.9, 0.4), COOL)[k % 4], 110), 16, "bulb")  # fmt: skip
+        place(bulb, (-2 + 4 * t, 9.6, 2.3 - 0.3 * math.sin(math.pi * ((3 * t) % 1))))
+    camera = look((-0.4, 0.8, 1.62), (-0.12, 9.3, 1.53), 25)
+    move(camera, frames, velocity=(0.006, 0, 0), spin=(0, 0, -0.0032))
+
+
+def shadow(rng: Rng, frames: range) -> None:
+    """Build a sunlit corner: the light of a window wanders over wall and things, leaves sway and a clock swings."""
+    sky("courtyard", 2.0, 0.6)
+    plaster = two_tone("plaster", (0.62, 0.55, 0.44), (0.72, 0.66, 0.55), scale=14, bump=0.0012, Roughness=0.9,
+                       roughness=(0.8, 0.95))  # fmt: skip
+    add_box((0, 0.55, 1.3), (6, 0.1, 3.2), plaster)
+    add_box((0, -3.6, 3.0), (6.4, 9, 0.1), plaster)
+    add_box((3.1, -3.6, 1.4), (0.1, 9, 3.4), plaster)
+    add_box((0, -8.1, 1.4), (6.4, 0.1, 3.4), plaster)
+    add_box((0, -3.6, -0.05), (6.4, 9, 0.1), wood(gloss=0.4))
+    # The wall on the left has a window of twelve panes, through which the sun comes.
+    for y, z, sy, sz in ((-5.6, 1.5, 5, 3), (0.15, 1.5, 0.9, 3), (-1.7, 0.4, 2.8, 0.9), (-1.7, 2.75, 2.8, 0.6)):
+        add_box((-3.1, y, z), (0.12, sy, sz), plaster)
+    bar = plain("frame", (0.75, 0.72, 0.66), Roughness=0.3)
+    for k in range(7):
+        add_box((-3.1, -3.1 + 0.466 * k, 1.65), (0.06, 0.045, 1.7), bar)
+    for k in range(5):
+        add_box((-3.1, -1.7, 0.86 + 0.4 * k), (0.05, 2.8, 0.04), bar)
+    board = wood((0.05, 0.02, 0.008), (0.22, 0.09, 0.035), gloss=0.3)
+    bevelled((0.1, 0.3, 0.86), (1.5, 0.4, 0.035), board, 0.006, "sideboard")
+    bevelled((0.1, 0.31, 0.5), (1.44, 0.36, 0.7), board, 0.006, "chest")
+    stone = two_tone("stoneware", (0.1, 0.16, 0.18), (0.24, 0.34, 0.36), scale=30, roughness=(0.25, 0.5), bump=0.0006)
+    vase = [(0, 0), (0.045, 0), (0.05, 0.01), (0.082, 0.08), (0.075, 0.15), (0.034, 0.2), (0.03, 0.225), (0.041, 0.245),
+            (0.037, 0.245), (0.026, 0.222), (0, 0.2)]  # fmt: skip
+    place(turned(vase, stone, name="vase"), (-0.19, 0.27, 0.878))
+    green = two_tone("leaf", (0.04, 0.11, 0.02), (0.13, 0.27, 0.06), scale=20, roughness=(0.35, 0.5))
+    for k in range(9):
+        stem = twig(rng, 9, 0.34, green, board, 0.085)
+        place(stem, (-0.19, 0.27, 1.1), (float(rng.normal(0, 0.6)), -1.25 + 0.28 * float(rng.normal()), 0.75 * k))
+        swing(stem, frames, "y", 0.055, 0.5, 0.9 * k)
+    for k, (thick, tone) in enumerate(((0.035, (0.32, 0.05, 0.04)), (0.05, (0.05, 0.1, 0.2)), (0.03, (0.5, 0.4, 0.2)),
+                                       (0.042, (0.08, 0.16, 0.08)))):  # fmt: skip
+        deep = 0.896 + sum((0.035, 0.05, 0.03, 0.042)[:k])
+        lighter = (1.5 * tone[0], 1.5 * tone[1], 1.5 * tone[2])
+        cloth = two_tone("cloth", tone, lighter, scale=400, bump=0.0002)
+        book = bevelled((0.14, 0.26, deep), (0.2, 0.15, thick - 0.003), cloth, 0.003, "book")
+        book.rotation_euler.z = 0.35 - 0.22 * k
+        paper = plain("paper", (0.8, 0.75, 0.62), Roughness=0.9)
+        pages = add_box((0.14, 0.26, deep), (0.203, 0.142, thick - 0.011), paper)
+        pages.rotation_euler.z = 0.35 - 0.22 * k
+    # A clock whose pendulum swings, and a picture.
+    gold = plain("gold", (0.85, 0.6, 0.25), Metallic=1.0, Roughness=0.2)
+    rim = [(0, 0.0), (0.075, 0), (0.082, -0.012), (0.09, -0.012), (0.094, 0.0), (0.094, 0.02)]
+    place(turned(rim, gold, name="rim"), (0.3, 0.488, 1.31), (math.pi / 2, 0, 0))
+    dial = turned([(0, 0), (0.08, 0)], plain("dial", (0.8, 0.77, 0.68), Roughness=0.4), name="dial")
+    place(dial, (0.3, 0.476, 1.31), (math.pi / 2, 0, 0))
+    ink = plain("ink", (0.02, 0.02, 0.025), Roughness=0.4)
+    for k in range(12):
+        a = k * math.pi / 6
+        where = (0.3 + 0.065 * math.sin(a), 0.4745, 1.31 + 0.065 * math.cos(a))
+        tick = add_box(where, (0.004, 0.003, 0.016), ink, "tick")
+        tick.rotation_euler.y = a
+    for a, long in ((1.1, 0.04), (4.2, 0.058)):
+        where = (0.3 + long / 2 * math.sin(a), 0.473, 1.31 + long / 2 * math.cos(a))
+        hand = add_box(where, (0.005, 0.003, long), ink, "hand")
+        hand.rotation_euler.y = a
+    pivot = place(add_object("pendulum", None, None), (0.3, 0.46, 1.3))
+    add_box((0, 0, -0.12), (0.006, 0.004, 0.24), gold, "rod").parent = pivot
+    bob = turned([(0, 0.006), (0.03, 0.004), (0.034, 0), (0.03, -0.004), (0, -0.006)], gold, name="bob")
+    place(bob, (0, 0, -0.25), (math.pi / 2, 0, 0)).parent = pivot
+    swing(pivot, frames, "y", 0.35, 0.4, 0.3)
+    bevelled((-0.02, 0.49, 1.62), (0.5, 0.03, 0.36), gold, 0.008, "frame")
+    add_box((-0.02, 0.472, 1.62), (0.43, 0.005, 0.29), printed(rng), "picture")
+    sun = add_lamp("SUN", (0, 0, 5), 6.5, 0.0093, (0, 0, 0), (1, 0.86, 0.66))
+    toward = Vector((3.05, 2.0, -1.0)).to_track_quat("-Z", "Y").to_euler()
+    sun.rotation_euler = toward
+    move(sun, frames, spin=(0, 0, 0.004))
+    camera = look((0.55, -3.7, 1.42), (0.02, 0.4, 1.18), 27)
+    move(camera, frames, velocity=(-0.002, 0, 0))
+
+
+def volume(rng: Rng, frames: range) -> None:
+    """Build a workshop full of smoke: a fan turns before the light, its beams sweep past pipes, chains and barrels."""
+    dark()
+    concrete = two_tone("concrete", (0.12, 0.11, 0.1), (0.3, 0.28, 0.26), scale=2.5, bump=0.004, roughness=(0.6, 0.95))
+    wet = two_tone("floor", (0.04, 0.04, 0.04), (0.12, 0.11, 0.1), scale=4, bump=0.002, roughness=(0.1, 0.6))
+    rust = two_tone("rust", (0.12, 0.035, 0.015), (0.3, 0.14, 0.07), scale=12, roughness=(0.45, 0.9), bump=0.002)
+    iron = two_tone("iron", (0.05, 0.05, 0.055), (0.2, 0.2, 0.21), scale=20, Metallic=1.0, roughness=(0.3, 0.6))
+    add_box((0, 0, -0.05), (7, 10, 0.1), wet)
+    add_box((0, 0, 3.65), (7, 10, 0.1), concrete)
+    for side in (-1, 1):
+        add_box((side * 3.4, 0, 1.8), (0.1, 10, 3.6), concrete)
+    # A wall of brick with a round hole, and the fan in it.
+    bricks = plain("brick", (0.3, 0.12, 0.08), Roughness=0.85)
+    tree = bricks.node_tree
+    where = node(tree, "Mapping", Vector=node(tree, "TexCoord").outputs["Object"], Rotation=(math.pi / 2, 0, 0))
+    laid = node(tree, "TexBrick", Vector=where.outputs["Vector"], Scale=6.5, Color1=(0.3, 0.11, 0.07, 1),
+                Color2=(0.16, 0.07, 0.05, 1), Mortar=(0.3, 0.28, 0.25, 1), Mortar_Size=0.025)  # fmt: skip
+    relief = node(tree, "Bump", Height=laid.outputs["Fac"], Strength=1.0, Distance=-0.006)
+    shader = tree.nodes["Principled BSDF"]
+    tree.links.new(laid.outputs["Color"], shader.inputs["Base Color"])
+    tree.links.new(relief.outputs["Normal"], shader.inputs["Normal"])
+    cx, cz, radius = -0.42, 1.62, 0.46
+    wall = add_box((0, 2.5, 1.8), (7, 0.16, 3.6), bricks)
+    hole = wall.modifiers.new("hole", "BOOLEAN")
+    drum = turned([(0, -0.4), (radius, -0.4), (radius, 0.4), (0, 0.4)], None, 96, "drum")
+    place(drum, (cx, 2.5, cz), (math.pi / 2, 0, 0))
+    drum.hide_render = True
+    drum.hide_set(True)
+    hole.object, hole.operation = drum, "DIFFERENCE"
+    ring = [(0.99, -0.16), (1.06, -0.19), (1.1, -0.18), (1.1, 0.2), (1.06, 0.21), (0.99, 0.2), (0.97, 0), (0.99, -0.16)]
+    place(turned([(radius * r, 0.5 * z) for r, z in ring], rust, 96, "ring"), (cx, 2.5, cz), (math.pi / 2, 0, 0))
+    fan = place(add_object("fan", None, None), (cx, 2.5, cz))
+    hub = turned([(0, 0.07), (0.06, 0.07), (0.08, 0.04), (0.08, -0.05), (0, -0.05)], iron, name="hub")
+    place(hub, (0, 0, 0), (math.pi / 2, 0, 0)).parent = fan
+    for k in range(5):
+        blade = bevelled((0, 0, 0), (0.17, 0.008, radius - 0.1), rust, 0.003, "blade")
+        blade.data.transform(Matrix.Translation((0, 0, 0.04 + radius / 2)))
+        blade.rotation_mode = "ZYX"  # pitched around its own length first
+        place(blade, (0, 0, 0), (0, 2 * math.pi * k / 5, 0.5))
+        blade.parent = fan
+    move(fan, frames, spin=(0, 0.07, 0))
+    for k in (-1, 0, 1):
+        across = math.sqrt(radius**2 - (0.22 * k) ** 2)
+        wire([(cx + 0.22 * k, 2.4, cz - across), (cx + 0.22 * k, 2.38, cz), (cx + 0.22 * k, 2.4, cz + across)], 0.007,
+             iron, "guard")  # fmt: skip
+        wire([(cx - across, 2.39, cz + 0.22 * k), (cx, 2.37, cz + 0.22 * k), (cx + across, 2.39, cz + 0.22 * k)], 0.007,
+             iron, "guard")  # fmt: skip
+    barrel = [(0, 0), (0.27, 0), (0.285, 0.01), (0.275, 0.03), (0.275, 0.27), (0.29, 0.285), (0.275, 0.3),
+              (0.275, 0.57), (0.29, 0.585), (0.275, 0.6), (0.275, 0.85), (0.285, 0.87), (0.27, 0.88), (0.26, 0.865),
+              (0, 0.865)]  # fmt: skip
+    for k, (x, y, z) in enumerate(((0.72, 0.9, 0.25), (1.25, 1.3, 0.25), (0.98, 1.15, 1.13), (-1.1, 0.6, 0.05))):
+        place(turned(barrel, (rust, iron)[k % 2], name="barrel"), (x, y, z), (0, 0, float(rng.uniform(0, 6))), 0.8)
+    bevelled((1.0, 1.1, 0.12), (1.5, 1.0, 0.24), wood((0.04, 0.025, 0.015), (0.16, 0.1, 0.06), 0.7), 0.01, "pallet")
+    for x, z in ((-1.12, 2.2), (0.3, 2.05), (0.42, 2.05)):
+        wire([(x, 2.34, 0), (x, 2.34, z - 0.3), (x, 2.3, z), (x, 1.5, z + 0.05), (x, -4, z)], 0.045, rust, "pipe")
+    for strand, (x, y) in enumerate(((0.18, 0.9), (-0.75, 0.2))):
+        hook = place(add_object("chain", None, None), (x, y, 3.6))
+        for k in range(44):
+            bpy.ops.mesh.primitive_torus_add(major_radius=0.03, minor_radius=0.008, major_segments=20, minor_segments=8)
+            link = bpy.context.active_object
+            link.data.materials.append(iron)
+            bpy.ops.object.shade_smooth()
+            link.scale = (0.75, 1.2, 1)
+            link.location, link.rotation_euler = (0, 0, -0.053 * k), (math.pi / 2, 0, math.pi / 2 * (k % 2))
+            link.parent = hook
+        swing(hook, frames, "y", 0.03, 0.4, strand)
+    beam = add_lamp("SPOT", (-2.2, 6.4, 3.3), 38000, 0.06, (0.35, 0.9, 0.7), (1, 0.83, 0.6))
+    beam.data.spot_size, beam.data.spot_blend = 0.6, 0.3
+    add_lamp("POINT", (2.4, -1.5, 2.6), 130, 0.1, (0, 0, 0), (0.45, 0.65, 1.0))
+    fill_with_smoke(frames, (0, -0.6, 1.8), (6.7, 6.0, 3.6), (0.02, 0.1), 1.6, 0.55)
+    camera = look((0.25, -4.3, 1.35), (0.06, 2.4, 1.36), 16)
+    move(camera, frames, velocity=(0.012, 0, 0))
+
+
+SHOTS: dict[str, Callable[[Rng, range], None]] = {
+    "lens": lens,
+    "closeup": closeup,
+    "lamps": lamps,
+    "shadow": shadow,
+    "volume": volume,
+}
