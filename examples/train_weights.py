@@ -52,7 +52,7 @@ SHOTS = [
     Shot("chalice", "Camera_near1", "0.576,0.710", "1920x1080", 21, 1, 158, 15),
     Shot("country_kitchen", "Camera_move", "0.349,0.536", "1280x720", 23, 0, 159, 17),
 ]
-RANDOM = ["--frames", "7", "--size", "256x144", "--spp", "8-64", "--levels", "a=n,c=n/e,d=4", "--shots", "32"]
+RANDOM = ["--frames", "1-7", "--size", "256x144", "--spp", "8-64", "--levels", "a=n,c=n/e,d=4", "--shots", "32"]
 RANDOM += ["--seed", "3000", "--reference", "128", "--reference-frames", "4"]
 PRESETS = "fast", "balanced", "quality"
 

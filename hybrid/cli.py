@@ -4,28 +4,49 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
 from hybrid.commands.compare import compare
 from hybrid.commands.denoise import denoise, pseudoref
 from hybrid.commands.inspect import inspect
-from hybrid.commands.options import printable
-from hybrid.commands.simulate import simulate_command
-from hybrid.commands.train import prepare_command, train_command
+from hybrid.commands.log import LOG, end_log, lasting_streams, logged, one_line, start_log
+from hybrid.commands.simulate import simulate
+from hybrid.commands.train import prepare, train
 from hybrid.interrupt import INTERRUPTED, is_interrupt
 
 app = typer.Typer(
-    help="Denoise rendered animation, in time as well as in space.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (inspect, pseudoref, denoise, compare):
-    app.command()(command)
-app.command("prepare")(prepare_command)
-app.command("train")(train_command)
-app.command("simulate")(simulate_command)
+for command, panel in (
+    (inspect, "Frames"),
+    (denoise, "Frames"),
+    (pseudoref, "Frames"),
+    (compare, "Frames"),
+    (prepare, "Networks"),
+    (train, "Networks"),
+    (simulate, "Networks"),
+):
+    app.command(rich_help_panel=panel)(logged(command))
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"ravg {version('ravg')}")
+        raise typer.Exit
+
+
+@app.callback()
+def ravg(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version, and no more.")
+    ] = False,
+) -> None:
+    """Denoise rendered animation, in time as well as in space."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,6 +57,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments; the process's own without.
     """
+    with lasting_streams():
+        start_log()  # until a command has read how it is to tell things
+        try:
+            return _run(argv)
+        finally:
+            end_log()
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         app(args=None if argv is None else list(argv), prog_name="ravg")
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
@@ -47,15 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError:
         raise  # a broken installation, not something optional that is missing
     except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"error: {_one_line(error)}", err=True)
+        LOG.error(one_line(error))
         return 1
     return 0
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return printable(f"{error.filename}: {error.strerror}")
-    return printable(" ".join(str(error).split()))
 
 
 if __name__ == "__main__":

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hybrid.commands.options import FramesOption, LayerOption, choose, open_input
+from hybrid.commands.log import LOG, Progress
+from hybrid.commands.options import INPUT, OUTPUT, WHAT, FramesOption, LayerOption, choose, open_input
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -22,34 +23,76 @@ def compare(
     ] = None,
     reference: Annotated[
         list[str] | None,
-        typer.Option(help="the same frames at many samples; twice: two independent halves, whose noise cancels"),
+        typer.Option(
+            metavar="PATTERN",
+            help="the same frames at many samples; twice: two independent halves, whose noise cancels",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="REPORT", help="folder for a page with chart and pictures")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="REPORT",
+            help="folder for a page with chart and pictures",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
-    methods: Annotated[str | None, typer.Option(help="names, separated by commas; all without")] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="separated by commas; all without", rich_help_panel=WHAT),
+    ] = None,
     external: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=PATTERN", help="frames that another denoiser has finished; may be repeated"),
+        typer.Option(
+            metavar="NAME=PATTERN",
+            help="frames that another denoiser has finished; may be repeated",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    sweep: Annotated[bool, typer.Option("--sweep", help="also vary stages and settings, one at a time")] = False,
-    rounds: Annotated[int, typer.Option(min=1, help="runs of each method, in turns, whose median is the time")] = 3,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="also vary stages and settings, one at a time", rich_help_panel=WHAT)
+    ] = False,
+    rounds: Annotated[
+        int, typer.Option(min=1, help="runs of each method, in turns, whose median is the time", rich_help_panel=WHAT)
+    ] = 3,
     samples: Annotated[
-        float | None, typer.Option(help="per pixel of SHOT, where its files do not tell, as those of Cycles do")
+        float | None,
+        typer.Option(
+            metavar="SPP",
+            help="per pixel of SHOT, where its files do not tell, as those of Cycles do",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     level: Annotated[
         list[str] | None,
-        typer.Option(metavar="PATTERN=SPP", help="SHOT at other samples per pixel, to measure how noise falls"),
+        typer.Option(
+            metavar="PATTERN=SPP",
+            help="SHOT at other samples per pixel, to measure how noise falls",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    exposure: Annotated[float, typer.Option(help="factor before the tone curve of the measures")] = 1.0,
+    exposure: Annotated[
+        float, typer.Option(help="factor before the tone curve of the measures", rich_help_panel=WHAT)
+    ] = 1.0,
     clock: Annotated[
-        str, typer.Option(help="wall or cpu: the time that chart.png and the Markdown table show")
+        Literal["wall", "cpu"],
+        typer.Option(help="the time that chart.png and the Markdown table show", rich_help_panel=OUTPUT),
     ] = "wall",
-    markdown: Annotated[bool, typer.Option("--markdown", help="print the table of the README")] = False,
-    name: Annotated[str | None, typer.Option(help="of the shot, in tables and on the page")] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="print the table of the README", rich_help_panel=OUTPUT)
+    ] = False,
+    name: Annotated[
+        str | None, typer.Option(help="of the shot, in tables and on the page", rich_help_panel=OUTPUT)
+    ] = None,
     beside: Annotated[
         list[Path] | None,
-        typer.Option(metavar="REPORT", help="folder of a finished comparison of another shot, to be shown beside"),
+        typer.Option(
+            metavar="REPORT",
+            help="folder of a finished comparison of another shot, to be shown beside",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
@@ -57,23 +100,20 @@ def compare(
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
     import tempfile
 
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from hybrid.comparison.compare import compare_shot, result_table
     from hybrid.comparison.report import report_images, write_report
     from hybrid.comparison.results import Comparison, Cost, join, markdown_table, read_comparison
     from hybrid.comparison.samples import samples_of
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
-    cost = choose(costs, clock, "clock")
+    cost = costs[clock]
     others = [read_comparison(folder / "results.json") for folder in beside or ()]
     if shot is None or not reference:
         if not others or shot is not None or reference:
             raise typer.BadParameter("expected SHOT and --reference, or --beside with finished comparisons")
         joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
         if output is not None:
-            typer.echo(f"wrote {write_report(output, joined, others=others, cost=cost)}", err=True)
+            LOG.info(f"wrote {write_report(output, joined, others=others, cost=cost)}")
         _show(markdown, markdown_table(others, cost=cost), result_table(joined.results))
         return
     if len(reference) > 2:
@@ -90,10 +130,15 @@ def compare(
         chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
     pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
     levels = [(open_input(pattern, frames, None), _number(count, "--level")) for pattern, count in pairs]
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with tempfile.TemporaryDirectory() as folder, Progress(*columns, console=console) as progress:
-        task = progress.add_task("compare")
+    bar: Progress | None = None
+
+    def show(what: str, done: float, total: float) -> None:
+        nonlocal bar
+        if bar is None or total != bar.total or done < bar.done:
+            bar = Progress("compare", total, "methods")
+        bar.advance(done - bar.done, what)
+
+    with tempfile.TemporaryDirectory() as folder:
         comparison = compare_shot(
             noisy,
             clean[0] if len(clean) == 1 else (clean[0], clean[1]),
@@ -106,14 +151,13 @@ def compare(
             levels=levels,
             maps=output is not None,
             folder=Path(folder),
-            progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+            progress=show,
         )
         if output is not None:
             judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
-            progress.update(task, description="write the page")
             images, truth = report_images(Path(folder), comparison, judged)
             page = write_report(output, comparison, images, truth, judged, others=others, exposure=exposure, cost=cost)
-            console.print(f"wrote {page}", highlight=False)
+            LOG.info(f"wrote {page}")
     _show(markdown, markdown_table([comparison, *others], cost=cost), result_table(comparison.results))
 
 

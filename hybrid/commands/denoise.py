@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from hybrid.commands.log import LOG, Progress, print_table, printable
 from hybrid.commands.options import (
+    OUTPUT,
+    RESOURCES,
+    WHAT,
     AovOption,
     EstimateOption,
     FramesOption,
@@ -31,11 +36,10 @@ from hybrid.commands.options import (
     ResumeOption,
     SheetOption,
     ShotArgument,
-    choose,
     import_neural,
     open_input,
     plan_input,
-    printable,
+    usage,
 )
 from hybrid.interrupt import INTERRUPTED, interruptible
 
@@ -50,16 +54,18 @@ if TYPE_CHECKING:
 def pseudoref(
     shot: ShotArgument,
     output: OutputOption,
-    preset: Annotated[str, typer.Option(help="of our own estimate: draft, standard or final")] = "standard",
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
+    preset: Annotated[
+        Literal["draft", "standard", "final"], typer.Option(help="of our own estimate", rich_help_panel=WHAT)
+    ] = "standard",
     estimate: EstimateOption = "none",
     keep_estimates: KeepOption = None,
     preview: PreviewOption = None,
     fps: RateOption = 24,
     contact: SheetOption = None,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
     resume: ResumeOption = False,
@@ -76,7 +82,7 @@ def pseudoref(
     from hybrid.pseudo_reference import filter_window as estimate_centre
     from hybrid.timing import Timings
 
-    chosen = choose(CLASSICAL_PRESETS, preset, "preset")
+    chosen = CLASSICAL_PRESETS[preset]
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
@@ -106,44 +112,77 @@ def pseudoref(
 def denoise(
     shot: ShotArgument,
     output: OutputOption,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
     preset: Annotated[
-        str, typer.Option(help="of the weights that come with ravg: fast, balanced, quality, or auto, with --budget")
+        Literal["fast", "balanced", "quality", "tkpcn", "auto"],
+        typer.Option(
+            metavar="NAME",
+            help="of the weights that come with ravg: fast, balanced, quality or tkpcn; or auto, with --budget",
+            rich_help_panel=WHAT,
+        ),
     ] = "fast",
     budget: Annotated[
-        str | None, typer.Option(metavar="TIME", help="per frame, such as 10s: the most accurate preset that fits it")
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="per frame, such as 10s: the most accurate preset that fits it",
+            rich_help_panel=WHAT,
+        ),
     ] = None,
-    weights: Annotated[Path | None, typer.Option(help="a weights file of your own, instead of a preset")] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="weights of your own, instead of a preset", rich_help_panel=WHAT),
+    ] = None,
     threshold: Annotated[
         float | None,
-        typer.Option(help="from 0 to 1: higher keeps fewer frames or taps: closer to the one frame"),
+        typer.Option(
+            min=0,
+            max=0.99,
+            metavar="SHARE",
+            help="higher keeps fewer frames or taps: closer to the one frame",
+            rich_help_panel=WHAT,
+        ),
     ] = None,
     estimate: EstimateOption = "auto",
     keep_estimates: KeepOption = None,
     passes: Annotated[
         int,
         typer.Option(
-            help="run again on the result: a wider window in time, a softer picture; --resume makes all passes again"
+            min=1,
+            metavar="N",
+            help="run again on the result: a wider window in time, a softer picture; --resume makes all passes again",
+            rich_help_panel=WHAT,
         ),
     ] = 1,
     breakdown: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="a picture of what each frame contributes, with layers and figures of it"),
+        typer.Option(
+            metavar="PNG",
+            help="a picture of what each frame contributes, with layers and figures of it",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     aov: AovOption = None,
     preview: PreviewOption = None,
     fps: RateOption = 24,
     contact: SheetOption = None,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
     tile: Annotated[
         int | None,
-        typer.Option(help="pixels on a side that the network sees at once; without: 640, with --max-memory 384"),
+        typer.Option(
+            min=16,
+            metavar="N",
+            help="pixels on a side that the network sees at once; without: 640, with --max-memory 384",
+            rich_help_panel=RESOURCES,
+        ),
     ] = None,
-    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"], typer.Option(help="of the network", rich_help_panel=RESOURCES)
+    ] = "auto",
     resume: ResumeOption = False,
     max_memory: MemoryOption = None,
     max_pixels: PixelsOption = None,
@@ -157,24 +196,23 @@ def denoise(
     from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
     from hybrid.timing import Timings
 
-    if passes < 1:
-        raise typer.BadParameter(f"--passes is {passes}, expected at least 1")
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
+    chosen: str = preset
     if budget is not None:
-        preset = _fitting(opened, budget, estimate, plan_input(opened, stages, no_stages), precision)
-    path = weights or neural.shipped_weights(preset)
+        chosen = _fitting(opened, budget, estimate, plan_input(opened, stages, no_stages), precision)
+    path = weights or neural.shipped_weights(chosen)
     if tile is None:
         tile = neural.TILE if max_memory is None else neural.SMALL_TILE
     denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
-        mode = "oidn-clean" if weights is not None else MODE_OF[preset]
+        mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
         source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
     elif estimate in ("auto", "none"):
@@ -201,7 +239,7 @@ def denoise(
         timings,
         source,
         command="denoise",
-        preset=preset if weights is None else path.name,
+        preset=chosen if weights is None else path.name,
         settings=settings,
         stages=(stages, no_stages),
         resume=resume,
@@ -223,8 +261,8 @@ def denoise(
                 table.add_row(*row)
             Console().print(table)
         else:
-            typer.echo("no weights to print: all frames were finished already")
-        typer.echo(f"wrote {breakdown}")
+            LOG.info("no weights to print: all frames were finished already")
+        LOG.info(f"wrote {breakdown}")
 
 
 def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictures: Path | None) -> None:
@@ -249,7 +287,9 @@ def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str)
     """The most accurate preset that is measured to fit a time per frame, or the fastest; says what was measured."""
     from hybrid.budget import measure_presets, parse_budget
 
-    neural, seconds = import_neural(), parse_budget(budget)
+    neural = import_neural()
+    with usage():
+        seconds = parse_budget(budget)
 
     def load(preset: str) -> tuple[DenoiseWindow, int]:
         denoiser = neural.Denoiser(neural.shipped_weights(preset), precision=precision)
@@ -261,9 +301,9 @@ def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str)
         fits = measured.seconds <= seconds
         if fits:
             break
-    typer.echo(f"preset: {measured.preset} ({', '.join(tried)} a frame; {budget} asked for)", err=True)
+    LOG.info(f"preset: {measured.preset} ({', '.join(tried)} a frame; {budget} asked for)")
     if not fits:
-        typer.echo("warning: not even the fastest preset fits", err=True)
+        LOG.warning("not even the fastest preset fits")
     return measured.preset
 
 
@@ -316,7 +356,7 @@ def _run(job: Job) -> None:
     def report() -> None:
         count = f"{len(done)} of {len(job.shot)} frames are finished"
         last = f", the last is {done[-1]}" if done else ""
-        typer.echo(f"\nstopped: {count}{last}; --resume goes on from there", err=True)
+        LOG.error(f"stopped: {count}{last}; --resume goes on from there")
 
     try:
         with interruptible(report):
@@ -327,9 +367,6 @@ def _run(job: Job) -> None:
 
 def _denoise(job: Job, done: list[int]) -> None:
     """Denoise with a progress bar, say what was met on the way, and leave the timings beside the output."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Table
 
     from hybrid.files.layers import summarize_layers
@@ -338,7 +375,8 @@ def _denoise(job: Job, done: list[int]) -> None:
     from hybrid.plan import Plan
 
     shot, source, timings = job.shot, job.source, job.timings
-    limit = None if job.max_memory is None else parse_size(job.max_memory)
+    with usage():
+        limit = None if job.max_memory is None else parse_size(job.max_memory)
     if limit is None:
         keep_freed_memory()
     fit = (
@@ -350,13 +388,12 @@ def _denoise(job: Job, done: list[int]) -> None:
         fit(Plan(()))  # refuses what can never be enough before frames are read to make a plan
     plan = plan_input(shot, *job.stages)
     rows = None if fit is None else fit(plan)
-    console = Console(stderr=True)
-    console.print(f"layers: {printable(summarize_layers(shot.layers(shot.numbers[0])))}", highlight=False, markup=False)
-    console.print("stages: " + ", ".join(d.stage for d in plan.decisions if d.on), highlight=False)
+    LOG.info(f"layers: {printable(summarize_layers(shot.layers(shot.numbers[0])))}")
+    LOG.info("stages: " + ", ".join(d.stage for d in plan.decisions if d.on))
     for decision in plan.decisions:
         if not decision.on:
-            console.print(f"  not run: {decision.stage} ({decision.reason})", highlight=False)
-    console.print(f"estimates: {source.name} ({source.reason})", highlight=False)
+            LOG.info(f"  not run: {decision.stage} ({decision.reason})")
+    LOG.info(f"estimates: {source.name} ({source.reason})")
     attributes = {
         "ravg/command": job.command,
         "ravg/preset": job.preset,
@@ -365,41 +402,40 @@ def _denoise(job: Job, done: list[int]) -> None:
         "ravg/settings": json.dumps(job.settings, sort_keys=True),
     }
     pixels, outliers, resumed, finished = 0, 0, 0, None
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(job.command, total=len(shot))
-        frames = denoise_shot(
-            shot,
-            job.output,
-            job.denoise,
-            plan,
-            radius=job.radius,
-            estimates=source.estimates,
-            attributes=attributes,
-            rows=rows,
-            resume=job.resume,
-            timings=timings,
-        )
-        for finished in frames:
-            progress.advance(task)
-            done.append(finished.number)
-            resumed += finished.resumed
-            pixels += finished.pixels
-            outliers += finished.outliers
-            if finished.repaired:
-                console.print(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
-            if finished.clamped:
-                console.print(
-                    f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504"
-                )
+    progress = Progress(job.command, len(shot))
+    frames = denoise_shot(
+        shot,
+        job.output,
+        job.denoise,
+        plan,
+        radius=job.radius,
+        estimates=source.estimates,
+        attributes=attributes,
+        rows=rows,
+        resume=job.resume,
+        timings=timings,
+    )
+    started = time.perf_counter()
+    for finished in frames:
+        done.append(finished.number)
+        resumed += finished.resumed
+        pixels += finished.pixels
+        outliers += finished.outliers
+        if finished.repaired:
+            LOG.warning(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
+        if finished.clamped:
+            LOG.warning(f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504")
+        seconds, started = time.perf_counter() - started, time.perf_counter()
+        words = f"frame {finished.number} was there" if finished.resumed else f"frame {finished.number} {seconds:.1f} s"
+        progress.advance(message=words, frame=finished.number, seconds=round(seconds, 3), path=str(finished.path))
     if finished is None:
         return
     if resumed:
-        console.print(f"{resumed} of {len(shot)} frames were finished already")
+        LOG.info(f"{resumed} of {len(shot)} frames were finished already")
     table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
     for row in timings.rows(pixels):
         table.add_row(*row)
-    console.print(table)
+    print_table(table, stages={name: asdict(stage) for name, stage in timings.stages.items()})
     folder = finished.path.parent
     timings.write(
         folder / "ravg.json",
@@ -412,10 +448,7 @@ def _denoise(job: Job, done: list[int]) -> None:
         outliers=outliers,
         plan=[vars(decision) for decision in plan.decisions],
     )
-    console.print(
-        escape(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}"),
-        highlight=False,
-    )
+    LOG.info(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}")
 
 
 def _look(shot: Shot, output: str, preview: Path | None, fps: float, contact: Path | None) -> None:
@@ -424,7 +457,7 @@ def _look(shot: Shot, output: str, preview: Path | None, fps: float, contact: Pa
 
     if preview is not None:
         write_preview(shot, output, preview, rate=fps)
-        typer.echo(f"wrote {preview}", err=True)
+        LOG.info(f"wrote {preview}")
     if contact is not None:
         write_contact_sheet(shot, output, contact)
-        typer.echo(f"wrote {contact}", err=True)
+        LOG.info(f"wrote {contact}")

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybrid.commands.log import printable
 from hybrid.commands.options import (
+    OUTPUT,
     FramesOption,
     LayerOption,
     MotionOption,
@@ -13,8 +21,10 @@ from hybrid.commands.options import (
     ShotArgument,
     open_input,
     plan_input,
-    printable,
 )
+
+if TYPE_CHECKING:
+    from hybrid.plan import Decision
 
 
 def inspect(
@@ -25,9 +35,13 @@ def inspect(
     motion: MotionOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="all of it as one JSON object", rich_help_panel=OUTPUT)
+    ] = False,
     max_pixels: PixelsOption = None,
 ) -> None:
     """Show which channels are taken for what, and which stages the shot calls for."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -35,23 +49,42 @@ def inspect(
     from hybrid.files.layers import describe_layers
     from hybrid.plan import STAGES
 
-    console = Console()
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     first = opened.numbers[0]
     height, width = opened.shape
-    console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
-    table = Table("role", "taken from", "note", title="Layers", title_justify="left")
     layers = opened.layers(first)
-    console.print(f"profile: {printable(layers.profile)} ({printable(layers.reason)})", highlight=False, markup=False)
-    for row in describe_layers(layers):
+    rows = describe_layers(layers)
+    plan = plan_input(opened, stages, no_stages)
+    if as_json:
+        document = {
+            "frames": opened.numbers,
+            "width": width,
+            "height": height,
+            "warnings": opened.warnings,
+            "profile": layers.profile,
+            "reason": layers.reason,
+            "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in rows],
+            "plan": [asdict(decision) for decision in plan.decisions],
+        }
+        typer.echo(json.dumps(document, indent=1))
+        return
+    console = Console()
+    console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
+    console.print(f"profile: {printable(layers.profile)} ({printable(layers.reason)})\n", highlight=False, markup=False)
+    table = Table("role", "taken from", "note", title="Layers", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for row in rows:
         table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
     console.print(table)
-    plan = plan_input(opened, stages, no_stages)
-    table = Table("stage", "", "measured", "threshold", "why", title="Plan", title_justify="left")
+    table = Table("", "stage", "measured", "why", title="Plan", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for decision in plan.decisions:
-        figure = "–" if decision.figure is None else f"{decision.figure:.4g}"
-        threshold = "–" if decision.figure is None else f"{decision.threshold:.4g}"
-        state = "on" if decision.on else "off"
         why = f"{decision.reason} ({STAGES[decision.stage]})"
-        table.add_row(decision.stage, state, figure, threshold, why)
+        table.add_row("on" if decision.on else "off", decision.stage, _measured(decision), Text(printable(why)))
     console.print(table)
+
+
+def _measured(decision: Decision) -> str:
+    """A figure beside the threshold that it was held against."""
+    if decision.figure is None:
+        return "–"
+    sign = ">" if decision.figure > decision.threshold else "≤"
+    return f"{decision.figure:.3g} {sign} {decision.threshold:.3g}"

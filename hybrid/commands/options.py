@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
+
+from hybrid.commands.log import LOG
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
     from hybrid.files.frames import Shot
@@ -14,15 +17,25 @@ if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not 
 
 Thing = TypeVar("Thing")
 
+# The groups of options in the help.
+INPUT, WHAT, OUTPUT, RESOURCES = "Input", "What to run", "Output", "Resources"
+
+Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
+
 ShotArgument = Annotated[str, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")]
-OutputOption = Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="OUT.####.exr, or a folder")]
-FramesOption = Annotated[str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2")]
+OutputOption = Annotated[
+    str, typer.Option("-o", "--output", metavar="OUT", help="OUT.####.exr, or a folder", rich_help_panel=OUTPUT)
+]
+FramesOption = Annotated[
+    str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2", rich_help_panel=INPUT)
+]
 LayerOption = Annotated[
     list[str] | None,
     typer.Option(
         "--layer",
         metavar="ROLE=LAYER",
         help="take a layer for color, albedo, normal, depth, motion, variance, half_a, half_b, estimate",
+        rich_help_panel=INPUT,
     ),
 ]
 ProfileOption = Annotated[
@@ -30,6 +43,7 @@ ProfileOption = Annotated[
     typer.Option(
         metavar="NAME|FILE",
         help="whose names and conventions to take: a renderer, or a TOML file (docs/renderers.md); else found",
+        rich_help_panel=INPUT,
     ),
 ]
 MotionOption = Annotated[
@@ -38,23 +52,34 @@ MotionOption = Annotated[
         metavar="WORDS",
         help="what vectors mean, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: measured, none: not used; "
         "else as the renderer writes them",
+        rich_help_panel=INPUT,
     ),
 ]
 PreviewOption = Annotated[
     Path | None,
     typer.Option(
-        help="to look at: a .png of the middle frame, noisy and denoised, or a .mp4 or .webp of all as they play"
+        metavar="FILE",
+        help="to look at: a .png of the middle frame, noisy and denoised, or a .mp4 or .webp of all as they play",
+        rich_help_panel=OUTPUT,
     ),
 ]
-RateOption = Annotated[float, typer.Option("--fps", min=1, max=240, help="frames per second of a preview that plays")]
+RateOption = Annotated[
+    float,
+    typer.Option("--fps", min=1, max=240, help="frames per second of a preview that plays", rich_help_panel=OUTPUT),
+]
 SheetOption = Annotated[
-    Path | None, typer.Option("--contact", metavar="PNG", help="a sheet of frames from all over the shot")
+    Path | None,
+    typer.Option("--contact", metavar="PNG", help="a sheet of frames from all over the shot", rich_help_panel=OUTPUT),
 ]
 OnOption = Annotated[
-    list[str] | None, typer.Option("--stages", "--effects", metavar="NAME", help="run a stage, whatever the plan says")
+    list[str] | None,
+    typer.Option(
+        "--stages", "--effects", metavar="NAME", help="run a stage, whatever the plan says", rich_help_panel=WHAT
+    ),
 ]
 OffOption = Annotated[
-    list[str] | None, typer.Option("--no-stages", "--no-effects", metavar="NAME", help="do not run a stage")
+    list[str] | None,
+    typer.Option("--no-stages", "--no-effects", metavar="NAME", help="do not run a stage", rich_help_panel=WHAT),
 ]
 EstimateOption = Annotated[
     str,
@@ -62,22 +87,47 @@ EstimateOption = Annotated[
         metavar="SOURCE",
         help="denoised single frames to make stable: auto (in the file, else OIDN if installed, else our own), oidn, "
         "oidn-fast, oidn-clean, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
+        rich_help_panel=WHAT,
     ),
 ]
 KeepOption = Annotated[
-    str | None, typer.Option("--keep-estimates", metavar="OUT", help="keep OIDN's pictures, and take them from there")
+    str | None,
+    typer.Option(
+        "--keep-estimates",
+        metavar="OUT",
+        help="keep OIDN's pictures, and take them from there",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="leave frames alone that an earlier run with these options has finished")
+    bool,
+    typer.Option(
+        "--resume",
+        help="leave frames alone that an earlier run with these options has finished",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 MemoryOption = Annotated[
-    str | None, typer.Option(metavar="SIZE", help="such as 8G; frames are then worked on a part at a time")
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        envvar="RAVG_MAX_MEMORY",
+        help="such as 8G; frames are then worked on a part at a time",
+        rich_help_panel=RESOURCES,
+    ),
 ]
 PixelsOption = Annotated[
-    int | None, typer.Option(metavar="N", help="refuse files that claim more pixels than this; 2^28 without")
+    int | None,
+    typer.Option(
+        metavar="N",
+        envvar="RAVG_MAX_PIXELS",
+        help="refuse files that claim more pixels than this; 2^28 without",
+        rich_help_panel=RESOURCES,
+    ),
 ]
 AovOption = Annotated[
-    list[str] | None, typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels")
+    list[str] | None,
+    typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels", rich_help_panel=WHAT),
 ]
 
 
@@ -108,19 +158,16 @@ def open_input(
     from hybrid.files.frames import open_shot
     from hybrid.files.profile import open_profile, parse_motion
 
-    try:
+    from hybrid.files.sequences import parse_frames
+
+    with usage():
         if motion not in (None, "auto", "none"):
             parse_motion(motion or "")
         chosen = None if profile is None else open_profile(profile)
-    except ValueError as error:
-        raise typer.BadParameter(f"--{error}") from None
-
-    overrides = {}
-    for item in layer or ():
-        role, separator, name = item.partition("=")
-        if not separator:
-            raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER")
-        overrides[role] = name
+    overrides = parse_layers(layer)
+    if frames is not None:
+        with usage():
+            parse_frames(frames)
     # keep=0: whoever aligns a window keeps what he has made of a frame, not the frame.
     opened = open_shot(
         shot,
@@ -133,14 +180,29 @@ def open_input(
         max_pixels=MAX_PIXELS if max_pixels is None else max_pixels,
     )
     for warning in opened.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        LOG.warning(warning)
     return opened
+
+
+def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
+    """Roles and the layers that are to play them."""
+    from hybrid.files.profile import ROLES
+
+    overrides = {}
+    for item in layer or ():
+        role, _, name = item.partition("=")
+        if role not in ROLES or not name:
+            raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER; roles: {', '.join(ROLES)}")
+        overrides[role] = name
+    return overrides
 
 
 def plan_input(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Plan:
     from hybrid.plan import plan_shot
 
-    return plan_shot(shot).force(split_names(on), split_names(off))
+    plan = plan_shot(shot)
+    with usage():
+        return plan.force(split_names(on), split_names(off))
 
 
 def split_names(names: Sequence[str] | None) -> list[str]:
@@ -154,6 +216,10 @@ def choose(table: dict[str, Thing], name: str, option: str) -> Thing:
     return table[name]
 
 
-def printable(words: str) -> str:
-    """What a terminal shows as it is: a name from a file may hold sequences that command it."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
+@contextmanager
+def usage() -> Iterator[None]:
+    """Let what is wrong with an option be bad usage, exit code 2, in every command alike."""
+    try:
+        yield
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None

@@ -2,120 +2,160 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from hybrid.simulate.run import missing, parse_center, parse_frames, parse_numbers, parse_size, shots_of, simulate
+from hybrid.commands.log import LOG, Progress
+from hybrid.commands.options import INPUT, OUTPUT, RESOURCES, WHAT, usage
+from hybrid.simulate.run import missing, parse_center, parse_numbers, parse_size, shots_of
+from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
 
-def simulate_command(
-    scene: Annotated[str, typer.Argument(help="A .blend file, random, hard, validation, test, or one as test:NAME.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the frames and meta.json.")],
-    frames: Annotated[str, typer.Option(help="How many, or FIRST-LAST.")] = "7",
-    size: Annotated[str, typer.Option(help="Of what is rendered, WxH.")] = "320x180",
-    film: Annotated[str | None, typer.Option(help="Of the whole camera, WxH; what is rendered is a crop.")] = None,
-    center: Annotated[str | None, typer.Option(help="Of the crop, as fractions X,Y with y down.")] = None,
-    spp: Annotated[str, typer.Option(help="Samples per pixel, n; as LOW-HIGH drawn for each shot.")] = "16",
-    levels: Annotated[str, typer.Option(help="Noise levels, such as n,n/e,4 or noisy=n.")] = "n,n/e,4",
-    reference: Annotated[int, typer.Option(help="Samples per pixel of a reference; 0: none.")] = 0,
-    reference_frames: Annotated[str | None, typer.Option(help="Of these frames only, such as 1,4,7.")] = None,
-    seed: Annotated[int, typer.Option(help="All that is random comes from it.")] = 1,
-    shots: Annotated[int, typer.Option(help="How many shots, with seeds that count up.")] = 1,
-    camera: Annotated[str | None, typer.Option(help="Which of the file's cameras, or random.")] = None,
-    motion: Annotated[str, typer.Option(help="auto: add motion to a file that has none; keep; add.")] = "auto",
-    movers: Annotated[int | None, typer.Option(help="How many moving things to add, with added motion.")] = None,
-    motion_blur: Annotated[bool, typer.Option("--motion-blur", help="Blur what moves.")] = False,
-    halves: Annotated[bool, typer.Option("--halves", help="Half buffers, for the variance.")] = False,
-    effects: Annotated[str, typer.Option(help="auto: what the scene calls for; all: everything.")] = "auto",
-    jobs: Annotated[int, typer.Option(help="Blender processes at a time.")] = 1,
-    threads: Annotated[int | None, typer.Option(help="Of each; by default the cores are shared out.")] = None,
-    python: Annotated[str | None, typer.Option(help="A Python that has bpy, if this one has not.")] = None,
+def simulate(
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="a .blend file, random, hard, validation, test, or one as test:NAME")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            "--out",
+            metavar="OUT",
+            help="folder for the frames and meta.json",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
+    frames: Annotated[
+        str, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010", rich_help_panel=INPUT)
+    ] = "1-7",
+    size: Annotated[str, typer.Option(metavar="WxH", help="of what is rendered", rich_help_panel=WHAT)] = "320x180",
+    film: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="of the whole camera; what is rendered is a crop of it", rich_help_panel=WHAT),
+    ] = None,
+    center: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y", help="of the crop, as fractions, y down", rich_help_panel=WHAT),
+    ] = None,
+    spp: Annotated[
+        str,
+        typer.Option(metavar="N", help="samples per pixel, n; as LOW-HIGH drawn for each shot", rich_help_panel=WHAT),
+    ] = "16",
+    levels: Annotated[
+        str, typer.Option(help="noise levels, such as n,n/e,4 or noisy=n", rich_help_panel=WHAT)
+    ] = "n,n/e,4",
+    reference: Annotated[
+        int,
+        typer.Option(min=0, metavar="SPP", help="samples per pixel of a reference; 0: none", rich_help_panel=WHAT),
+    ] = 0,
+    reference_frames: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="of these alone, such as 1,4,7", rich_help_panel=WHAT)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="all that is random comes from it", rich_help_panel=INPUT)] = 1,
+    shots: Annotated[
+        int, typer.Option(min=1, metavar="N", help="how many, with seeds that count up", rich_help_panel=INPUT)
+    ] = 1,
+    camera: Annotated[
+        str | None, typer.Option(help="which of the file's cameras, or random", rich_help_panel=INPUT)
+    ] = None,
+    motion: Annotated[
+        Literal["auto", "keep", "add"],
+        typer.Option(help="auto: add motion to a file that has none", rich_help_panel=WHAT),
+    ] = "auto",
+    movers: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="how many moving things to add, with added motion", rich_help_panel=WHAT),
+    ] = None,
+    motion_blur: Annotated[bool, typer.Option("--motion-blur", help="blur what moves", rich_help_panel=WHAT)] = False,
+    halves: Annotated[
+        bool, typer.Option("--halves", help="half buffers, for the variance", rich_help_panel=WHAT)
+    ] = False,
+    effects: Annotated[
+        Literal["auto", "all"],
+        typer.Option(help="auto: what the scene calls for; all: everything", rich_help_panel=WHAT),
+    ] = "auto",
+    jobs: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Blender processes at a time", rich_help_panel=RESOURCES)
+    ] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            envvar="RAVG_THREADS",
+            help="of each; without, the cores are shared out",
+            rich_help_panel=RESOURCES,
+        ),
+    ] = None,
+    python: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            envvar="RAVG_BLENDER_PYTHON",
+            help="an interpreter that has bpy, if this one has not",
+            rich_help_panel=RESOURCES,
+        ),
+    ] = None,
 ) -> None:
     """Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for."""
+    from hybrid.files.sequences import parse_frames
+
     known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]
     if scene not in known and not Path(scene).is_file():
         raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or one of {', '.join(known)}")
-    if jobs < 1:
-        raise ValueError(f"jobs: got {jobs}, expected at least 1")
-    first = ShotSettings(
-        scene=scene,
-        seed=seed,
-        frames=parse_frames(frames),
-        size=parse_size(size, "size"),
-        levels={"noisy": 1},
-        reference=reference,
-        reference_frames=parse_numbers(reference_frames) if reference_frames else None,
-        film=parse_size(film, "film") if film else None,
-        center=parse_center(center) if center else None,
-        camera=camera,
-        motion=motion,
-        movers=movers,
-        motion_blur=motion_blur,
-        halves=False,
-        effects=effects,
-    )
-    # Half buffers last: they ask for levels of two samples, and the levels are only now read.
-    asked = [(replace(shot, halves=halves), out) for shot, out in shots_of(scene, out, shots, spp, levels, first)]
+    with usage():
+        first = ShotSettings(
+            scene=scene,
+            seed=seed,
+            frames=tuple(parse_frames(frames)),
+            size=parse_size(size, "size"),
+            levels={"noisy": 1},
+            reference=reference,
+            reference_frames=parse_numbers(reference_frames) if reference_frames else None,
+            film=parse_size(film, "film") if film else None,
+            center=parse_center(center) if center else None,
+            camera=camera,
+            motion=motion,
+            movers=movers,
+            motion_blur=motion_blur,
+            halves=False,
+            effects=effects,
+        )
+        several = shots_of(scene, output, shots, spp, levels, first)
+        # Half buffers last: they ask for levels of two samples, and the levels are only now read.
+        asked = [(replace(shot, halves=halves), folder) for shot, folder in several]
     _run_with_progress(asked, jobs, threads, python)
 
 
 def _run_with_progress(
     shots: Sequence[tuple[ShotSettings, Path]], jobs: int, threads: int | None, python: str | None
 ) -> None:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
     # The bar counts samples, not frames: they tell the time that is left whatever the levels.
     total = sum(missing(shot, out, frame) for shot, out in shots for frame in shot.frames)
     pictures = sum(len(shot.pictures(frame)) for shot, _ in shots for frame in shot.frames)
     if total == 0:
-        console.print(f"all {pictures} pictures are there")
+        LOG.info(f"all {pictures} pictures are there")
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("spp·frames"))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
-        bar = progress.add_task("rendering", total=total)
+    bar = Progress("rendering", total, "spp·frames")
 
-        def show(kind: str, out: Path, message: dict[str, Any]) -> None:
-            if kind == "frame":
-                progress.update(bar, advance=message["samples"], description=f"{out.name}/{message['file']}")
-                return
-            plan = message["plan"]
-            console.print(f"{out}: {_one_line(plan['description'])}", markup=False, highlight=False)
-            if len(shots) == 1:
-                for line in plan["printed"]:
-                    console.print(f"  {line}", markup=False, highlight=False)
+    def show(kind: str, out: Path, message: dict[str, Any]) -> None:
+        if kind == "frame":
+            bar.advance(message["samples"], f"{out.name}/{message['file']}")
+            return
+        plan = message["plan"]
+        LOG.info(f"{out}: {_one_line(plan['description'])}")
+        if len(shots) == 1:
+            for line in plan["printed"]:
+                LOG.info(f"  {line}")
 
-        simulate(shots, jobs=jobs, threads=threads, python=python, on_event=show)
+    render(shots, jobs=jobs, threads=threads, python=python, on_event=show)
 
 
 def _one_line(description: dict[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in description.items() if value not in ([], {}, "still"))
-
-
-def main() -> None:
-    """Run the command by itself: `python -m hybrid.commands.simulate`."""
-    application = typer.Typer(pretty_exceptions_enable=False)
-    application.command()(simulate_command)
-    try:
-        application()
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(1) from None
-
-
-if __name__ == "__main__":
-    main()

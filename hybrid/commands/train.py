@@ -9,10 +9,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid.commands.options import import_neural
+from hybrid.commands.log import LOG, Progress
+from hybrid.commands.options import (
+    INPUT,
+    OUTPUT,
+    RESOURCES,
+    WHAT,
+    FramesOption,
+    LayerOption,
+    import_neural,
+    parse_layers,
+    usage,
+)
 
 if TYPE_CHECKING:
     from hybrid.files.frames import Shot
+
+TRAINING = "Training"
 
 
 def open_levels(
@@ -74,76 +87,90 @@ def open_levels(
     return path.resolve().name, levels, counts
 
 
-def prepare_command(
+def prepare(
     shots: Annotated[
         list[str],
         typer.Argument(metavar="SHOTS...", help="folders, each with LEVEL.####.exr at one or more noise levels"),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips", rich_help_panel=OUTPUT),
+    ],
     levels: Annotated[
-        str | None, typer.Option(help="a=24,b=24,c=8: levels and their samples; else all, as Cycles' headers say")
+        str | None,
+        typer.Option(
+            help="a=24,b=24,c=8: levels and their samples; else all, as Cycles' headers say", rich_help_panel=INPUT
+        ),
     ] = None,
-    tile: Annotated[int, typer.Option(help="pixels on a side of a clip; 0: whole frames, to validate on")] = 128,
-    tiles: Annotated[int, typer.Option(help="clips of each frame, placed where noise, detail and motion are")] = 4,
-    window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7")] = 5,
-    estimate: Annotated[str, typer.Option(help="first estimates, as for denoise; clips hold them")] = "auto",
+    tile: Annotated[
+        int,
+        typer.Option(min=0, help="pixels on a side of a clip; 0: whole frames, to validate on", rich_help_panel=WHAT),
+    ] = 128,
+    tiles: Annotated[
+        int,
+        typer.Option(
+            min=1, help="clips of each frame, placed where noise, detail and motion are", rich_help_panel=WHAT
+        ),
+    ] = 4,
+    window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT)] = 5,
+    estimate: Annotated[
+        str,
+        typer.Option(metavar="SOURCE", help="first estimates, as for denoise; clips hold them", rich_help_panel=WHAT),
+    ] = "auto",
     reference: Annotated[
-        bool, typer.Option("--reference", help="only the frames that SHOT/reference.####.exr has, trained towards it")
+        bool,
+        typer.Option(
+            "--reference",
+            help="only the frames that SHOT/reference.####.exr has, trained towards it",
+            rich_help_panel=INPUT,
+        ),
     ] = False,
-    seed: Annotated[int, typer.Option(help="of the places")] = 0,
-    frames: Annotated[str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2")] = None,
-    layer: Annotated[list[str] | None, typer.Option("--layer", metavar="ROLE=LAYER", help="as for denoise")] = None,
+    seed: Annotated[int, typer.Option(help="of the places", rich_help_panel=WHAT)] = 0,
+    frames: FramesOption = None,
+    layer: LayerOption = None,
 ) -> None:
     """Make training clips: aligned windows at all noise levels, with first estimates and pseudo-references.
 
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from hybrid.files.frames import open_shot
     from hybrid.memory import keep_freed_memory
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
-    if tile < 0 or tiles < 1:
-        raise typer.BadParameter(f"--tile, --tiles: expected 0 or more and 1 or more, got {tile} and {tiles}")
     neural = import_neural()
-    samples = None if levels is None else parse_samples(levels)
-    if wrong := [item for item in layer or () if "=" not in item]:
-        raise typer.BadParameter(f"--layer is {wrong[0]!r}, expected ROLE=LAYER")
-    roles = dict(item.split("=", 1) for item in layer or ())
+    with usage():
+        samples = None if levels is None else parse_samples(levels)
+    roles = parse_layers(layer)
     found = [open_levels(spec, samples, frames=frames, layers=roles) for spec in shots]
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
     output.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
-        task = progress.add_task("prepare", total=sum(len(next(iter(shot.values()))) for _, shot, _ in found))
-        for name, shot, counts in found:
-            first = next(iter(shot.values()))
-            progress.update(task, description=f"prepare {name}")
-            if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
-                progress.advance(task, len(first))
-                continue
-            neural.write_clips(
-                shot,
-                counts,
-                output,
-                name,
-                radius=window // 2,
-                tile=tile,
-                tiles=tiles,
-                estimate=estimate,
-                reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
-                if reference
-                else None,
-                seed=seed,
-                advance=lambda: progress.advance(task),
-            )
-    typer.echo(f"clips of {len(found)} shots are in {output}")
+    bar = Progress("prepare", sum(len(next(iter(shot.values()))) for _, shot, _ in found))
+    for name, shot, counts in found:
+        first = next(iter(shot.values()))
+        if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
+            bar.advance(len(first), f"{name} has clips already")
+            continue
+        neural.write_clips(
+            shot,
+            counts,
+            output,
+            name,
+            radius=window // 2,
+            tile=tile,
+            tiles=tiles,
+            estimate=estimate,
+            reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
+            if reference
+            else None,
+            seed=seed,
+            advance=lambda name=name: bar.advance(message=name),
+        )
+    LOG.info(f"clips of {len(found)} shots are in {output}")
 
 
 def parse_samples(text: str) -> dict[str, float]:
@@ -163,49 +190,80 @@ def parse_samples(text: str) -> dict[str, float]:
     return samples
 
 
-def train_command(
+def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg prepare")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="W.safetensors", help="weights to write")],
-    preset: Annotated[str, typer.Option(help="fast, balanced, quality, unet, multiscale, paper or tkpcn")] = "fast",
-    init: Annotated[str | None, typer.Option(help="start from these weights: a file, or a preset that ships")] = None,
-    validation: Annotated[
-        list[str] | None, typer.Option(help="shots kept out of training; again or with commas for more")
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="W.safetensors", help="weights to write", rich_help_panel=OUTPUT)
+    ],
+    preset: Annotated[
+        str, typer.Option(help="fast, balanced, quality, unet, multiscale, paper or tkpcn", rich_help_panel=WHAT)
+    ] = "fast",
+    init: Annotated[
+        str | None, typer.Option(help="start from these weights: a file, or a preset that ships", rich_help_panel=INPUT)
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="stop after so many steps")] = None,
-    minutes: Annotated[float | None, typer.Option(help="stop after so many minutes")] = None,
-    batch: Annotated[int, typer.Option(help="samples of a step, of all processes together")] = 2,
-    rate: Annotated[float, typer.Option(help="peak learning rate")] = 1e-3,
-    warmup: Annotated[int, typer.Option(help="steps in which the rate rises")] = 200,
-    clip_norm: Annotated[float, typer.Option("--clip", help="largest norm of a gradient")] = 1.0,
-    ema: Annotated[float, typer.Option(help="how slowly the weights that are kept follow")] = 0.999,
+    validation: Annotated[
+        list[str] | None,
+        typer.Option(help="shots kept out of training; again or with commas for more", rich_help_panel=INPUT),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="stop after so many steps", rich_help_panel=TRAINING)] = None,
+    minutes: Annotated[float | None, typer.Option(help="stop after so many minutes", rich_help_panel=TRAINING)] = None,
+    batch: Annotated[
+        int, typer.Option(help="samples of a step, of all processes together", rich_help_panel=TRAINING)
+    ] = 2,
+    rate: Annotated[float, typer.Option(help="peak learning rate", rich_help_panel=TRAINING)] = 1e-3,
+    warmup: Annotated[int, typer.Option(help="steps in which the rate rises", rich_help_panel=TRAINING)] = 200,
+    clip_norm: Annotated[
+        float, typer.Option("--clip", help="largest norm of a gradient", rich_help_panel=TRAINING)
+    ] = 1.0,
+    ema: Annotated[
+        float, typer.Option(help="how slowly the weights that are kept follow", rich_help_panel=TRAINING)
+    ] = 0.999,
     loss: Annotated[
-        str, typer.Option(help="relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)")
+        str,
+        typer.Option(
+            help="relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)", rich_help_panel=TRAINING
+        ),
     ] = "relmse",
-    vgg: Annotated[str | None, typer.Option(help="torchvision's VGG19 weights: a file, or hub to fetch them")] = None,
-    terms: Annotated[str, typer.Option(help="temporal, power (every subset of the window), or spatial")] = "temporal",
-    whole: Annotated[float, typer.Option(help="weight of the whole window's term beside the temporal ones")] = 1.0,
-    slope: Annotated[float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail")] = 1.0,
-    crop: Annotated[int, typer.Option(help="pixels on a side of a sample")] = 128,
-    sets: Annotated[int, typer.Option(help="disjoint sets of clips, one an epoch")] = 10,
-    seed: Annotated[int, typer.Option(help="of initial weights and samples")] = 0,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
-    threads: Annotated[int | None, typer.Option(help="of torch and numba")] = None,
-    workers: Annotated[int, typer.Option(help="processes that read clips")] = 0,
-    float32: Annotated[bool, typer.Option("--float32", help="no bfloat16")] = False,
-    compile: Annotated[bool, typer.Option("--compile", help="compile the network; pays on a GPU")] = False,
-    validate_minutes: Annotated[float, typer.Option(help="between validations, and between checkpoints")] = 5.0,
-    tensorboard: Annotated[Path | None, typer.Option(metavar="FOLDER", help="write TensorBoard's logs there")] = None,
+    vgg: Annotated[
+        str | None,
+        typer.Option(help="torchvision's VGG19 weights: a file, or hub to fetch them", rich_help_panel=TRAINING),
+    ] = None,
+    terms: Annotated[
+        str, typer.Option(help="temporal, power (every subset of the window), or spatial", rich_help_panel=TRAINING)
+    ] = "temporal",
+    whole: Annotated[
+        float, typer.Option(help="weight of the whole window's term beside the temporal ones", rich_help_panel=TRAINING)
+    ] = 1.0,
+    slope: Annotated[
+        float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail", rich_help_panel=TRAINING)
+    ] = 1.0,
+    crop: Annotated[int, typer.Option(help="pixels on a side of a sample", rich_help_panel=TRAINING)] = 128,
+    sets: Annotated[int, typer.Option(help="disjoint sets of clips, one an epoch", rich_help_panel=TRAINING)] = 10,
+    seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = 0,
+    device: Annotated[
+        str, typer.Option(envvar="RAVG_DEVICE", help="auto, cpu or cuda", rich_help_panel=RESOURCES)
+    ] = "auto",
+    threads: Annotated[int | None, typer.Option(help="of torch and numba", rich_help_panel=RESOURCES)] = None,
+    workers: Annotated[int, typer.Option(help="processes that read clips", rich_help_panel=RESOURCES)] = 0,
+    float32: Annotated[bool, typer.Option("--float32", help="no bfloat16", rich_help_panel=RESOURCES)] = False,
+    compile: Annotated[
+        bool, typer.Option("--compile", help="compile the network; pays on a GPU", rich_help_panel=RESOURCES)
+    ] = False,
+    validate_minutes: Annotated[
+        float, typer.Option(help="between validations, and between checkpoints", rich_help_panel=TRAINING)
+    ] = 5.0,
+    tensorboard: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="write TensorBoard's logs there", rich_help_panel=OUTPUT)
+    ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="go on from W.safetensors.state, with the same options")
+        bool,
+        typer.Option("--resume", help="go on from W.safetensors.state, with the same options", rich_help_panel=OUTPUT),
     ] = False,
 ) -> None:
     """Train a network on clips; torchrun -m hybrid.cli train … trains in several processes.
 
     Fine-tune on your own footage, without any reference: ravg prepare it, then --init fast --rate 1e-4.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
     neural = import_neural()
     writer = None
     if tensorboard is not None:
@@ -214,56 +272,53 @@ def train_command(
         except ModuleNotFoundError:
             raise ValueError("tensorboardX is not installed; expected: pip install tensorboardX") from None
         writer = SummaryWriter(str(tensorboard))
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     recent: list[float] = []
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("train", total=1.0)
+    bar = Progress("train", 100, "%")
 
-        def log(step: int, values: dict[str, float]) -> None:
-            if writer is not None:
-                for name, value in values.items():
-                    writer.add_scalar(name, value, step)
-            if "done" in values:
-                recent.append(values["train/loss"])
-                del recent[:-100]
-                text = f"step {step}  loss {sum(recent) / len(recent):.4f}"
-                progress.update(task, completed=values["done"], description=text)
-            else:
-                figures = "  ".join(f"{name.partition('/')[2]} {value:.3f}" for name, value in values.items())
-                console.print(f"step {step}: {figures}", highlight=False)
+    def log(step: int, values: dict[str, float]) -> None:
+        if writer is not None:
+            for name, value in values.items():
+                writer.add_scalar(name, value, step)
+        if "done" in values:
+            recent.append(values["train/loss"])
+            del recent[:-100]
+            text = f"step {step}  loss {sum(recent) / len(recent):.4f}"
+            bar.advance(100 * values["done"] - bar.done, text)
+        else:
+            figures = "  ".join(f"{name.partition('/')[2]} {value:.3f}" for name, value in values.items())
+            LOG.info(f"step {step}: {figures}")
 
-        neural.train_network(
-            clips,
-            output,
-            preset=preset,
-            init=init,
-            validation=[name for item in validation or () for name in item.split(",")],
-            threads=threads,
-            resume=resume,
-            log=log,
-            crop=crop,
-            sets=sets,
-            steps=steps,
-            minutes=minutes,
-            batch=batch,
-            rate=rate,
-            warmup=warmup,
-            clip_norm=clip_norm,
-            ema=ema,
-            loss=loss,
-            vgg=vgg,
-            terms=terms,
-            whole=whole,
-            slope=slope,
-            seed=seed,
-            device=device,
-            workers=workers,
-            bfloat16=not float32,
-            compile=compile,
-            validate_minutes=validate_minutes,
-            checkpoint_minutes=validate_minutes,
-        )
+    neural.train_network(
+        clips,
+        output,
+        preset=preset,
+        init=init,
+        validation=[name for item in validation or () for name in item.split(",")],
+        threads=threads,
+        resume=resume,
+        log=log,
+        crop=crop,
+        sets=sets,
+        steps=steps,
+        minutes=minutes,
+        batch=batch,
+        rate=rate,
+        warmup=warmup,
+        clip_norm=clip_norm,
+        ema=ema,
+        loss=loss,
+        vgg=vgg,
+        terms=terms,
+        whole=whole,
+        slope=slope,
+        seed=seed,
+        device=device,
+        workers=workers,
+        bfloat16=not float32,
+        compile=compile,
+        validate_minutes=validate_minutes,
+        checkpoint_minutes=validate_minutes,
+    )
     if writer is not None:
         writer.close()
-    typer.echo(f"wrote {output}")
+    LOG.info(f"wrote {output}")

@@ -246,16 +246,6 @@ def parse_center(text: str) -> tuple[float, float]:
     return where
 
 
-def parse_frames(text: str) -> tuple[int, ...]:
-    """Read `7`, the first seven frames, or `8-14`."""
-    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
-    if match is None:
-        raise ValueError(f"frames: got {text!r}, expected a count or FIRST-LAST")
-    if match[2] is None:
-        return tuple(range(1, int(match[1]) + 1))
-    return tuple(range(int(match[1]), int(match[2]) + 1))
-
-
 def parse_numbers(text: str) -> tuple[int, ...]:
     """Read `1,4,7`, frames named one by one."""
     if re.fullmatch(r"\d+(,\d+)*", text) is None:

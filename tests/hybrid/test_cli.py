@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,41 @@ def run(capsys, *arguments):
     return code, captured.out, captured.err
 
 
-def test_help_works(capsys):
-    assert run(capsys, "--help")[0] == 0
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_help_works(capsys, word):
+    code, out, _ = run(capsys, word)
+    assert code == 0
+    assert "--install-completion" in out
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert run(capsys, "--version")[:2] == (0, f"ravg {version('ravg')}\n")
+
+
+@pytest.mark.parametrize("command", ["inspect", "denoise", "pseudoref", "compare", "prepare", "train", "simulate"])
+def test_options_have_one_name_and_one_group_everywhere(command, capsys):
+    code, out, _ = run(capsys, command, "-h")
+    assert code == 0
+    assert "What it tells" in out
+    assert "--output" in out or command == "inspect"
+    groups = [line for line in out.splitlines() if line.startswith("╭")]
+    assert len(groups) >= 4
+
+
+def test_inspect_as_json(shot_folder, capsys):
+    code, out, _ = run(capsys, "inspect", shot_folder, "--json", "--no-stages", "warp")
+    document = json.loads(out)
+    assert code == 0
+    assert document["frames"] == [1001, 1002, 1003]
+    assert (document["width"], document["height"]) == (56, 40)
+    assert {"role": "color", "layer": "ViewLayer.Combined", "note": ""} | document["layers"][0] == document["layers"][0]
+    assert {d["stage"]: d["forced"] for d in document["plan"]}["warp"]
+
+
+def test_the_environment_holds_the_defaults_of_a_site(shot_folder, capsys, monkeypatch):
+    monkeypatch.setenv("RAVG_MAX_PIXELS", "100")
+    assert "100" in one_line_error(capsys, "inspect", shot_folder)
+    assert run(capsys, "inspect", shot_folder, "--max-pixels", 10_000)[0] == 0
 
 
 def test_inspect_names_channels_and_decisions(shot_folder, capsys):
@@ -166,12 +200,42 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["pseudoref"],
         ["pseudoref", "SHOT", "-o", "OUT", "--preset", "best"],
         ["inspect", "SHOT", "--layer", "color"],
+        ["inspect", "SHOT", "--layer", "sound=beauty"],
+        ["inspect", "SHOT", "--frames", "first-last"],
+        ["inspect", "SHOT", "--stages", "polish"],
         ["inspect", "SHOT", "--no-such-option"],
+        ["inspect", "SHOT", "--quiet", "--verbose"],
+        ["inspect", "SHOT", "--log-format", "prose"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "much"],
+        ["compare", "SHOT", "--reference", "SHOT", "--clock", "sun"],
+        ["simulate", "random", "-o", "OUT", "--size", "large"],
+        ["simulate", "random", "-o", "OUT", "--frames", "a-b"],
+        ["simulate", "random", "-o", "OUT", "--motion", "perhaps"],
+        ["simulate", "random", "-o", "OUT", "--jobs", "0"],
     ],
 )
 def test_bad_usage_is_two(arguments, shot_folder, tmp_path, capsys):
     words = {"SHOT": str(shot_folder), "OUT": str(tmp_path / "o")}
     assert run(capsys, *(words.get(word, word) for word in arguments))[0] == 2
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["denoise", "SHOT", "-o", "OUT", "--preset", "best"],
+        ["denoise", "SHOT", "-o", "OUT", "--precision", "float8"],
+        ["denoise", "SHOT", "-o", "OUT", "--threshold", "1"],
+        ["denoise", "SHOT", "-o", "OUT", "--tile", "3"],
+        ["denoise", "SHOT", "-o", "OUT", "--passes", "0"],
+        ["denoise", "SHOT", "-o", "OUT", "--preset", "auto", "--budget", "soon"],
+        ["prepare", "SHOT", "-o", "OUT", "--window", "4"],
+        ["prepare", "SHOT", "-o", "OUT", "--levels", "many"],
+    ],
+)
+def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys):
+    pytest.importorskip("torch")
+    test_bad_usage_is_two(options, shot_folder, tmp_path, capsys)
 
 
 def test_a_file_without_color_is_refused(tmp_path, capsys):
@@ -216,7 +280,7 @@ def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, ca
         (["--external", "nameless"], "expected NAME=PATTERN"),
         (["--external", "noisy=x.exr"], "a name that no other method has"),
         (["--level", "x.####.exr"], "expected PATTERN=SPP"),
-        (["--clock", "sun"], "expected one of wall, cpu"),
+        (["--clock", "sun"], "'wall', 'cpu'"),
     ],
 )
 def test_compare_refuses_what_it_cannot_do(compared, capsys, extra, complaint):

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.commands.simulate import simulate_command
+from hybrid.commands.simulate import simulate as simulate_command
 from hybrid.simulate.run import (
     SimulationError,
     check_blender,
     missing,
     parse_center,
-    parse_frames,
     parse_numbers,
     parse_size,
     shots_of,
@@ -91,13 +90,9 @@ def test_seeds_differ_between_frames_levels_and_shots():
 
 
 def test_frames_and_sizes():
-    assert parse_frames("3") == (1, 2, 3)
-    assert parse_frames("8-10") == (8, 9, 10)
     assert parse_size("320x180", "size") == (320, 180)
     assert parse_numbers("4") == (4,)
     assert parse_numbers("1,4,7") == (1, 4, 7)
-    with pytest.raises(ValueError, match="frames"):
-        parse_frames("a-b")
     with pytest.raises(ValueError, match="reference frames: got '1-4'"):
         parse_numbers("1-4")
     with pytest.raises(ValueError, match="film: got '320'"):

@@ -1,0 +1,358 @@
+"""What a command tells while it works: on a terminal, in the log of a farm, in a file.
+
+All of it are records of one logger. A handler shows each in its own way: as a bar and lines on a terminal, as lines
+where there is none, as JSON, or in the form that Open Job Description reads. Results, such as tables of `ravg compare`,
+are no records and go to standard output.
+"""
+
+from __future__ import annotations
+
+import codecs
+import inspect
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+LOG = logging.getLogger("ravg")
+LOG.propagate = False
+
+LogFormat = Literal["text", "json", "openjd"]
+PANEL = "What it tells"
+# What terminals and files that know only ASCII show in place of some signs that are used here.
+_PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
+
+
+def logged(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options that say how much it tells, in which form, and where to."""
+
+    @wraps(command)
+    def run(
+        *,
+        log_format: LogFormat,
+        log_file: Path | None,
+        quiet: bool,
+        verbose: bool,
+        **arguments: Any,
+    ) -> None:
+        if quiet and verbose:
+            raise typer.BadParameter("expected --quiet or --verbose, got both")
+        start_log(log_format, log_file, quiet=quiet, verbose=verbose)
+        command(**arguments)
+
+    form = typer.Option(
+        "--log-format", envvar="RAVG_LOG_FORMAT", help="of progress and messages", rich_help_panel=PANEL
+    )
+    file = typer.Option(
+        "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE", help="add them to a file", rich_help_panel=PANEL
+    )
+    less = typer.Option("-q", "--quiet", help="warnings and errors alone", rich_help_panel=PANEL)
+    more = typer.Option("-v", "--verbose", help="details too", rich_help_panel=PANEL)
+    options = {
+        "log_format": (Annotated[LogFormat, form], "text"),
+        "log_file": (Annotated[Path | None, file], None),
+        "quiet": (Annotated[bool, less], False),
+        "verbose": (Annotated[bool, more], False),
+    }
+    parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
+    own = inspect.signature(command, eval_str=True)
+    added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]
+    run.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
+    return run
+
+
+class Progress:
+    """How far a command has come; every step is a record.
+
+    Parameters
+    ----------
+    what : str
+        What is being done.
+    total : float
+        How many steps there are.
+    unit : str
+        What is counted.
+    """
+
+    def __init__(self, what: str, total: float, unit: str = "frames") -> None:
+        self.what, self.total, self.unit = what, total, unit
+        self.done = 0.0
+        self._start = time.monotonic()
+        self._record(what, {})
+
+    def advance(self, by: float = 1, message: str = "", **facts: object) -> None:
+        """Tell that so many steps more are done, with a message and facts of them."""
+        self.done += by
+        elapsed = time.monotonic() - self._start
+        left = elapsed / self.done * (self.total - self.done) if self.done else None
+        self._record(message or self.what, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
+
+    def _record(self, message: str, facts: dict[str, object]) -> None:
+        share = self.done / self.total if self.total else 1.0
+        facts = {"done": self.done, "total": self.total, "percent": round(100 * share, 1), **facts}
+        LOG.info(message, extra={"facts": facts, "progress": self})
+
+
+def start_log(
+    form: LogFormat = "text", file: Path | None = None, *, quiet: bool = False, verbose: bool = False
+) -> None:
+    """Say where records go from now on: to standard error, and into a file.
+
+    Raises
+    ------
+    ValueError
+        If the file is there and no text.
+    OSError
+        If it cannot be written to.
+    """
+    end_log()
+    LOG.setLevel(logging.DEBUG if verbose else logging.INFO)
+    handlers = [_on_stderr(form)]
+    handlers[0].setLevel(logging.WARNING if quiet else logging.NOTSET)
+    if file is not None:
+        handlers.append(_into(file, form))
+    for handler in handlers:
+        LOG.addHandler(handler)
+
+
+def end_log() -> None:
+    """Take the handlers away; the bar of a terminal goes with them."""
+    for handler in tuple(LOG.handlers):
+        LOG.removeHandler(handler)
+        handler.close()
+
+
+def print_table(table: Any, **facts: object) -> None:
+    """Tell the rows of a rich table: as a table, or as `facts` where records are JSON."""
+    LOG.info("", extra={"table": table, "facts": facts})
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, without line breaks and without what would command a terminal."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return printable(f"{error.filename}: {error.strerror}")
+    return printable(" ".join(str(error).split()))
+
+
+def printable(words: str) -> str:
+    """What a terminal shows as it is: a name from a file may hold sequences that command it."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
+
+
+def _on_stderr(form: LogFormat) -> logging.Handler:
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if form == "text" and console.is_terminal and not console.is_dumb_terminal:
+        return _Terminal(console)
+    handler = _Lines(sys.stderr)
+    handler.setFormatter(_JsonLine() if form == "json" else _TextLine(openjd=form == "openjd"))
+    return handler
+
+
+def _into(file: Path, form: LogFormat) -> logging.Handler:
+    if file.exists() and (not file.is_file() or b"\0" in file.open("rb").read(4096)):
+        raise ValueError(f"log-file {str(file)!r} is there and no text, expected a log or a new name")
+    handler = _Lines(file.open("a", encoding="utf-8"), own=True)
+    handler.setFormatter(_JsonLine() if form == "json" else _TextLine(times=True))
+    return handler
+
+
+class _Lines(logging.StreamHandler):
+    """Records as lines. A bar that moves by less than a percent is no line, but for the end of a frame."""
+
+    def __init__(self, stream: Any, *, own: bool = False) -> None:
+        super().__init__(stream)
+        self._own = own
+        self._percent = -1
+
+    def emit(self, record: logging.LogRecord) -> None:
+        facts = getattr(record, "facts", {})
+        if hasattr(record, "progress"):
+            if int(facts["percent"]) == self._percent and "frame" not in facts:
+                return
+            self._percent = int(facts["percent"])
+        super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """A log that cannot be written any more does not end the work."""
+
+    def close(self) -> None:
+        if self._own:
+            self.stream.close()
+        super().close()
+
+
+class _TextLine(logging.Formatter):
+    """What a person reads; with `openjd`, also the lines that a worker of Open Job Description reads."""
+
+    def __init__(self, *, times: bool = False, openjd: bool = False) -> None:
+        super().__init__()
+        self._times, self._openjd = times, openjd
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = _message(record)
+        if (table := getattr(record, "table", None)) is not None:
+            text = _plain_table(table)
+        facts = getattr(record, "facts", {})
+        if (progress := getattr(record, "progress", None)) is not None:
+            left = f", about {_duration(facts['seconds_left'])} left" if "seconds_left" in facts else ""
+            count = f"{progress.done:.0f} of {progress.total:.0f} {progress.unit}"
+            text = f"{text}: {count}, {facts['percent']:.0f} %{left}"
+        lines = [text]
+        if self._openjd and progress is not None:
+            lines += [f"openjd_progress: {facts['percent']:.1f}", f"openjd_status: {text}"]
+        if self._openjd and record.levelno >= logging.ERROR:
+            lines.append(f"openjd_fail: {record.getMessage()}")
+        if self._times:
+            lines = [f"{_time(record)} {line}" for line in text.splitlines()]
+        return "\n".join(lines)
+
+
+class _JsonLine(logging.Formatter):
+    """One JSON object a line: time, level, message, and the facts of the record."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        document = {"time": _time(record), "level": record.levelname.lower(), "message": record.getMessage()}
+        return json.dumps({**document, **getattr(record, "facts", {})}, default=str)
+
+
+class _Terminal(logging.Handler):
+    """Lines above a bar that moves."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+        self._bar: Bar | None = None
+        self._of: Progress | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        progress = getattr(record, "progress", None)
+        if progress is not None:
+            self._show(progress, record.getMessage())
+        elif (table := getattr(record, "table", None)) is not None:
+            self._stop()
+            self._console.print(table)
+        else:
+            self._console.print(_message(record), highlight=False, markup=False, soft_wrap=True)
+
+    def close(self) -> None:
+        self._stop()
+        super().close()
+
+    def _show(self, progress: Progress, text: str) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        if self._of is not progress:
+            self._stop()
+            words = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
+            unit = TextColumn(progress.unit, markup=False)
+            self._bar = Bar(*words, unit, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
+            self._bar.add_task(progress.what, total=progress.total)
+            self._bar.start()
+            self._of = progress
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=progress.done, description=text)
+
+    def _stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar = self._of = None
+
+
+def _message(record: logging.LogRecord) -> str:
+    level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+    return level + record.getMessage()
+
+
+def _plain_table(table: Any) -> str:
+    from rich.console import Console
+
+    console = Console(width=min(Console().width, 100), color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get().rstrip("\n")
+
+
+def _time(record: logging.LogRecord) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(record.created))
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+@contextmanager
+def lasting_streams() -> Iterator[None]:
+    """Let the work go on where standard output or error is closed or knows only ASCII."""
+    before = sys.stdout, sys.stderr
+    codecs.register_error("plain", _replace_sign)
+    sys.stdout, sys.stderr = _Lasting.of(sys.stdout), _Lasting.of(sys.stderr)
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def _replace_sign(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return "".join(_PLAIN.get(sign, "?") for sign in error.object[error.start : error.end]), error.end
+
+
+class _Lasting:
+    """A stream that what it cannot write does not concern."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self._closed = False
+
+    @classmethod
+    def of(cls, stream: Any) -> Any:
+        if stream is None:  # what Python makes of a standard stream that was closed before it started
+            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="plain")
+        return cls(stream)
+
+    def write(self, text: str) -> int:
+        if not self._closed:
+            with self._enduring():
+                self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        if not self._closed:
+            with self._enduring():
+                self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @contextmanager
+    def _enduring(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:  # the reader has gone: a pipe that is closed, a terminal that was hung up
+            self._closed = True
+            # What is still in Python's buffer would be written, in vain, when the process ends.
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)

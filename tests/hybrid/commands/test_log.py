@@ -1,0 +1,138 @@
+"""What a command tells: lines, JSON, Open Job Description; closed pipes and terminals that know only ASCII."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybrid.cli import main
+from hybrid.commands.log import LOG, Progress, end_log, start_log
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def log():
+    """Start the log, and end it whatever happens."""
+    yield start_log
+    end_log()
+
+
+def work(total=4):
+    progress = Progress("denoise", total)
+    for number in range(total):
+        progress.advance(message=f"frame {number}", frame=number, seconds=1.5)
+
+
+def test_progress_is_lines_where_there_is_no_terminal(log, capsys):
+    log()
+    work()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "denoise: 0 of 4 frames, 0 %"
+    assert lines[2].startswith("frame 1: 2 of 4 frames, 50 %, about ")
+    assert len(lines) == 5
+
+
+def test_a_bar_that_hardly_moves_fills_no_log(log, capsys):
+    log()
+    bar = Progress("train", 10_000, "steps")
+    for _ in range(10_000):
+        bar.advance()
+    assert len(capsys.readouterr().err.splitlines()) == 101
+
+
+def test_json_lines_hold_the_facts(log, capsys):
+    log("json")
+    work()
+    LOG.warning("careful")
+    documents = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert documents[2] | {"time": "", "seconds_left": 0} == {
+        "time": "",
+        "level": "info",
+        "message": "frame 1",
+        "done": 2,
+        "total": 4,
+        "percent": 50,
+        "frame": 1,
+        "seconds": 1.5,
+        "seconds_left": 0,
+    }
+    assert documents[-1]["level"] == "warning"
+
+
+def test_open_job_description_is_told_percent_and_status(log, capsys):
+    log("openjd")
+    work()
+    LOG.error("out of rays")
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith("openjd_progress: ")][-1] == "openjd_progress: 100.0"
+    assert any(line.startswith("openjd_status: frame 3: 4 of 4 frames") for line in lines)
+    assert lines[-1] == "openjd_fail: out of rays"
+
+
+def test_quiet_and_verbose(log, capsys):
+    for options, seen in (
+        ({"quiet": True}, "warning: w\n"),
+        ({}, "i\nwarning: w\n"),
+        ({"verbose": True}, "d\ni\nwarn"),
+    ):
+        log(**options)
+        LOG.debug("d")
+        LOG.info("i")
+        LOG.warning("w")
+        assert capsys.readouterr().err.startswith(seen)
+
+
+def test_a_log_file_is_added_to_and_never_takes_the_place_of_another_file(log, tmp_path, capsys):
+    path = tmp_path / "log.txt"
+    for _ in range(2):
+        log(file=path, quiet=True)
+        LOG.info("hello")
+    assert [line.split(" ", 1)[1] for line in path.read_text().splitlines()] == ["hello", "hello"]
+    assert capsys.readouterr().err == ""
+    picture = tmp_path / "shot.exr"
+    picture.write_bytes(b"\x76\x2f\x31\x01\0\0")
+    with pytest.raises(ValueError, match="is there and no text"):
+        log(file=picture)
+    assert picture.stat().st_size == 6
+
+
+def test_errors_are_records_too(tmp_path, capsys):
+    assert main(["inspect", str(tmp_path / "no.####.exr"), "--log-format", "json"]) == 1
+    document = json.loads(capsys.readouterr().err)
+    assert document["level"] == "error"
+    assert "no.####.exr" in document["message"]
+
+
+def ravg(*arguments, **options):
+    return [sys.executable, "-m", "hybrid.cli", *map(str, arguments)], {"cwd": ROOT, **options}
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_pipe_does_not_end_the_work(shot_folder, tmp_path, stream):
+    command, options = ravg("pseudoref", shot_folder, "-o", tmp_path / "out", "--preset", "draft")
+    read, write = os.pipe()
+    os.close(read)  # whoever read it has gone before the first word
+    other = "stderr" if stream == "stdout" else "stdout"
+    done = subprocess.run(command, **options, **{stream: write, other: subprocess.DEVNULL}, check=False)
+    os.close(write)
+    assert done.returncode == 0
+    assert len(list((tmp_path / "out").glob("*.exr"))) == 3
+
+
+def test_streams_that_were_never_open(shot_folder):
+    command, options = ravg("inspect", shot_folder)
+    script = 'exec "$0" "$@" >&- 2>&-'
+    assert subprocess.run(["sh", "-c", script, *command], **options, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}])
+def test_terminals_that_know_only_ascii(shot_folder, environment):
+    command, options = ravg("inspect", shot_folder, env={**os.environ, **environment, "PYTHONUTF8": "0"})
+    done = subprocess.run(command, **options, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert b"56x40" in done.stdout
+    assert done.stdout.isascii()
