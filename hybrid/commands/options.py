@@ -157,7 +157,6 @@ def open_input(
     from hybrid.files.exr import MAX_PIXELS
     from hybrid.files.frames import open_shot
     from hybrid.files.profile import open_profile, parse_motion
-
     from hybrid.files.sequences import parse_frames
 
     with usage():

@@ -12,14 +12,13 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
-import fileseq
 import numpy as np
 
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
-from hybrid.files.sequences import PADDING, find_files, format_frames, parse_frames
+from hybrid.files.sequences import find_files, format_frames, parse_frames, parse_pattern
 from nlm.variance import variance_from_halves
 
 
@@ -384,9 +383,9 @@ def open_shot(
     Parameters
     ----------
     spec
-        ``shot.####.exr``, ``shot.%04d.exr``, ``shot.@@@@.exr``, a folder with one sequence in it, or one file.
+        A sequence as `hybrid.files.sequences.find_files` takes it: ``shot.####.exr``, a folder, one file, ….
     frames
-        A range such as ``1001-1010x2``; all by default.
+        A range such as ``1001-1010x2``; else the one that `spec` names, or all.
     layers
         Overrides for `hybrid.files.layers.find_layers`.
     profile
@@ -408,9 +407,10 @@ def open_shot(
     ValueError
         If the folder has several sequences, or `frames` is not a range.
     """
+    files, named = find_files(str(spec))
     return Shot(
-        find_files(str(spec)),
-        frames=frames,
+        files,
+        frames=named if frames is None else frames,
         layers=layers,
         profile=profile,
         motion=motion,
@@ -441,15 +441,14 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
         If several frames would get one name, or an input file would be overwritten.
     """
     pattern = str(pattern)
-    if Path(pattern).is_dir() or not pattern.lower().endswith(".exr"):
+    names, _ = parse_pattern(pattern)
+    if Path(pattern).is_dir() or names.path(number).suffix.lower() != ".exr":
         path = Path(pattern) / shot.path(number).name
     else:
-        sequence = fileseq.FileSequence(pattern, pad_style=PADDING)
-        placeholder = bool(sequence.padding()) and not sequence.frameSet()
         count = shot.count if beside else len(shot)
-        if not placeholder and count > 1:
+        if not names.digits and count > 1:
             raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
-        path = Path(sequence.frame(number)) if placeholder else Path(pattern)
+        path = names.path(number)
     # Not only its own input: frames still to come need the noisy neighbours.
     if shot.reads(path):
         raise ValueError(f"output {str(path)!r} would overwrite an input frame")

@@ -1,56 +1,170 @@
-"""Numbered files: patterns such as ``shot.####.exr``, folders, and ranges of frames."""
+"""Numbered files: patterns such as ``shot.####.exr``, as any program writes them, folders, and ranges of frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import fileseq
 
-# One "#" or "@" is one digit, as in Nuke, RV and ffmpeg's %04d.
-PADDING = fileseq.PAD_STYLE_HASH1
+# Where a number goes: #### (Nuke, RV), @@@@, %04d (ffmpeg, Nuke), $F4 (Houdini), <frame04> and <F4> (Maya, Karma).
+_PLACE = re.compile(r"(#+|@+)|%(\d*)d|\$(?:F(\d*)|\{F(\d*)\})|<(?:frame|f)(\d*)>", re.IGNORECASE)
+_RANGE = r"\d+(?:-\d+(?:[x:y]\d+)?)?(?:,\d+(?:-\d+(?:[x:y]\d+)?)?)*"
 
 
-def find_files(spec: str) -> dict[int, Path]:
-    """Frame number → file."""
+@dataclass(frozen=True)
+class Pattern:
+    """The names of a sequence: `before`, a number of at least `digits` digits, `after`. Without digits: one name."""
+
+    folder: Path
+    before: str
+    digits: int
+    after: str = ""
+
+    def path(self, number: int) -> Path:
+        """The file of a frame."""
+        return self.folder / f"{self.before}{number:0{self.digits}d}{self.after}" if self.digits else self.single
+
+    @property
+    def single(self) -> Path:
+        """The file where there is no place for a number."""
+        return self.folder / self.before
+
+    def files(self) -> dict[int, Path]:
+        """Frame number → file, of those that are there, whatever the width of their numbers.
+
+        Where two names have one number, the width of the pattern decides for all. A name without a number is frame 1.
+        """
+        if not self.digits:
+            return {1: self.single} if self.single.is_file() else {}
+        found = [(n, path) for path in _names(self.folder) if (n := self.number(path.name)) is not None]
+        if len(dict(found)) < len(found):
+            found = [(n, path) for n, path in found if path == self.path(n)]
+        return dict(sorted(found))
+
+    def number(self, name: str) -> int | None:
+        """The number in a file's name; None where it has none, or is of another sequence."""
+        if not self.digits:
+            return None
+        match = re.fullmatch(f"{re.escape(self.before)}({_sign(self.before)}[0-9]+){re.escape(self.after)}", name)
+        return int(match[1]) if match else None
+
+    def __str__(self) -> str:
+        return f"{self.before}{'#' * self.digits}{self.after}"
+
+
+def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
+    """Find a sequence.
+
+    Parameters
+    ----------
+    spec : str
+        A pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), a folder that holds one sequence, a file, or a
+        glob. With the range in it, as programs copy it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
+
+    Returns
+    -------
+    dict of int to Path
+        Frame number → file; all that are there.
+    str or None
+        The range of frames that is named along with them.
+
+    Raises
+    ------
+    FileNotFoundError
+        If nothing matches; says what the folder has.
+    ValueError
+        If several sequences do.
+    """
     path = Path(spec)
     if path.is_dir():
-        sequences = _sequences(path)
-        if not sequences:
-            raise FileNotFoundError(f"{spec}: no EXR files in this folder")
-        if len(sequences) > 1:
-            raise ValueError(f"{spec} holds several sequences, name one: {_listing(path)}")
-        return _files(sequences[0])
-    sequence = fileseq.FileSequence(spec, pad_style=PADDING)
+        return _only(_patterns(_names(path)), spec, path).files(), None
     if path.is_file():
-        return {int(sequence.start()) if sequence.frameSet() else 1: path}
-    if not sequence.padding() or sequence.frameSet():
-        raise FileNotFoundError(f"{spec}: no such file; {_listing(path.parent)}")
-    for strict in (False, True):  # files with one name and two widths of numbers: the pattern's width decides
-        try:
-            return _files(fileseq.FileSequence.findSequenceOnDisk(spec, strictPadding=strict, pad_style=PADDING))
-        except fileseq.FileSeqException:
-            continue
-    raise FileNotFoundError(f"{spec}: no frame matches; {_listing(path.parent)}")
+        number = _pattern_of(path).number(path.name)
+        return {1 if number is None else number: path}, None
+    pattern, frames = parse_pattern(spec)
+    if pattern.digits:
+        if files := pattern.files():
+            return files, frames
+        # The range within the name, unless that is the name.
+        match = re.fullmatch(rf"(.*?)({_RANGE})", pattern.before)
+        if match and "-" in match[2]:
+            bare = Pattern(pattern.folder, match[1], pattern.digits, pattern.after)
+            if files := bare.files():
+                return files, match[2]
+        raise FileNotFoundError(f"{spec}: no frame matches; {_listing(path.parent)}")
+    matching = [name for name in _names(path.parent) if fnmatchcase(name.name, path.name)]
+    if matching:
+        # All files of the sequence: neighbours need not match.
+        pattern = _only(_patterns(matching), spec, path.parent)
+        numbers = [number for name in matching if (number := pattern.number(name.name)) is not None]
+        return pattern.files(), format_frames(numbers or [1])
+    raise FileNotFoundError(f"{spec}: no such file; {_listing(path.parent)}")
 
 
-def _sequences(folder: Path) -> list[fileseq.FileSequence]:
-    found = fileseq.FileSequence.findSequencesOnDisk(str(folder), pad_style=PADDING)
-    return [sequence for sequence in found if sequence.extension().lower() == ".exr"]
+def parse_pattern(spec: str) -> tuple[Pattern, str | None]:
+    """Split a pattern at the last place for a number in its name; and from the range that stands behind it."""
+    match = re.fullmatch(rf"(.*\S)\s+({_RANGE})", spec)
+    frames = match[2] if match and _PLACE.search(Path(match[1]).name) else None
+    path = Path(match[1] if match and frames else spec)
+    places = list(_PLACE.finditer(path.name))
+    if not places:
+        return Pattern(path.parent, path.name, 0), frames
+    place = places[-1]
+    digits = len(place[1]) if place[1] else int(next(filter(None, place.groups()[1:]), "1"))
+    return Pattern(path.parent, path.name[: place.start()], max(digits, 1), path.name[place.end() :]), frames
 
 
-def _files(sequence: fileseq.FileSequence) -> dict[int, Path]:
-    numbers = sequence.frameSet()
-    if numbers is None:
-        return {1: Path(str(sequence))}
-    return {int(number): Path(sequence.frame(number)) for number in numbers}
+def _names(folder: Path) -> list[Path]:
+    """The EXR files of a folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr" and not path.name.startswith("."))
+
+
+def _patterns(paths: Iterable[Path]) -> list[Pattern]:
+    """The sequences that files belong to."""
+    found: dict[tuple[str, str], Pattern] = {}
+    for path in paths:
+        pattern = _pattern_of(path)
+        key = pattern.before, pattern.after
+        if key not in found or pattern.digits < found[key].digits:
+            found[key] = pattern
+    return list(found.values())
+
+
+def _pattern_of(path: Path) -> Pattern:
+    """The sequence that a file belongs to: its number is the last one in its name."""
+    match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.name)
+    if match is None:
+        return Pattern(path.parent, path.name, 0)
+    before = match[1]
+    if before.endswith("-") and _sign(before[:-1]):
+        before = before[:-1]
+    return Pattern(path.parent, before, len(match[2]), match[3])
+
+
+def _sign(before: str) -> str:
+    """A hyphen is a sign where something else separates name and number already: in a.-001.exr, not in a-001.exr."""
+    return "-?" if before.endswith((".", "_")) else ""
+
+
+def _only(patterns: list[Pattern], spec: str, folder: Path) -> Pattern:
+    if not patterns:
+        raise FileNotFoundError(f"{spec}: no EXR files in this folder")
+    if len(patterns) > 1:
+        raise ValueError(f"{spec} holds several sequences, name one: {_listing(folder)}")
+    return patterns[0]
 
 
 def _listing(folder: Path) -> str:
     """What a folder has, for an error message; shortened if there is much of it."""
     if not folder.is_dir():
         return f"there is no folder {str(folder)!r}"
-    names = [f"{s.basename()}{s.padding()}{s.extension()} {s.frameRange()}".strip() for s in _sequences(folder)]
+    names = [f"{p} {format_frames(p.files())}" if p.digits else str(p) for p in _patterns(_names(folder))]
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
     return f"{str(folder)!r} has {', '.join(sorted(names)[:8]) or 'no EXR files'}{more}"
 
@@ -66,5 +180,6 @@ def parse_frames(frames: str) -> list[int]:
     return sorted({int(number) for number in numbers})
 
 
-def format_frames(numbers: Iterable[int]) -> str:
+def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
+    """The range of some frame numbers, such as 1001-1010x2."""
     return str(fileseq.FrameSet(sorted(numbers)))

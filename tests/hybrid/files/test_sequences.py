@@ -1,0 +1,98 @@
+"""Sequence names as people paste them."""
+
+import pytest
+
+from hybrid.files.sequences import find_files, parse_frames, parse_pattern
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Frames 8 to 12 of a sequence whose name holds numbers, a second sequence, and a temporary file."""
+    for number in range(8, 13):
+        (tmp_path / f"aov1_v002.{number:04d}.exr").touch()
+    (tmp_path / ".aov1_v002.0008.exr.host-1-1.tmp").touch()
+    (tmp_path / "notes.txt").touch()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "place", ["####", "@@@@", "%04d", "%d", "#", "$F4", "$F", "${F4}", "<frame04>", "<Frame4>", "<f4>", "<frame>"]
+)
+def test_places_for_a_number_of_every_program(folder, place):
+    files, frames = find_files(f"{folder}/aov1_v002.{place}.exr")
+    assert list(files) == [8, 9, 10, 11, 12]
+    assert files[9] == folder / "aov1_v002.0009.exr"
+    assert frames is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "aov1_v002.####.exr 8-10",  # Nuke
+        "aov1_v002.%04d.exr 8-10",
+        "aov1_v002.$F4.exr  8,9,10",
+        "aov1_v002.8-10####.exr",  # RV
+        "aov1_v002.8-10@@@@.exr",
+        "aov1_v002.8-10%04d.exr",
+        "aov1_v002.00[01][890].exr",  # a glob; neighbours need not match
+    ],
+)
+def test_ranges_that_are_pasted_along(folder, name):
+    files, frames = find_files(f"{folder}/{name}")
+    assert list(files) == [8, 9, 10, 11, 12]
+    assert parse_frames(frames) == [8, 9, 10]
+
+
+def test_globs_and_folders_of_one_sequence(folder):
+    assert list(find_files(f"{folder}/*.exr")[0]) == [8, 9, 10, 11, 12]
+    assert list(find_files(str(folder))[0]) == [8, 9, 10, 11, 12]
+    assert find_files(f"{folder}/aov1_v002.0009.exr") == ({9: folder / "aov1_v002.0009.exr"}, None)
+    (folder / "other.0008.exr").touch()
+    for spec in (f"{folder}/*.exr", str(folder)):
+        with pytest.raises(ValueError, match=r"several sequences.*aov1_v002\.#### 8-12|aov1_v002\.####\.exr 8-12"):
+            find_files(spec)
+
+
+def test_a_range_in_a_name_that_is_its_own(tmp_path):
+    (tmp_path / "take1-2.0001.exr").touch()
+    (tmp_path / "take1-20001.exr").touch()
+    assert find_files(f"{tmp_path}/take1-2.####.exr") == ({1: tmp_path / "take1-2.0001.exr"}, None)
+    assert find_files(f"{tmp_path}/take1-2####.exr") == ({1: tmp_path / "take1-20001.exr"}, None)
+
+
+@pytest.mark.parametrize("name", ["plates_####", "100%04d", "[1]", "a b 1-3", "$F4", "v@2"])
+def test_folders_may_have_names_that_look_like_patterns(tmp_path, name):
+    home = tmp_path / name
+    home.mkdir()
+    (home / "a.0001.exr").touch()
+    for spec in (f"{home}/a.####.exr", f"{home}/a.*.exr", f"{home}/a.####.exr 1-1", str(home), f"{home}/a.0001.exr"):
+        assert find_files(spec)[0] == {1: home / "a.0001.exr"}
+
+
+def test_the_hyphen_of_a_name_is_no_sign(tmp_path):
+    for number in range(1, 4):
+        (tmp_path / f"shot-{number:04d}.exr").touch()
+    for spec in (tmp_path, tmp_path / "shot-####.exr", tmp_path / "shot-*.exr"):
+        assert list(find_files(str(spec))[0]) == [1, 2, 3]
+    assert list(find_files(f"{tmp_path}/shot-0002.exr")[0]) == [2]
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "shot.-001.exr").touch()
+    assert list(find_files(str(other))[0]) == [-1]
+    assert parse_pattern(f"{other}/shot.####.exr")[0].path(-1).name == "shot.-001.exr"
+
+
+def test_numbers_of_several_widths(tmp_path):
+    for name in ("a.9999.exr", "a.10000.exr", "a.01.exr", "a.0001.exr"):
+        (tmp_path / name).touch()
+    files, _ = find_files(f"{tmp_path}/a.####.exr")
+    assert {n: path.name for n, path in files.items()} == {1: "a.0001.exr", 9999: "a.9999.exr", 10000: "a.10000.exr"}
+    assert find_files(f"{tmp_path}/a.##.exr")[0][1].name == "a.01.exr"
+
+
+def test_what_is_not_there_is_said_with_what_is(folder):
+    for spec in ("beauty.####.exr", "beauty.$F4.exr", "beauty.exr", "b*.exr"):
+        with pytest.raises(FileNotFoundError, match=r"aov1_v002\.####\.exr 8-12"):
+            find_files(f"{folder}/{spec}")
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        find_files(f"{folder}/nowhere/a.####.exr")
