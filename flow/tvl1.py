@@ -15,11 +15,8 @@ from flow.warp import locate
 _THETA = np.float32(0.3)
 _DUAL_STEP = np.float32(0.25 / 0.3)
 
-# Contraction and reassociation only: input is sanitised, but a guide may still hold what the caller made.
-_FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _step_primal(
     u: np.ndarray, v: np.ndarray, dual: np.ndarray, rho: np.ndarray, gx: np.ndarray, gy: np.ndarray,
     inverse_square: np.ndarray, bound: np.ndarray,
@@ -38,7 +35,7 @@ def _step_primal(
             v[y, x] += _THETA * (dual[2, y + 1, x + 1] - dual[2, y + 1, x] + dual[3, y + 1, x + 1] - dual[3, y, x + 1])
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _step_dual(u: np.ndarray, v: np.ndarray, dual: np.ndarray) -> None:
     """Follow the gradient of the flow; the dual's first row and column are a border of zeros."""
     height, width = u.shape
@@ -58,7 +55,7 @@ def _step_dual(u: np.ndarray, v: np.ndarray, dual: np.ndarray) -> None:
             )
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _linearize(
     centre: np.ndarray, neighbour: np.ndarray, noise: np.ndarray, base: np.ndarray, u: np.ndarray, v: np.ndarray,
     attachment: float, rho: np.ndarray, gx: np.ndarray, gy: np.ndarray, inverse_square: np.ndarray,
@@ -100,7 +97,7 @@ def _linearize(
                 bound[g, y, x] = _THETA * np.float32(attachment) * trust if inside else np.float32(0)
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _with_gradients(planes: np.ndarray) -> np.ndarray:
     """Interleave (H, W, G) with its central differences in x and y, halved across the edge."""
     height, width, channels = planes.shape
@@ -296,7 +293,7 @@ def refine_flow(
     return _solve(centre, neighbour, deviation, base, np.zeros_like(base), scales, warps, iterations, attachment)
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _photometric_error(
     centre: np.ndarray, neighbour: np.ndarray, scale: np.ndarray, flow: np.ndarray, error: np.ndarray,
     evidence: np.ndarray,

@@ -7,9 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit, prange
 
-# Contraction and reassociation only: "nnan" and "ninf" would let one NaN pixel spoil the frame.
-_FAST = {"contract", "reassoc", "nsz", "arcp"}
-
 
 @njit(inline="always")
 def locate(
@@ -29,7 +26,7 @@ def locate(
     return inside, x0, y0, x1, y1, fx, fy
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
     one = np.float32(1)
@@ -74,7 +71,7 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
     )
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _bicubic(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
     for y in prange(flow.shape[0]):

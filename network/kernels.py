@@ -405,7 +405,7 @@ def _planes(tensor: Tensor) -> NDArray[Any]:
     return planes
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _add_taps(
     kernels: NDArray[Any], padded: NDArray[Any], sums: NDArray[Any], columns: tuple[int, ...]
 ) -> None:  # pragma: no cover - compiled
@@ -423,7 +423,7 @@ def _add_taps(
                     sums[frame, channel, y, x] = total
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _to_taps(
     to_sums: NDArray[Any], padded: NDArray[Any], to_kernels: NDArray[Any], size: int
 ) -> None:  # pragma: no cover - compiled
@@ -443,7 +443,7 @@ def _to_taps(
                     gradient[x] += given[x] * read[x]
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _to_frames(
     to_sums: NDArray[Any], kernels: NDArray[Any], to_padded: NDArray[Any], size: int
 ) -> None:  # pragma: no cover - compiled

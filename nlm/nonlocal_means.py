@@ -122,7 +122,7 @@ def joint_nlm(
     return _filter(window, variance, features, feature_variance, confidence, radius, patch_radius, np.float32(k))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _add_color_distance(d, pu, pa, qu, qa, cancel):  # type: ignore[no-untyped-def]
     for x in range(d.size):
         diff = pu[x] - qu[x]
@@ -132,7 +132,7 @@ def _add_color_distance(d, pu, pa, qu, qa, cancel):  # type: ignore[no-untyped-d
         d[x] += v if v < np.float32(_PIXEL_CAP) else np.float32(_PIXEL_CAP)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _max_feature_distance(d, pf, qf, noise, scale):  # type: ignore[no-untyped-def]
     for x in range(d.size):
         diff = pf[x] - qf[x]
@@ -140,14 +140,14 @@ def _max_feature_distance(d, pf, qf, noise, scale):  # type: ignore[no-untyped-d
         d[x] = v if v > d[x] else d[x]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _reject_far(d, pu, pa, qu, qa, limit):  # type: ignore[no-untyped-def]
     for x in range(d.size):
         diff = pu[x] - qu[x]
         d[x] = np.float32(_NEVER) if diff * diff > limit * (pa[x] + qa[x]) else d[x]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _accumulate(total, w, values, centre):  # type: ignore[no-untyped-def]
     # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
     for x in range(w.size):
@@ -214,7 +214,7 @@ def _load_features(f, noise, scale, features, variance, top, left):  # type: ign
                 scale[c, y, x] = 1 / tolerance
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"}, boundscheck=False)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", boundscheck=False)
 def _filter(window, variance, features, feature_variance, confidence, radius, patch, k):  # type: ignore[no-untyped-def]
     T, H, W, C = window.shape
     F = features.shape[2]

@@ -65,6 +65,17 @@ def test_the_extension_for_blender_imports_blender_and_nothing_else():
         assert imports(path) - {"bpy"} <= sys.stdlib_module_names, path.name
 
 
+def test_compiled_loops_leave_the_order_of_arithmetic_alone():
+    """With fastmath a process that had compiled a loop gave other last digits than one that found it in the cache."""
+    loops = 0
+    for path in (path for package in ("flow", "nlm", "network") for path in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "njit":
+                loops += 1
+                assert "fastmath" not in {keyword.arg for keyword in node.keywords}, f"{path.name}:{node.lineno}"
+    assert loops > 10
+
+
 def test_the_core_imports_no_peer_at_start():
     """Importing the command must not load what only some of its commands need."""
     code = "import sys, hybrid, hybrid.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"
