@@ -24,9 +24,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flow.confidence import estimate_confidence, mix_centre
-from flow.guide import prefilter_guide
+from flow.guide import make_guide, pair_guides
 from flow.motion import CYCLES, compose_flow, forward_backward_error, invert_flow, normalize_motion
-from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.selection import select_flow
+from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
 
 
@@ -71,8 +72,11 @@ def main(argv: list[str]) -> int:
     numba.set_num_threads(options.threads)
     pair = make_pair(width, height)
     flow, color, albedo, normal = (pair[name] for name in ("flow", "color", "albedo", "normal"))
-    centre, noise = prefilter_guide(color, albedo, normal)
-    neighbour, _ = prefilter_guide(pair["neighbour_color"], pair["neighbour_albedo"], normal)
+    neighbour_color, neighbour_albedo = pair["neighbour_color"], pair["neighbour_albedo"]
+    guides = pair_guides(
+        make_guide(color, albedo, exposure=0.5), make_guide(neighbour_color, neighbour_albedo, exposure=0.5)
+    )
+    luminance = pair_guides(make_guide(color, exposure=0.5), make_guide(neighbour_color, exposure=0.5))
     rng = np.random.default_rng(1)
     start = flow + rng.normal(size=flow.shape).astype(np.float32)
     stack = np.dstack([color, albedo, normal, color[..., :1]])
@@ -86,16 +90,13 @@ def main(argv: list[str]) -> int:
         "warp bilinear 3": lambda: warp(color, flow),
         "warp bilinear 10": lambda: warp(stack, flow),
         "warp bicubic 10": lambda: warp(stack, flow, interpolation="bicubic"),
-        "prefilter_guide": lambda: prefilter_guide(color, albedo),
-        "prefilter_guide with normal": lambda: prefilter_guide(color, albedo, normal),
-        "refine_flow 3/3/30": lambda: refine_flow(centre[..., 0], neighbour[..., 0], start, noise=noise[..., 0]),
-        "refine_flow 3/3/30, 2 guides": lambda: refine_flow(centre, neighbour, start, noise=noise),
-        "refine_flow 2/2/15": lambda: refine_flow(
-            centre[..., 0], neighbour[..., 0], start, noise=noise[..., 0], **light
-        ),
-        "refine_flow 2/2/15, 2 guides": lambda: refine_flow(centre, neighbour, start, noise=noise, **light),
-        "select_flow": lambda: select_flow([flow, start], centre, neighbour, noise=noise),
-        "dense_flow": lambda: dense_flow(centre, neighbour, noise=noise),
+        "make_guide": lambda: make_guide(color, albedo, exposure=0.5),
+        "refine_flow 3/3/30": lambda: refine_flow(luminance, start),
+        "refine_flow 3/3/30, 2 guides": lambda: refine_flow(guides, start),
+        "refine_flow 2/2/15": lambda: refine_flow(luminance, start, **light),
+        "refine_flow 2/2/15, 2 guides": lambda: refine_flow(guides, start, **light),
+        "select_flow": lambda: select_flow([flow, start], guides),
+        "dense_flow": lambda: dense_flow(guides),
         "estimate_confidence": lambda: estimate_confidence(
             flow, inside=inside, reverse=-flow, albedo=albedo, warped_albedo=warped, normal=normal, warped_normal=normal
         ),

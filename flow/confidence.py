@@ -60,29 +60,28 @@ def estimate_confidence(
 
     Parameters
     ----------
-    flow
-        (H, W, 2) float, pixels, finite, centre to neighbour.
-    inside
-        (H, W) bool, as `flow.warp.warp` gives it; false also where the vector, or a pixel it leads to, is no good.
-    reverse
-        (H, W, 2) float, neighbour to centre, or None. Of the whole frame, also where all else is of some of its rows.
-    albedo, warped_albedo
-        (H, W) or (H, W, C) float, of the centre and of the warped neighbour. One may come with the other only; so
-        for the normals.
-    normal, warped_normal
-        (H, W, 3) float, any one space; any length, 0 where there is no surface.
-    first_row
+    flow : (H, W, 2) float array
+        Pixels, finite, centre to neighbour.
+    inside : (H, W) bool array
+        As `flow.warp.warp` gives it; false also where the vector, or a pixel it leads to, is no good.
+    reverse : (H, W, 2) float array, optional
+        Pixels, neighbour to centre. Of the whole frame, also where all else is of some of its rows.
+    albedo, warped_albedo : (H, W) or (H, W, C) float array, optional
+        Of the centre and of the warped neighbour. One may come with the other only; so for the normals.
+    normal, warped_normal : (H, W, 3) float array, optional
+        In any one space, of any length, 0 where there is no surface.
+    first_row : int
         The frame's row that the first row of `flow` belongs to.
 
     Returns
     -------
-    numpy.ndarray
-        (H, W) float32 in [0, 1]. Non-finite guides give 0.
+    (H, W) float32 array
+        In [0, 1]. Guides that are not finite give 0.
 
     Raises
     ------
     ValueError
-        Half a pair, or shapes that do not agree.
+        If half a pair is given, or shapes do not agree.
 
     Notes
     -----
@@ -126,18 +125,23 @@ def mix_centre(
 
     Parameters
     ----------
-    warped, centre
-        (H, W) or (H, W, C) float, any unit.
-    confidence
-        (H, W) float in [0, 1].
-    out
-        float32, contiguous, the shape of `centre`: where the result is written. Without: a new one.
+    warped, centre : (H, W) or (H, W, C) float array
+        In any unit.
+    confidence : (H, W) float array
+        In [0, 1].
+    out : float32 array, optional
+        Contiguous, of the shape of `centre`: where the result is written. Without: a new one.
 
     Returns
     -------
-    numpy.ndarray
-        float32, the shape of `centre`: c · warped + (1 − c) · centre; exactly the centre where c is 0, whatever
-        `warped` holds there.
+    float32 array
+        Of the shape of `centre`: ``c · warped + (1 − c) · centre``, exactly the centre where c is 0, whatever `warped`
+        holds there.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree.
     """
     if warped.shape != centre.shape or confidence.shape != centre.shape[:2]:
         raise ValueError(

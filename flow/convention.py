@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.guide import estimate_noise, median_luminance, prefilter_guide, tone_map
+from flow.guide import estimate_noise, make_guide, median_luminance, pair_guides, tone_map
 from flow.motion import UNITS, VERTICAL, MotionConvention, normalize_motion
 from flow.tvl1 import dense_flow
 from flow.warp import locate
@@ -465,13 +465,11 @@ def _found(pair: FramePair) -> np.ndarray:
     factor = min(1.0, float(np.sqrt(FOUND_PIXELS / (height * width))))
     size = max(1, round(width * factor)), max(1, round(height * factor))
     exposure = median_luminance(pair.earlier)
-    guides, noises = [], []
-    for color in (pair.later, pair.earlier):
-        small = color if factor == 1 else cv2.resize(np.nan_to_num(color), size, interpolation=cv2.INTER_AREA)
-        guide, noise = prefilter_guide(small, exposure=exposure)
-        guides.append(guide)
-        noises.append(noise)
-    flow = dense_flow(*guides, noise=np.maximum(*noises))
+    later, earlier = (
+        color if factor == 1 else cv2.resize(np.nan_to_num(color), size, interpolation=cv2.INTER_AREA)
+        for color in (pair.later, pair.earlier)
+    )
+    flow = dense_flow(pair_guides(make_guide(later, exposure=exposure), make_guide(earlier, exposure=exposure)))
     if factor == 1:
         return flow
     return cv2.resize(flow, (width, height)) * np.array([width / size[0], height / size[1]], np.float32)

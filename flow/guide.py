@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
 _REC709 = np.array([0.2126, 0.7152, 0.0722], np.float32)
+# Of the guided filter that the luminance goes through, pixels.
+_RADIUS = 2
 
 
 def _luminance(image: np.ndarray) -> np.ndarray:
@@ -42,15 +46,20 @@ def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
 
     Parameters
     ----------
-    image
-        (H, W) or (H, W, C) float, finite, in any unit.
-    spacing
+    image : (H, W) or (H, W, C) float array
+        Finite, in any unit.
+    spacing : int
         Distance, pixels, at which the noise is independent: 1, or the diameter of the filter it went through.
 
     Returns
     -------
-    numpy.ndarray
-        Standard deviation, float32, the shape and unit of `image`.
+    float32 array
+        Standard deviation, of the shape and unit of `image`.
+
+    Raises
+    ------
+    ValueError
+        If `image` has another number of axes, or no pixel.
 
     Notes
     -----
@@ -73,42 +82,96 @@ def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
     return (cv2.blur(np.sqrt(response), (15, 15)) ** 2 / np.float32(0.676)).reshape(image.shape)
 
 
-def prefilter_guide(
-    color: np.ndarray,
-    albedo: np.ndarray | None = None,
-    normal: np.ndarray | None = None,
-    *,
-    exposure: float | None = None,
-    radius: int = 2,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Make the guides that flows are refined on: tone-mapped luminance, smoothed within its surfaces, and albedo.
+class Guide(NamedTuple):
+    """What flows are refined on, of one frame.
+
+    Attributes
+    ----------
+    planes : (H, W, G) float array
+        In [0, 1], and little disturbed by noise.
+    noise : (H, W, G) float array
+        The standard deviation of what noise is left in each.
+    """
+
+    planes: np.ndarray
+    noise: np.ndarray
+
+
+class GuidePair(NamedTuple):
+    """The guides of two frames, of equal exposure, and their noise; see `pair_guides`.
+
+    Attributes
+    ----------
+    centre, neighbour : (H, W, G) float32 array
+        In [0, 1], finite.
+    noise : (H, W, G) float32 array
+        The greater standard deviation of the two.
+    """
+
+    centre: np.ndarray
+    neighbour: np.ndarray
+    noise: np.ndarray
+
+
+def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
+    """Put the guides of two frames together.
 
     Parameters
     ----------
-    color
-        (H, W, 3) float, linear radiance. Negative and NaN count as 0, Inf as white.
-    albedo
-        (H, W, 3) float >= 0, or None. It steers the smoothing, and is a guide of its own.
-    normal
-        (H, W, 3) float, or None. It steers the smoothing too.
-    exposure
-        The radiance that maps to 0.5. Missing: `color`'s own median of positive luminances; pass one value for
-        all frames of a shot, or their guides may differ in brightness.
-    radius
-        Of the guided filter, pixels.
+    centre, neighbour : Guide
+        Of one shape. Planes that are not finite are 0 (+Inf: 1).
 
     Returns
     -------
-    guide
-        (H, W, G) float32 in [0, 1]: luminance, and the albedo's where there is an albedo. The same for
-        `a * color` where `exposure` is missing.
-    noise
-        (H, W, G) float32: the estimated standard deviation of each.
+    GuidePair
+        For `flow.tvl1` and `flow.selection`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not agree, or are none of (H, W, G).
+    """
+    shape = centre.planes.shape
+    if centre.planes.ndim != 3 or centre.planes.size == 0:
+        raise ValueError(f"centre guide has shape {shape}, expected a non-empty (H, W, G)")
+    others = {"noise of the centre": centre.noise, "neighbour guide": neighbour.planes, "its noise": neighbour.noise}
+    for name, planes in others.items():
+        if planes.shape != shape:
+            raise ValueError(f"{name} has shape {planes.shape}, expected that of the centre guide, {shape}")
+    first, second = (
+        np.nan_to_num(np.ascontiguousarray(guide.planes, np.float32), nan=0.0, posinf=1.0, neginf=0.0)
+        for guide in (centre, neighbour)
+    )
+    return GuidePair(first, second, np.maximum(centre.noise, neighbour.noise, dtype=np.float32))
+
+
+def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure: float) -> Guide:
+    """Make what flows are refined on: tone-mapped luminance, smoothed within its surfaces, and albedo.
+
+    Parameters
+    ----------
+    color : (H, W, 3) float array
+        Linear radiance. Negative and NaN count as 0, Inf as white.
+    albedo : (H, W, 3) float array, optional
+        At least 0. It steers the smoothing, and is a guide of its own. Without one the luminance steers itself.
+    exposure : float
+        The radiance that maps to 0.5, positive: one value for both frames of a pair, or their guides differ in
+        brightness.
+
+    Returns
+    -------
+    Guide
+        Luminance, and the albedo's where there is an albedo. The same for ``a * color`` and ``a * exposure``.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not agree, or the exposure is not positive.
 
     Notes
     -----
-    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided filter.
-    With neither albedo nor normal the luminance steers itself.
+    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided filter over
+    5 x 5 pixels.
 
     References
     ----------
@@ -116,25 +179,19 @@ def prefilter_guide(
     """
     if color.ndim != 3 or color.shape[2] != 3:
         raise ValueError(f"color has shape {color.shape}, expected (H, W, 3)")
-    for name, aov in (("albedo", albedo), ("normal", normal)):
-        if aov is not None and aov.shape != color.shape:
-            raise ValueError(f"{name} has shape {aov.shape}, expected that of color, {color.shape}")
-    tone = tone_map(color, median_luminance(color) if exposure is None else exposure)
-    steer = []
-    if albedo is not None:
+    if albedo is not None and albedo.shape != color.shape:
+        raise ValueError(f"albedo has shape {albedo.shape}, expected that of color, {color.shape}")
+    tone = tone_map(color, exposure)
+    if albedo is None:
+        # Contrasts of the steering image below the root of the last number are smoothed over. Its own noise is strong.
+        smooth = cv2.ximgproc.guidedFilter(tone, tone, _RADIUS, 1e-2)
+    else:
         reflectance = _luminance(albedo)
         reflectance /= 1 + reflectance
-        steer.append(reflectance)
-    if normal is not None:
-        # Two components tell surfaces apart, and the filter takes three channels at most.
-        steer.append(0.5 * np.nan_to_num(np.asarray(normal[..., :2], np.float32), posinf=0.0, neginf=0.0))
-    # 1e-3: contrasts of the steering image below 0.03 (its range is about 1) are smoothed over. Noise of the
-    # luminance itself is stronger than that, so it steers itself with 0.1.
-    tolerance = 1e-3 if steer else 1e-2
-    smooth = cv2.ximgproc.guidedFilter(np.dstack(steer) if steer else tone, tone, radius, tolerance)
-    guide = [np.clip(smooth, 0, 1)]
-    noise = [estimate_noise(guide[0], spacing=2 * radius)]
+        smooth = cv2.ximgproc.guidedFilter(reflectance[..., None], tone, _RADIUS, 1e-3)
+    luminance = np.clip(smooth, 0, 1)
+    planes, noise = [luminance], [estimate_noise(luminance, spacing=2 * _RADIUS)]
     if albedo is not None:
-        guide.append(reflectance)
+        planes.append(reflectance)
         noise.append(estimate_noise(reflectance))
-    return np.dstack(guide), np.dstack(noise)
+    return Guide(np.dstack(planes), np.dstack(noise))

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
 
+class Place(NamedTuple):
+    """Whether a position is in the frame, the four pixels around it, and how far from the first, (x0, y0), it is."""
+
+    inside: np.bool
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+    fx: np.float32
+    fy: np.float32
+
+
 @njit(inline="always")
-def locate(
-    px: np.float32, py: np.float32, width: int, height: int
-) -> tuple[np.bool, int, int, int, int, np.float32, np.float32]:
-    """Find the four pixels around a position, and its place between them: (inside, x0, y0, x1, y1, fx, fy)."""
+def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
+    """Find the four pixels around a position."""
     # Written so that a NaN or infinite position fails the test.
     inside = px >= -0.5 and px <= width - 0.5 and py >= -0.5 and py <= height - 0.5
     # Clamping the position is the same as repeating the edge; NaN falls to 0.
@@ -23,27 +34,41 @@ def locate(
     # A neighbour of weight 0 is not read: on whole-pixel motion it could only bring in a NaN.
     x1 = x0 + 1 if fx > 0 else x0
     y1 = y0 + 1 if fy > 0 else y0
-    return inside, x0, y0, x1, y1, fx, fy
+    return Place(inside, x0, y0, x1, y1, fx, fy)
+
+
+@njit(inline="always")
+def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Bilinear weights of the four pixels around a position, row by row; they sum to 1."""
+    one = np.float32(1)
+    fx, fy = place.fx, place.fy
+    return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+
+
+@njit(inline="always")
+def interpolate(
+    image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
+) -> np.float32:
+    """Sample a channel of (H, W, C) bilinearly, with the weights of `weigh`."""
+    return (
+        weights[0] * image[place.y0, place.x0, channel] + weights[1] * image[place.y0, place.x1, channel]
+        + weights[2] * image[place.y1, place.x0, channel] + weights[3] * image[place.y1, place.x1, channel]
+    )  # fmt: skip
 
 
 @njit(parallel=True, nogil=True, cache=True)
 def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
-    one = np.float32(1)
     for y in prange(flow.shape[0]):
         for x in range(width):
-            inside[y, x], x0, y0, x1, y1, fx, fy = locate(
-                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
-            )
-            w00, w01, w10, w11 = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+            place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
+            inside[y, x] = place.inside
+            weights = weigh(place)
             for c in range(channels):
-                out[y, x, c] = (
-                    w00 * image[y0, x0, c] + w01 * image[y0, x1, c]
-                    + w10 * image[y1, x0, c] + w11 * image[y1, x1, c]
-                )  # fmt: skip
+                out[y, x, c] = interpolate(image, c, place, weights)
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, nogil=True, cache=True)
 def _nearest(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
     height, width, channels = image.shape
     half = np.float32(0.5)
@@ -110,30 +135,29 @@ def warp(
 
     Parameters
     ----------
-    image
-        (H, W) or (H, W, C) float; taken as float32. NaN and Inf are the caller's to remove: one spreads to
-        every pixel that samples it.
-    flow
-        (H, W, 2) float, pixels, x right then y down; or (h, W, 2), of some of the rows.
-    interpolation
+    image : (H, W) or (H, W, C) float array
+        In any unit; taken as float32. NaN and Inf are the caller's to remove: one spreads to every pixel that samples
+        it.
+    flow : (H, W, 2) or (h, W, 2) float array
+        Pixels, x right then y down; of all rows, or of some.
+    interpolation : str
         "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position,
         so that it never rings (nor goes below zero) beside a firefly; or "nearest", which leaves noise as it is.
-    first_row
+    first_row : int
         The image's row that the first row of `flow` belongs to.
 
     Returns
     -------
-    warped
-        float32, the shape of `image`, less the rows without flow: `image[y + v, x + u]`; outside the frame the edge
-        value.
-    inside
-        (H, W) bool, of the same rows: the position lies on a pixel of the frame, x + u in [-0.5, W - 0.5] and y + v
-        alike. False where the flow is not finite.
+    warped : float32 array
+        Of the shape of `image`, less the rows without flow: `image[y + v, x + u]`; outside the frame the edge value.
+    inside : (H, W) or (h, W) bool array
+        Whether the position lies on a pixel of the frame: x + u in [-0.5, W - 0.5], and y + v alike. False where the
+        flow is not finite.
 
     Raises
     ------
     ValueError
-        The shapes do not agree, or `interpolation` is unknown.
+        If the shapes do not agree, or `interpolation` is unknown.
 
     Notes
     -----

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.confidence import estimate_confidence, mix_centre
-from flow.guide import prefilter_guide as prefilter_flow_guide
+from flow.guide import make_guide, pair_guides
 from flow.motion import compose_flow, forward_backward_error
-from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.selection import select_flow
+from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.transfer import measure_exposure, remodulate
@@ -310,17 +311,17 @@ class Aligner:
         if vectors is not None and "refine" not in self.stages:
             return vectors
         exposure = measure_exposure(here.radiance)
-        guide, noise = prefilter_flow_guide(here.radiance, here.albedo, exposure=exposure)
-        other, other_noise = prefilter_flow_guide(there.radiance, there.albedo, exposure=exposure)
-        noise = np.maximum(noise, other_noise)
+        guides = pair_guides(
+            make_guide(here.radiance, here.albedo, exposure=exposure),
+            make_guide(there.radiance, there.albedo, exposure=exposure),
+        )
         if vectors is None:
-            return dense_flow(guide, other, noise=noise), np.ones(shape, bool)
+            return dense_flow(guides), np.ones(shape, bool)
         flow, valid = vectors
         back = rendered_flow(there, here)
         # Hidden in the other frame: whatever matches there is another surface.
         visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
-        refined = self.refine(guide, other, flow, noise=noise)
-        flow, _ = select_flow([flow, refined], guide, other, noise=noise, visible=visible)
+        flow, _ = select_flow([flow, self.refine(guides, flow)], guides, visible=visible)
         return flow, valid
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:

@@ -7,6 +7,7 @@ from flow.tvl1 import dense_flow, refine_flow
 from hybrid.estimates import OfFrames
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
+from tests.flow.scenes import plain
 from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 
 SIZES = [(1, 1), (1, 2), (2, 1), (1, 17), (17, 1), (2, 3), (3, 3), (5, 5), (7, 11), (13, 31), (31, 13), (16, 16)]
@@ -49,9 +50,9 @@ def test_the_network_takes_any_size(size):
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_motion_is_looked_for_in_any_size(size):
     rng = np.random.default_rng(0)
-    first, second = rng.random((2, *size), np.float32)
-    assert np.isfinite(dense_flow(first, second)).all()
-    assert np.isfinite(refine_flow(first, second, np.zeros((*size, 2), np.float32))).all()
+    guides = plain(*rng.random((2, *size), np.float32))
+    assert np.isfinite(dense_flow(guides)).all()
+    assert np.isfinite(refine_flow(guides, np.zeros((*size, 2), np.float32))).all()
 
 
 @pytest.mark.parametrize("size", [(3, 33_000), (33_000, 3)], ids=["wide", "tall"])

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flow.confidence import estimate_confidence, mix_centre
-from flow.guide import estimate_noise, prefilter_guide
+from flow.guide import Guide, estimate_noise, make_guide, pair_guides
 from flow.motion import (
     CYCLES,
     MotionConvention,
@@ -17,7 +17,8 @@ from flow.motion import (
     invert_flow,
     normalize_motion,
 )
-from flow.tvl1 import dense_flow, refine_flow, select_flow
+from flow.selection import select_flow
+from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
 from hybrid.alignment.transfer import compress, demodulate, expand, measure_exposure, remodulate
 from nlm import variance as variances
@@ -152,28 +153,27 @@ def test_confidence_is_between_nought_and_one(drawn):
 
 
 @anything
-@given(images(3, wrong=True, negative=True), st.booleans(), st.booleans())
-def test_the_guides_of_the_flow_are_between_nought_and_one(drawn, with_albedo, with_normal):
-    color, rng = drawn
+@given(images(3, wrong=True, negative=True), st.booleans())
+def test_the_guides_of_the_flow_are_between_nought_and_one(drawn, with_albedo):
+    color, _ = drawn
     albedo = np.abs(np.nan_to_num(color, posinf=1e30, neginf=0)) if with_albedo else None
-    normal = rng.normal(size=color.shape).astype(np.float32) if with_normal else None
-    guide, noise = prefilter_guide(color, albedo, normal)
-    assert between(guide, 0, 1)
-    assert np.isfinite(noise).all()
-    assert np.isfinite(estimate_noise(guide)).all()
+    guide = make_guide(color, albedo, exposure=measure_exposure(color))
+    assert between(guide.planes, 0, 1)
+    assert np.isfinite(guide.noise).all()
+    assert np.isfinite(estimate_noise(guide.planes)).all()
 
 
 @settings(anything, max_examples=15)  # the slowest
 @given(images(2, wrong=True), st.booleans())
 def test_refined_flow_is_finite(drawn, dense):
-    guide, rng = drawn
-    shape = guide.shape[:2]
-    other = np.roll(guide, 1, axis=0)
-    noise = rng.random(guide.shape, np.float32)
+    planes, rng = drawn
+    shape = planes.shape[:2]
+    noise = rng.random(planes.shape, np.float32)
+    guides = pair_guides(Guide(planes, noise), Guide(np.roll(planes, 1, axis=0), noise))
     start = flows(rng, shape, wrong=True)
-    found = dense_flow(guide, other, noise=noise) if dense else refine_flow(guide, other, start, noise=noise)
+    found = dense_flow(guides) if dense else refine_flow(guides, start)
     assert np.isfinite(found).all()
-    flow, choice = select_flow([flows(rng, shape), found], guide, other, noise=noise)
+    flow, choice = select_flow([flows(rng, shape), found], guides)
     assert np.isfinite(flow).all()
     assert choice.max() <= 1
 

@@ -115,7 +115,7 @@ class TestSweep:
 
         def spy(*arguments: np.ndarray, **settings: object) -> np.ndarray:
             seen.append(settings)
-            return arguments[2]
+            return arguments[1]
 
         monkeypatch.setattr(methods, "refine_flow", spy)
         run = partial(METHODS[CLASSICAL].run, solver={"scales": 1, "warps": 2, "iterations": 10})
