@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skimage.restoration import denoise_nl_means
+from skimage.restoration import denoise_nl_means, estimate_sigma
 
 from flow.tvl1 import refine_flow
 from hybrid.alignment.align import AlignedWindow, Aligner
@@ -268,9 +268,8 @@ def _radiance(tone: NDArray[np.floating], exposure: float) -> Array:
 
 
 def _noise_of(tone: Array) -> float:
-    """Standard deviation of the noise by the median absolute diagonal difference (Donoho and Johnstone 1994)."""
-    diagonal = (tone[1::2, 1::2][: tone.shape[0] // 2] - tone[:-1:2, 1::2] - tone[1::2, :-1:2] + tone[:-1:2, :-1:2]) / 2
-    return float(np.median(np.abs(diagonal)) / 0.6745)
+    """Standard deviation of the noise of a picture."""
+    return float(estimate_sigma(tone, average_sigmas=True, channel_axis=-1))
 
 
 def _finite(image: Array) -> Array:

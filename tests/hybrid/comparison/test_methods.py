@@ -22,7 +22,7 @@ from nlm.average import average
 from tests.scenes import Scene
 
 SCENE = Scene(frames=3, height=32, width=40)
-NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch"}
+NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch", "scikit-image": "pywt", "OpenCV": "pywt"}
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,7 @@ def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) ->
 
 
 def test_noise_of_a_tone_mapped_frame_is_found() -> None:
+    pytest.importorskip("pywt")
     rng = np.random.default_rng(2)
     slope = np.linspace(0.2, 0.6, 121, dtype=np.float32)[None, :, None] * np.ones((81, 1, 3), np.float32)
     noisy = slope + 0.03 * rng.normal(size=slope.shape).astype(np.float32)
