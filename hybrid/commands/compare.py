@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -101,20 +102,23 @@ def compare(
     import tempfile
 
     from hybrid.comparison.compare import compare_shot, result_table
-    from hybrid.comparison.report import report_images, write_report
     from hybrid.comparison.results import Comparison, Cost, join, markdown_table, read_comparison
     from hybrid.comparison.samples import samples_of
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]
+    if output is not None:
+        _need_page()  # before anything runs
     others = [read_comparison(folder / "results.json") for folder in beside or ()]
     if shot is None or not reference:
         if not others or shot is not None or reference:
             raise typer.BadParameter("expected SHOT and --reference, or --beside with finished comparisons")
         joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
         if output is not None:
+            from hybrid.comparison.report import write_report
+
             LOG.info(f"wrote {write_report(output, joined, others=others, cost=cost)}")
-        _show(markdown, markdown_table(others, cost=cost), result_table(joined.results))
+        _show(markdown, markdown_table(others, cost), result_table(joined.results))
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
@@ -154,11 +158,20 @@ def compare(
             progress=show,
         )
         if output is not None:
+            from hybrid.comparison.report import report_images, write_report
+
             judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
             images, truth = report_images(Path(folder), comparison, judged)
             page = write_report(output, comparison, images, truth, judged, others=others, exposure=exposure, cost=cost)
             LOG.info(f"wrote {page}")
-    _show(markdown, markdown_table([comparison, *others], cost=cost), result_table(comparison.results))
+    _show(markdown, markdown_table([comparison, *others], cost), result_table(comparison.results))
+
+
+def _need_page() -> None:
+    """Refuse a page that cannot be made here."""
+    if find_spec("jinja2") is None:
+        words = "expected: pip install 'ravg[compare]' (the table alone is made without)"
+        raise ValueError(f"the page of --output needs jinja2, which is not installed; {words}")
 
 
 def _show(markdown: bool, text: str, table: RichTable) -> None:

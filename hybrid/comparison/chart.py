@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
+from hybrid.comparison.page import render
 from hybrid.comparison.results import (
     COSTS,
     Cost,
@@ -20,7 +21,6 @@ from hybrid.comparison.results import (
     column_title,
     format_bytes,
     format_seconds,
-    format_value,
     pareto_front,
 )
 
@@ -79,13 +79,18 @@ class Point:
     on_front: bool
     label: tuple[float, float, str] | None = None  # x of its left end, baseline, text
 
+    @property
+    def size(self) -> float:
+        """Radius of the marker: less for points of a sweep; the edge of a filled one has the paper's color."""
+        return RADIUS * (0.72 if self.result.sweep else 1) + self.on_front
+
 
 @dataclass(frozen=True)
 class Chart:
     """A chart laid out: everything in units of the picture, y down."""
 
-    title: str
-    cost_title: str
+    metric: Metric
+    cost: Cost
     box: tuple[float, float, float, float]  # left, top, right, bottom of the axes
     ticks_x: list[tuple[float, str]]
     ticks_y: list[tuple[float, str]]
@@ -153,8 +158,8 @@ def lay_out(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> Char
     gutters = [(LEFT, LEFT + GUTTER, "nothing")] if free else []
     gutters += [(right, right + GUTTER, "not known")] if unknown else []
     return Chart(
-        column_title(metric),
-        COSTS[cost],
+        metric,
+        cost,
         (left, TOP, right, BOTTOM),
         ticks_x,
         ticks_y,
@@ -283,84 +288,33 @@ def _text_width(text: str, weight: int = 400) -> float:
     return cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 10 * FONT / HERSHEY_HEIGHT, 1)[0][0] / 10
 
 
-# --- as SVG -------------------------------------------------------------------------------------------
+# As SVG
 
 
-def to_svg(chart: Chart, metric: Metric) -> str:
-    """Draw as an SVG element. Colours come from the page: classes ``f0`` … ``f6`` hold the families'.
+def to_svg(chart: Chart) -> Markup:
+    """Draw as an SVG element, which the page's style sheet colors.
 
     Each point is an element of class ``point`` that can have focus and says its method in ``data-name``.
     """
-    _, top, right, bottom = chart.box
-    out = []
-    for start, end, title in chart.gutters:
-        out.append(f'<rect class="gutter" x="{start}" y="{top}" width="{end - start}" height="{bottom - top}"/>')
-        out.append(_svg_text((start + end) / 2, bottom + 22, title, "tick", "middle"))
-    for x, text in chart.ticks_x:
-        out.append(f'<path class="grid" d="M{x:.1f} {top}V{bottom}"/>')
-        out.append(_svg_text(x, bottom + 22, text, "tick", "middle"))
-    for y, text in chart.ticks_y:
-        out.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
-        out.append(_svg_text(LEFT - 10, y + 4.5, text, "tick", "end"))
-    out.append(f'<path class="axis" d="M{LEFT} {bottom}H{WIDTH - RIGHT}"/>')
-    out.append(_svg_text(LEFT - 10, 14, f"{chart.title}, better ↑", "title", "start", shift=10 - LEFT + 2))
-    out.append(_svg_text(right, bottom + 46, f"{chart.cost_title} →", "title", "end"))
-    for family, line in chart.series:
-        out.append(f'<polyline class="series f{family % len(COLORS)}" data-family="{family}" points="{_path(line)}"/>')
-    if chart.front:
-        out.append(f'<polyline class="front-line" points="{_path(chart.front)}"/>')
-    for p in sorted(chart.points, key=lambda p: (p.on_front, p.x)):
-        out.append(_svg_point(p, metric))
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="group" aria-label="{escape(chart.title)} against '
-        f'{escape(chart.cost_title)}; arrow keys move between methods">{"".join(out)}</svg>'
+    return render(
+        "chart.svg",
+        chart=chart,
+        costs=COSTS,
+        width=WIDTH,
+        height=HEIGHT,
+        axis_left=LEFT,
+        axis_right=WIDTH - RIGHT,
+        colors=len(COLORS),
+        marker=marker,
     )
 
 
-def _svg_point(p: Point, metric: Metric) -> str:
-    s = p.result.metrics[metric.key]
-    says = (
-        f"{p.result.label}: {metric.label} {format_value(s.mean, metric)} {metric.unit}, "
-        f"{format_seconds(p.result.seconds_per_megapixel)} seconds per megapixel, "
-        f"{format_bytes(p.result.peak_bytes)}, {'on the front' if p.on_front else 'dominated'}"
-    )
-    kind = ("front" if p.on_front else "dominated") + (" swept" if p.result.sweep else "")
-    size = RADIUS * (0.72 if p.result.sweep else 1) + p.on_front  # the edge of a filled one is the paper's
-    shape = " ".join(f"{x * size:.2f},{y * size:.2f}" for x, y in SHAPES[p.family % len(SHAPES)])
-    bars = ""
-    if p.bar_x:
-        bars += f'<path class="bar" d="M{p.bar_x[0] - p.x:.1f} 0H{p.bar_x[1] - p.x:.1f}"/>'
-    if p.bar_y:
-        bars += f'<path class="bar" d="M0 {p.bar_y[0] - p.y:.1f}V{p.bar_y[1] - p.y:.1f}"/>'
-    name = ""
-    if p.label:
-        name = _svg_text(p.label[0] - p.x, p.label[1] - p.y, p.label[2], "name", "start")
-    return (
-        f'<g class="point {kind} f{p.family % len(COLORS)}" data-family="{p.family}" '
-        f'data-name="{escape(p.result.name)}" tabindex="-1" role="button" aria-label="{escape(says)}" '
-        f'transform="translate({p.x:.1f} {p.y:.1f})">'
-        f'{bars}<circle class="target" r="13"/><polygon points="{shape}"/>{name}</g>'
-    )
+def marker(family: int, size: float = RADIUS) -> str:
+    """The corners of a family's marker around the origin, as the points of an SVG polygon."""
+    return " ".join(f"{x * size:.2f},{y * size:.2f}" for x, y in SHAPES[family % len(SHAPES)])
 
 
-def _svg_text(x: float, y: float, text: str, kind: str, anchor: str, shift: float = 0.0) -> str:
-    return f'<text class="{kind}" x="{x + shift:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def _path(line: Sequence[tuple[float, float]]) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
-
-
-def legend_marker(family: int) -> str:
-    """Return a small SVG of a family's marker."""
-    shape = " ".join(f"{x * RADIUS:.2f},{y * RADIUS:.2f}" for x, y in SHAPES[family % len(SHAPES)])
-    return (
-        f'<svg class="marker f{family % len(COLORS)}" viewBox="-11 -11 22 22" aria-hidden="true">'
-        f'<polygon points="{shape}"/></svg>'
-    )
-
-
-# --- as pixels ----------------------------------------------------------------------------------------
+# As pixels
 
 SCALE = 1.6  # of the finished picture against the units above
 FINE = 2  # drawn so much larger, then averaged: OpenCV's own anti-aliasing is for thin lines only
@@ -387,8 +341,8 @@ def to_pixels(chart: Chart) -> NDArray[np.uint8]:
             thick, size = round(zoom / 2), size / HERSHEY_HEIGHT
             cv2.putText(canvas, words, at, cv2.FONT_HERSHEY_DUPLEX, size, _bgr(color), thick, cv2.LINE_AA)
 
-    def marker(x: float, y: float, family: int, filled: bool, size: float = RADIUS) -> None:
-        shape = np.array(SHAPES[family % len(SHAPES)]) * (size + filled) + (x, y)
+    def mark(x: float, y: float, family: int, filled: bool, size: float) -> None:
+        shape = np.array(SHAPES[family % len(SHAPES)]) * size + (x, y)
         corners = np.rint(shape * zoom * 16).astype(np.int32)
         color = COLORS[family % len(COLORS)]
         cv2.fillPoly(canvas, [corners], _bgr(color if filled else PAPER), cv2.LINE_AA, 4)
@@ -406,8 +360,8 @@ def to_pixels(chart: Chart) -> NDArray[np.uint8]:
         line((LEFT, y), (WIDTH - RIGHT, y), RULE)
         text(LEFT - 10, y + 4.5, words, FAINT, anchor=1)
     line((LEFT, bottom), (WIDTH - RIGHT, bottom), INK, 1.2)
-    text(2, 14, f"{chart.title}, better ↑", INK, 600)
-    text(right, bottom + 46, f"{chart.cost_title} →", INK, 600, anchor=1)
+    text(2, 14, f"{column_title(chart.metric)}, better ↑", INK, 600)
+    text(right, bottom + 46, f"{COSTS[chart.cost]} →", INK, 600, anchor=1)
     for family, points in chart.series:
         for a, b in pairwise(points):
             line(a, b, COLORS[family % len(COLORS)], 0.8)
@@ -418,13 +372,13 @@ def to_pixels(chart: Chart) -> NDArray[np.uint8]:
             line((p.bar_x[0], p.y), (p.bar_x[1], p.y), COLORS[p.family % len(COLORS)])
         if p.bar_y:
             line((p.x, p.bar_y[0]), (p.x, p.bar_y[1]), COLORS[p.family % len(COLORS)])
-        marker(p.x, p.y, p.family, p.on_front, RADIUS * (0.72 if p.result.sweep else 1))
+        mark(p.x, p.y, p.family, p.on_front, p.size)
         if p.label:
             text(*p.label, INK if p.on_front else FAINT, 600 if p.on_front else 400)
     for k, row in enumerate(rows):
         for x, family in row:
             y = HEIGHT + 14 + 24 * k
-            marker(x + RADIUS, y, family, True)
+            mark(x + RADIUS, y, family, True, RADIUS + 1)
             text(x + 3 * RADIUS, y + 4.5, chart.families[family], FAINT)
     size = (round(WIDTH * SCALE), round(tall * SCALE))
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), np.uint8)

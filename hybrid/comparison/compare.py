@@ -26,6 +26,7 @@ import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from rich.markup import escape
 from rich.table import Table
 
 from flow.motion import Vectors, forward_backward_error, invert_flow
@@ -427,7 +428,7 @@ def result_table(results: Sequence[MethodResult]) -> Table:
         table.add_column(heading, justify="right")
     for r in results:
         if r.absent_reason is not None:
-            table.add_row(r.label, *("–" for _ in table.columns[1:]), style="dim")
+            table.add_row(escape(r.label), *("–" for _ in table.columns[1:]), style="dim")
             continue
         cells = []
         for m in columns:
@@ -435,10 +436,10 @@ def result_table(results: Sequence[MethodResult]) -> Table:
             best, ties = verdicts[m.key]
             cells.append(f"[bold]{text}[/]" if r.name == best else f"≈ {text}" if r.name in ties else text)
         costs = format_seconds(r.seconds_per_megapixel), format_seconds(r.cpu_seconds_per_megapixel)
-        table.add_row(r.label, *cells, *costs, format_bytes(r.peak_bytes), format_worth(r.worth))
+        table.add_row(escape(r.label), *cells, *costs, format_bytes(r.peak_bytes), format_worth(r.worth))
     absent = [f"{r.label}: {r.absent_reason}" for r in results if r.absent_reason is not None]
     if absent:
-        table.caption = "absent – " + "; ".join(absent)
+        table.caption = escape("absent – " + "; ".join(absent))
     return table
 
 
@@ -623,7 +624,8 @@ def _save(folder: Path, name: str, number: int, image: NDArray[np.floating]) -> 
 
 
 def _file(folder: Path, name: str, number: int) -> Path:
-    return folder / quote(name, safe=" ,") / f"{number}.npy"
+    # A name may be ".." or hold a slash; `quote` leaves dots alone.
+    return folder / quote(name, safe=" ,").replace(".", "%2E") / f"{number}.npy"
 
 
 def _span(shot: Shot) -> str:

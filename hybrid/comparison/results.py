@@ -250,17 +250,13 @@ def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) ->
     return front
 
 
-def markdown_table(
-    comparisons: Sequence[Comparison],
-    metrics: Sequence[Metric] = METRICS,
-    cost: Cost = "seconds_per_megapixel",
-) -> str:
+def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
     """Return the README's table: PSNR and temporal PSNR on each shot, then the costs on the first.
 
     The best of a column is bold, what ties with it is marked "≈"; absent methods follow with their reason.
     Points of a sweep are left out.
     """
-    columns = [m for m in metrics if m.key in MARKDOWN_METRICS]
+    columns = [m for m in METRICS if m.key in MARKDOWN_METRICS]
     tables = [{r.name: r for r in c.results if not r.sweep} for c in comparisons]
     shown = [present_metrics(list(table.values()), columns) for table in tables]
     verdicts = [
@@ -304,7 +300,7 @@ class StageValue:
     cpu_seconds: float | None
 
 
-def stage_values(results: Sequence[MethodResult], metrics: Sequence[Metric] = METRICS) -> list[StageValue]:
+def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
     """What each stage buys and costs by the sweep named "Stages"; empty without one."""
     by_name = {r.name: r for r in results if r.absent_reason is None}
     values = []
@@ -315,7 +311,7 @@ def stage_values(results: Sequence[MethodResult], metrics: Sequence[Metric] = ME
         ((stage, state),) = variant.settings.items()
         ways = (base, variant) if state == "off" else (variant, base)
         gains, told = {}, []
-        for m in metrics:
+        for m in METRICS:
             if m.key in MARKDOWN_METRICS and m.key in base.metrics and m.key in variant.metrics:
                 gains[m.key] = ways[0].metrics[m.key].mean - ways[1].metrics[m.key].mean
                 if not _tied(ways[0].metrics[m.key], ways[1].metrics[m.key]):
@@ -356,6 +352,12 @@ def format_value(value: float, metric: Metric) -> str:
         return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
     text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
     return text.replace("-", "−")
+
+
+def format_change(value: float, metric: Metric) -> str:
+    """Print a difference of two figures, with its sign."""
+    text = format_value(value, metric)
+    return f"+{text}" if value > 0 else text
 
 
 def format_seconds(value: float | None) -> str:
@@ -401,21 +403,22 @@ def plain(result: MethodResult) -> dict[str, object]:
     return {**values, "settings": settings_as_text(result), "metrics": metrics}
 
 
+def to_plain_numbers(value: object) -> object:
+    """What JSON can hold: NumPy's numbers as Python's, those that are not finite as text that ``float`` reads."""
+    if isinstance(value, Mapping):
+        return {str(k): to_plain_numbers(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain_numbers(v) for v in value]
+    if isinstance(value, np.generic):
+        return to_plain_numbers(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
 def to_json(document: object, indent: int | None = None) -> str:
     """JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read."""
-
-    def finite(value: object) -> object:
-        if isinstance(value, Mapping):
-            return {str(k): finite(v) for k, v in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [finite(v) for v in value]
-        if isinstance(value, np.generic):
-            return finite(value.item())
-        if isinstance(value, float) and not math.isfinite(value):
-            return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-        return value
-
-    return json.dumps(finite(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:

@@ -1,0 +1,1 @@
+startChart(report.pictures ? startViewer(report.pictures) : null);

@@ -1,0 +1,54 @@
+"""The command `compare`: names that try to be something else, and a page that cannot be made."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybrid.cli import main
+from tests.scenes import Scene
+
+SMALL = Scene(height=24, width=32, frames=2)
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> tuple[Path, Path]:
+    """A noisy shot and its clean frames."""
+    return SMALL.write(tmp_path / "noisy"), SMALL.write(tmp_path / "clean", clean=True)
+
+
+@pytest.mark.parametrize("name", ["<img/onerror>", "[/bold] [red]", "../up", ".."])
+def test_a_hostile_name_is_shown_as_it_is(
+    shots: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:
+    """Markup of the terminal's tables raised an error after everything had run."""
+    monkeypatch.setenv("COLUMNS", "200")
+    noisy, clean = shots
+    words = [noisy, "--reference", clean, "--methods", "noisy", "--external", f"{name}={clean}", "--name", name]
+    code = main(["compare", *map(str, words), "--rounds", "1", "-o", str(tmp_path / "out" / "report")])
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    assert f" {name} " in printed.out
+    page = (tmp_path / "out" / "report" / "report.html").read_text(encoding="utf-8")
+    assert "<img" not in page
+    assert {path.name for path in tmp_path.iterdir()} == {"noisy", "clean", "out"}
+
+
+def test_without_jinja_the_page_is_refused_before_anything_runs(shots: tuple[Path, Path], tmp_path: Path) -> None:
+    noisy, clean = shots
+    code = "import sys; sys.modules['jinja2'] = None; from hybrid.cli import main; sys.exit(main(sys.argv[1:]))"
+    words = ["compare", noisy, "--reference", clean, "--methods", "noisy", "-o", tmp_path / "report"]
+    done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines() == [
+        "error: the page of --output needs jinja2, which is not installed; "
+        "expected: pip install 'ravg[compare]' (the table alone is made without)"
+    ]
+    assert not (tmp_path / "report").exists()
