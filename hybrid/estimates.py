@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
-from hybrid.files.frames import Frame, Shot, open_shot, output_path
+from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.oidn import HOLDS, denoise_oidn
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
@@ -204,7 +204,7 @@ def _choose(spec: str, shot: Shot, own: ClassicalPreset, kept: str | None, mode:
         if not _has_oidn():
             raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
         return EstimateSource(spec, _oidn(spec, shot, kept), "asked for")
-    sequence = open_shot(spec)
+    sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
@@ -261,5 +261,4 @@ def _run_or_read(frame: Frame, *, run: Callable[[Frame], Array], shot: Shot, kep
         path.parent.mkdir(parents=True, exist_ok=True)
         shot.write(path, frame.number, {"color": run(frame)})
     # Read back also what was just written, half as it may be: every run then sees the same.
-    sequence = open_shot(path)
-    return _denoised(sequence, sequence.numbers[0])
+    return shot.remade({frame.number: path}).read(frame.number).color

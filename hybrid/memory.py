@@ -115,7 +115,7 @@ def _planes(
 ) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
-    aovs = sum(len(header.layer(name).channels) for name in shot.aovs)
+    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
     if layers.alpha is not None and "alpha" in plan.stages:
         aovs += 1
     guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)

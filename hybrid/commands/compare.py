@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
     from hybrid.comparison.methods import Method
+    from hybrid.files.frames import Shot
 
 
 def compare(
@@ -122,8 +123,9 @@ def compare(
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
-    noisy, clean = open_input(shot, frames, layer), [open_input(spec, frames, None) for spec in reference]
-    chosen = _methods(methods, external, frames)
+    noisy = open_input(shot, frames, layer)
+    clean = [_open_beside(spec, noisy, frames) for spec in reference]
+    chosen = _methods(methods, external, noisy, frames)
     if sweep:
         from hybrid.comparison.methods import METHODS
         from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
@@ -133,7 +135,7 @@ def compare(
         plan = plan_shot(open_input(shot, frames, layer))
         chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
     pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
-    levels = [(open_input(pattern, frames, None), _number(count, "--level")) for pattern, count in pairs]
+    levels = [(open_input(pattern, frames, layer), _number(count, "--level")) for pattern, count in pairs]
     bar: Progress | None = None
 
     def show(what: str, done: float, total: float) -> None:
@@ -184,7 +186,17 @@ def _show(markdown: bool, text: str, table: RichTable) -> None:
         Console().print(table)
 
 
-def _methods(names: str | None, external: Sequence[str] | None, frames: str | None) -> dict[str, Method]:
+def _open_beside(spec: str, shot: Shot, frames: str | None) -> Shot:
+    """Open a reference or a finished sequence, and pass on its warnings."""
+    from hybrid.files.frames import open_beside
+
+    opened = open_beside(spec, shot, frames=frames)
+    for warning in opened.warnings:
+        LOG.warning(warning)
+    return opened
+
+
+def _methods(names: str | None, external: Sequence[str] | None, shot: Shot, frames: str | None) -> dict[str, Method]:
     """The methods asked for, and sequences that others have finished."""
     from hybrid.comparison.methods import METHODS
     from hybrid.comparison.methods import external as finished
@@ -195,7 +207,7 @@ def _methods(names: str | None, external: Sequence[str] | None, frames: str | No
         name, pattern = _pair(item, "--external", "NAME=PATTERN")
         if name in METHODS or name == "reference":
             raise typer.BadParameter(f"--external is {item!r}, expected a name that no other method has")
-        chosen[name] = finished(open_input(pattern, frames, None))
+        chosen[name] = finished(_open_beside(pattern, shot, frames))
     return chosen
 
 

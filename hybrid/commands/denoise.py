@@ -388,7 +388,9 @@ def _denoise(job: Job, done: list[int]) -> None:
         fit(Plan(()))  # refuses what can never be enough before frames are read to make a plan
     plan = plan_input(shot, *job.stages)
     rows = None if fit is None else fit(plan)
-    LOG.info(f"layers: {printable(summarize_layers(shot.layers(shot.numbers[0])))}")
+    layers = shot.layers(shot.numbers[0])
+    for words in (f"layers: {summarize_layers(layers)}", *layers.notes):
+        LOG.info(printable(words))
     LOG.info("stages: " + ", ".join(d.stage for d in plan.decisions if d.on))
     for decision in plan.decisions:
         if not decision.on:

@@ -192,6 +192,8 @@ def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
         role, _, name = item.partition("=")
         if role not in ROLES or not name:
             raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER; roles: {', '.join(ROLES)}")
+        if role in overrides:
+            raise typer.BadParameter(f"--layer names {role} twice, expected once")
         overrides[role] = name
     return overrides
 

@@ -16,7 +16,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TextIO
@@ -208,33 +208,58 @@ class ExrImage:
     def layer(self, name: str) -> Layer:
         """The layer with this name, or the one channel with it as a layer of one.
 
-        Tried in this order: the name of a layer, with or without its view; ``RGBA`` for the bare channels;
-        the name of a channel; that of a part; the same whatever the case; the end of a layer's name
-        (``DiffDir`` for ``ViewLayer.DiffDir``). The default stereo view goes before the others.
+        Tried in this order: the name of a layer, or ``RGBA`` or ``RGB`` for the bare channels; the name of a layer
+        without its view; the name of a channel; a layer with its channels (``ViewLayer.Combined.RGBA``, as listed);
+        the name of a part; all these whatever the case; the end of a layer's name (``DiffDir`` for
+        ``ViewLayer.DiffDir``). The default stereo view goes before the others.
 
         Raises
         ------
         ExrError
             If there is no such layer, or several; lists what is there.
         """
-        layers = sorted(self.layers, key=lambda layer: layer.view not in (None, *self.views[:1]))
-        names = [(layer.name, layer) for layer in layers]
-        names += [(without_view(layer), layer) for layer in layers]
-        names += [(alias, layer) for layer in layers if not layer.name for alias in ("RGBA", "RGB")]
-        names += [(c, Layer(c, layer.part, layer.view, (c,))) for layer in layers for c in layer.channels]
-        names += [(self.parts[layer.part].name, layer) for layer in layers]
-        for fold in (str, str.lower):
-            for known, layer in names:
-                if fold(known) == fold(name):
-                    return layer
         end = "." + name.lower()
-        ends = [x for x in layers if any(n.lower().endswith(end) for n in (x.name, without_view(x)))]
+        for fold in (str, str.lower):
+            for known in self._known_names:
+                if found := [layer for alias, layer in known if fold(alias) == fold(name)]:
+                    return self._only(name, found)
+        ends = [x for x in self.layers if any(n.lower().endswith(end) for n in (x.name, without_view(x)))]
         if not ends:
             raise ExrError(f"{self.path}: no layer {name!r}; {self.listing()}")
-        if len({without_view(layer) for layer in ends}) > 1:
-            several = ", ".join(str(layer) for layer in ends)
-            raise ExrError(f"{self.path}: layer {name!r} is ambiguous: {several}")
-        return ends[0]
+        return self._only(name, ends)
+
+    @cached_property
+    def _known_names(self) -> list[list[tuple[str, Layer]]]:
+        """Names and the layers they stand for; what stands first goes first."""
+        layers = self.layers
+        bare = [(alias, layer) for layer in layers if not layer.name for alias in ("RGBA", "RGB")]
+        return [
+            [(layer.name, layer) for layer in layers if layer.name] + bare,
+            [(without_view(layer), layer) for layer in layers],
+            [(c, Layer(c, layer.part, layer.view, (c,))) for layer in layers for c in layer.channels],
+            [(str(layer), layer) for layer in layers],
+            [(self.parts[layer.part].name, layer) for layer in layers if len(self.parts) > 1],
+        ]
+
+    def _only(self, name: str, found: list[Layer]) -> Layer:
+        """The one layer that a name stands for, of the default view if there are several."""
+        if len(found) > 1:
+            found = [layer for layer in found if layer.view in (None, *self.views[:1])] or found
+        if len(found) > 1:
+            raise ExrError(f"{self.path}: layer {name!r} is ambiguous: {', '.join(map(str, found))}")
+        return found[0]
+
+    def again(self, layer: Layer) -> Layer:
+        """The same layer as in another file of a shot.
+
+        Raises
+        ------
+        ExrError
+            If a channel of it is not there.
+        """
+        for channel in layer.channels:
+            self.part_of(channel)
+        return replace(layer, part=self._origin[layer.channels[0]][0])
 
     def listing(self) -> str:
         """What is in the file, for an error message; shortened if there is much of it."""
@@ -438,7 +463,8 @@ def write_exr(
     ExrError
         If the source has no such channel.
     ValueError
-        If an array has the wrong shape, or an attribute would change one that is not a string.
+        If an array has the wrong shape, a layer to be added is there already, or an attribute would change one that
+        is not a string.
     OSError
         If the file cannot be written; no partial file is left.
 
@@ -464,6 +490,8 @@ def write_exr(
         if over is None:
             raise ValueError(f"layer {name!r} has shape {values.shape}, expected {source.parts[0].shape}")
         channels = {n: OpenEXR.Channel(n, np.ascontiguousarray(v)) for n, v in _named(name, values).items()}
+        if there := [n for n in channels if n in source.channel_names]:
+            raise ExrError(f"{source.path}: channel {there[0]!r} is to be added, and is there already")
         if len(source.parts) == 1:
             by_part[over].update(channels)
         else:

@@ -18,7 +18,7 @@ from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
-from hybrid.files.sequences import find_files, format_frames, parse_frames, parse_pattern
+from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
 from nlm.variance import variance_from_halves
 
 
@@ -120,7 +120,7 @@ class Shot:
         files: Mapping[int, Path],
         *,
         frames: str | None = None,
-        layers: Mapping[str, str] | None = None,
+        layers: Mapping[str, str | Layer] | None = None,
         profile: Profile | None = None,
         motion: str | None = None,
         aovs: Sequence[str] = (),
@@ -130,15 +130,14 @@ class Shot:
         wanted = sorted(files) if frames is None else parse_frames(frames)
         # The numbers asked for count as well: --frames 1-5 where 1, 3 and 5 are there has two holes.
         self.step = math.gcd(*(b - a for a, b in pairwise(sorted({*files, *wanted})))) or 1
-        if frames is None:
-            wanted = list(range(wanted[0], wanted[-1] + 1, self.step))
         self.numbers = tuple(number for number in wanted if number in files)
         self.warnings: list[str] = []
         if not self.numbers:
             folder = next(iter(files.values())).parent
             raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
-        if missing := [number for number in wanted if number not in files]:
-            self.warnings.append(f"missing frames {format_frames(missing)}: the windows beside them are narrower")
+        asked = [number for number in wanted if number not in files]
+        if missing := format_frames(asked) if asked else name_holes(files, self.step) if frames is None else "":
+            self.warnings.append(f"missing frames {missing}: the windows beside them are narrower")
         self._files = dict(files)
         self._overrides = dict(layers or {})
         self._profile = profile
@@ -191,22 +190,21 @@ class Shot:
         Parameters
         ----------
         files : mapping of int to Path
-            Those of the frames that are made.
+            Those of the frames that are made, all or some.
         aovs : sequence of str, optional
             Names of further layers to load; those of this shot without.
         """
-        # A name of its own has any layer but that of bare channels.
-        color = self.layers(self.numbers[0]).target.name or "RGBA"
         made = Shot(
             files,
-            layers={**self._overrides, "color": color},
+            layers={**self._overrides, "color": self._first_layers.target},
             profile=self.profile,
             motion="none" if self._motion == "none" else None,
             aovs=self._aovs if aovs is None else aovs,
             keep=self._keep,
             max_pixels=self._max_pixels,
         )
-        made.numbers, made.step = tuple(number for number in self.numbers if number in files), self.step
+        made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
+        made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
         return made
 
     def path(self, number: int) -> Path:
@@ -226,7 +224,13 @@ class Shot:
         return self._read(self.path(number))
 
     def layers(self, number: int) -> Layers:
-        """Which channels of a frame's file are taken for what; reads the header only."""
+        """Which channels of a frame's file are taken for what; reads the header only.
+
+        Raises
+        ------
+        ExrError
+            If the file cannot be read, lacks a layer, or has another one where the first frame has its own.
+        """
         return self._find(self.header(number))
 
     @cached_property
@@ -236,8 +240,22 @@ class Shot:
         return taken if self._motion in (None, "none") else taken.with_motion(self._motion)
 
     def _find(self, image: ExrImage) -> Layers:
-        found = find_layers(image, self._overrides, self.profile)
+        """The layers of a file, which must be those of the first frame; a guide may be missing."""
+        layers, first = self._find_alone(image), self._first_layers
+        for role in (*ROLES, "target"):
+            here, there = getattr(layers, role), getattr(first, role)
+            if here is not None and there is not None and here.channels != there.channels:
+                raise ExrError(f"{image.path}: {role} is {here}, that of frame {self.numbers[0]} is {there}")
+        return layers
+
+    def _find_alone(self, image: ExrImage) -> Layers:
+        found = find_layers(image, self._overrides, self.profile, self._aovs)
         return found.without({"motion"}) if self._motion == "none" else found
+
+    @cached_property
+    def _first_layers(self) -> Layers:
+        """Those of the first frame that was asked for."""
+        return self._find_alone(self.header(self.numbers[0]))
 
     def header(self, number: int) -> ExrImage:
         """Parts and channels of a frame's file, without pixels."""
@@ -259,7 +277,7 @@ class Shot:
             self._held.move_to_end(number)
             return self._held[number]
         image, layers = self._open(number)
-        frame = _frame(image, layers, self._aovs, self._canvas, number)
+        frame = _frame(image, layers, self._canvas, number)
         self._held[number] = frame
         while len(self._held) > self._keep:
             self._held.popitem(last=False)
@@ -287,8 +305,8 @@ class Shot:
         number
             Frame number.
         images
-            Role or name of a layer → (H, W, C) or (H, W), of the size of `Frame.color`. "color" goes where
-            the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
+            "color", "alpha" or the name of one of `aovs` → (H, W, C) or (H, W), of the size of `Frame.color`.
+            "color" goes where the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
         extra
             Layers to add; name → (H, W, C) or (H, W), of the same size.
         attributes
@@ -301,10 +319,12 @@ class Shot:
         """
         source = self.source(number)
         layers = self._find(source)
+        places = {**layers.aovs, "color": layers.target, "alpha": layers.alpha}
         replaced: dict[str, np.ndarray] = {}
         for name, image in images.items():
-            taken = layers.target if name == "color" else getattr(layers, name) if name in ROLES else None
-            layer = taken or source.layer(name)
+            layer = places.get(name)
+            if layer is None:
+                raise ValueError(f"{source.path}: nothing was read as {name!r}, expected one of {', '.join(places)}")
             part = source.parts[layer.part]
             cut = self._cut(image, part)
             # Another part may reach beyond the color of all frames; what is there was not read, and stays.
@@ -349,8 +369,7 @@ class Shot:
     @cached_property
     def _size(self) -> tuple[int, int]:
         """Width and height of the first frame's display window."""
-        image = self._read(self.path(self.numbers[0]), pixels=False)
-        return _size(image.parts[self._find(image).color.part])
+        return _size(self.header(self.numbers[0]).parts[self._first_layers.color.part])
 
     @cached_property
     def _canvas(self) -> tuple[int, int, int, int]:
@@ -371,7 +390,7 @@ def open_shot(
     spec: str | Path,
     *,
     frames: str | None = None,
-    layers: Mapping[str, str] | None = None,
+    layers: Mapping[str, str | Layer] | None = None,
     profile: Profile | None = None,
     motion: str | None = None,
     aovs: Sequence[str] = (),
@@ -418,6 +437,23 @@ def open_shot(
         keep=keep,
         max_pixels=max_pixels,
     )
+
+
+def open_beside(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
+    """Open another sequence of the frames of a shot: a reference, or what another denoiser has made.
+
+    Where its own layers leave a choice, as between two view layers, the choice made for the shot holds for it too.
+    Parameters and errors are those of `open_shot`.
+    """
+    opened = open_shot(spec, frames=frames, keep=0)
+    with suppress(ExrError):
+        opened.layers(opened.numbers[0])
+        return opened
+    target = shot.layers(shot.numbers[0]).target
+    with suppress(ExrError):
+        opened.header(opened.numbers[0]).again(target)
+        return open_shot(spec, frames=frames, layers={"color": target}, keep=0)
+    return opened
 
 
 def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = False) -> Path:
@@ -477,9 +513,10 @@ def _data_window(part: Part) -> tuple[int, int, int, int]:
     return left - x, top - y, right - x, bottom - y
 
 
-def _frame(
-    image: ExrImage, layers: Layers, aovs: Sequence[str], canvas: tuple[int, int, int, int], number: int
-) -> Frame:
+def _frame(image: ExrImage, layers: Layers, canvas: tuple[int, int, int, int], number: int) -> Frame:
+    for name, layer in layers.aovs.items():
+        if any(image.channel(channel).dtype == np.uint32 for channel in layer.channels):
+            raise ExrError(f"{image.path}: aov {name!r} is {layer}, whole numbers, of which averages mean nothing")
     taken = {role: _pixels(image, layer, canvas) for role in ROLES if (layer := getattr(layers, role)) is not None}
     for role in {"depth", "alpha"} & taken.keys():
         taken[role] = np.ascontiguousarray(taken[role][..., 0])
@@ -499,7 +536,7 @@ def _frame(
         **taken,
         motion_convention=layers.motion_convention,
         resolution=_size(image.parts[layers.color.part])[::-1],
-        aovs={name: _pixels(image, image.layer(name), canvas) for name in aovs},
+        aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
         source=image.path,
     )
 

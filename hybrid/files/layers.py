@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
 from hybrid.files.profile import ROLES, Profile, find_profile, plain_name
+
+# Blender's name for what its compositor has made of the view layers: graded, blurred, glowing.
+COMPOSITE = "Composite"
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,9 @@ class Layers:
     where nobody has said what it is.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
+
+    `aovs` are the further layers that were asked for, by the names they were asked for by. `notes` say what was left
+    alone that a user might think is denoised; one line each.
     """
 
     color: Layer
@@ -48,6 +55,8 @@ class Layers:
     variance_scale: float | None = None
     view: str | None = None
     views: tuple[str, ...] = ()
+    aovs: Mapping[str, Layer] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def without(self, roles: Collection[str]) -> Layers:
         """The same with some roles left out; motion goes as a whole."""
@@ -56,22 +65,33 @@ class Layers:
         return replace(self, **dict.fromkeys(gone), motion_convention=kept)  # type: ignore[arg-type]
 
 
-def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None, profile: Profile | None = None) -> Layers:
+def find_layers(
+    image: ExrImage,
+    overrides: Mapping[str, str | Layer] | None = None,
+    profile: Profile | None = None,
+    aovs: Collection[str] = (),
+) -> Layers:
     """Say which channels of a file are the color, albedo, normal, depth, motion, variance, alpha, estimate.
+
+    Reading and writing both go by what this returns, so that what was read as a layer is written as that layer.
 
     Parameters
     ----------
     image
         From `read_exr`; pixels are not needed.
     overrides
-        Role → name of a layer, as `ExrImage.layer` takes it; goes before what would be found.
+        Role → name of a layer, as `ExrImage.layer` takes it, or a layer that was found in such a file before; goes
+        before what would be found.
     profile
         Whose names to look for; without, that of the renderer that the file seems to be from.
+    aovs
+        Names of further layers that are to be denoised along.
 
     Raises
     ------
     ExrError
-        If there is no color, or an override names a layer that is not there or cannot play the role.
+        If there is no color, if more than one layer can be meant, if an override names a layer that is not there or
+        cannot play the role, or if an AOV is one of the layers that are written anyway.
     ValueError
         If an override names an unknown role.
 
@@ -79,6 +99,10 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None, pro
     -----
     Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate. The
     other layers are taken from the color's own view layer and stereo view only.
+
+    What could be the color twice over (two view layers; ``beauty`` beside bare R, G, B) is refused: whichever was
+    taken, the other would stay noisy in the file. What a known renderer calls its color goes before names that
+    others use.
     """
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLES):
@@ -87,25 +111,33 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None, pro
 
     found: dict[str, Layer | None] = {}
     for role, name in overrides.items():
-        layer = image.layer(name)
-        found[role] = _fit(role, layer, named=True)
+        layer = image.layer(name) if isinstance(name, str) else image.again(name)
+        found[role] = _fit(image, role, layer, named=True)
         if found[role] is None:
             raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {_NEEDS[role]}")
 
-    color = found.get("color") or _search(image, "color", None, taken) or _only_picture(image, taken)
+    notes: list[str] = []
+    color = found.get("color") or _find_color(image, taken, notes) or _only_picture(image, taken)
     if color is None:
         raise ExrError(f"{image.path}: no color layer (--layer color=NAME); {image.listing()}")
     found["color"] = found["target"] = color
     for role in ROLES[1:]:
         if role not in found:
-            found[role] = _search(image, role, color, taken)
+            found[role] = _find_guide(image, role, color, taken)
     if found["alpha"] is None:
         whole = [x for x in image.layers if x.part == color.part and set(color.channels) <= set(x.channels)]
-        found["alpha"] = _fit("alpha", whole[0], named=False) if whole else None
+        found["alpha"] = _fit(image, "alpha", whole[0], named=False) if whole else None
     if "estimate" not in overrides and "noisyimage" in _tails(image, color):
         combined = [x for x in _same_group(image, color) if "combined" in _tails(image, x)]
-        found["estimate"] = _fit("estimate", combined[0], named=True) if combined else None
+        found["estimate"] = _fit(image, "estimate", combined[0], named=True) if combined else None
         found["target"] = found["estimate"] or color
+    for role in ROLES[1:]:
+        guide = found[role]
+        if guide is not None and set(guide.channels) & set(color.channels):
+            raise ExrError(f"{image.path}: {guide} is taken for both color and {role}, expected two layers")
+    view = color.view or (image.views[0] if image.views else None)
+    if len(image.views) > 1:
+        notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
     convention = _convention(found, taken)
     return Layers(
         **found,  # type: ignore[arg-type]
@@ -114,9 +146,77 @@ def find_layers(image: ExrImage, overrides: Mapping[str, str] | None = None, pro
         motion_convention=convention,
         settled=taken.settled,
         variance_scale=_variance_scale(image, taken),
-        view=color.view or (image.views[0] if image.views else None),
+        view=view,
         views=image.views,
+        aovs=_find_aovs(image, aovs, [layer for layer in (found["target"], found["alpha"]) if layer is not None]),
+        notes=tuple(notes),
     )
+
+
+def _find_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer | None:
+    """The one layer that has a name for the color; of the renderer's own names, or else of common ones."""
+    seen = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
+    for names in (profile.own_names("color"), profile.names("color")):
+        # Bare channels are a file's, not those of any of its parts.
+        named = [x for x in seen if ({*_tails(image, x)} - {""} if x.name else {""}) & {*names}]
+        fitting = {layer: fitted for layer in named if (fitted := _fit(image, "color", layer, named=True))}
+        if not fitting:
+            continue
+        groups = {_group(layer) for layer in fitting}
+        if COMPOSITE in groups and len(groups) > 1:
+            notes += [f"{x} stays as it is: the compositor's" for x in fitting.values() if _group(x) == COMPOSITE]
+            fitting = {layer: fitted for layer, fitted in fitting.items() if _group(layer) != COMPOSITE}
+            groups.remove(COMPOSITE)
+        if len(groups) == 1 and sorted(_tails(image, layer)[0] for layer in fitting) == ["combined", "noisyimage"]:
+            fitting = {x: fitted for x, fitted in fitting.items() if "noisyimage" in _tails(image, x)}
+        return _only(image, "color", [*fitting.values()])
+    return None
+
+
+def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> Layer | None:
+    """The layer whose name comes first in the profile, in the color's view layer rather than in none."""
+    layers: list[tuple[set[str], Layer]] = []
+    for layer in _same_group(image, color):
+        # Bare channels are those beside the color's: those of other parts can be anything.
+        bare = not layer.name or (layer.part == color.part and "" in _paths(image, layer))
+        layers.append(({*_tails(image, layer)} - {""} | ({""} if bare else set()), layer))
+        if not layer.name:  # one alone may have a name too: depth, a
+            layers += [({plain_name(c)}, Layer("", layer.part, layer.view, (c,))) for c in layer.channels]
+    near = [(tails, layer) for tails, layer in layers if _group(layer) == _group(color)]
+    for name in profile.names(role):
+        for scope in (near, layers):
+            matching = [layer for tails, layer in scope if name in tails]
+            fitting = [fitted for layer in matching if (fitted := _fit(image, role, layer, named=bool(name)))]
+            if fitting:
+                return _only(image, role, fitting)
+    return None
+
+
+def _find_aovs(image: ExrImage, names: Collection[str], written: Sequence[Layer]) -> dict[str, Layer]:
+    """The layers that are denoised along; each channel of a file is written once."""
+    taken: dict[str, str] = {channel: "the color or its alpha" for layer in written for channel in layer.channels}
+    # Hashes of names: an average of two is the name of a third thing.
+    hashed = [str(v) for p in image.parts for k, v in p.header.items() if re.fullmatch(r"cryptomatte/\w+/name", k)]
+    aovs = {}
+    for name in names:
+        layer = image.layer(name)
+        if name in ("color", "alpha"):
+            raise ExrError(f"{image.path}: aov {name!r} is also a role, expected the whole name: {layer}")
+        if clash := next((taken[channel] for channel in layer.channels if channel in taken), None):
+            raise ExrError(f"{image.path}: aov {name!r} is {layer}, which is written as {clash}")
+        if any(layer.name.startswith(base) for base in hashed):
+            raise ExrError(f"{image.path}: aov {name!r} is {layer}, a cryptomatte, of which averages mean nothing")
+        taken |= dict.fromkeys(layer.channels, f"aov {name!r}")
+        aovs[name] = layer
+    return aovs
+
+
+def _only(image: ExrImage, role: str, layers: Sequence[Layer]) -> Layer:
+    """The one layer of a list; raise ExrError if it has several."""
+    if len(layers) > 1:
+        names = ", ".join(map(str, layers))
+        raise ExrError(f"{image.path}: {role} can be {names}, expected one (--layer {role}=NAME)")
+    return layers[0]
 
 
 def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConvention | None:
@@ -150,10 +250,10 @@ def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:
     """The one layer with R, G, B and A, or else with R, G and B, that no role has a name for; None of several."""
     named = {name for role in ROLES for name in profile.names(role) if name}
     layers = [x for x in image.layers if x.view in (None, *image.views[:1]) and not named & set(_tails(image, x))]
-    pictures = [layer for layer in layers if _fit("color", layer, named=True)]
-    opaque = [layer for layer in pictures if _fit("alpha", layer, named=False)]
+    pictures = [layer for layer in layers if _fit(image, "color", layer, named=True)]
+    opaque = [layer for layer in pictures if _fit(image, "alpha", layer, named=False)]
     only = opaque if len(opaque) == 1 else pictures
-    return _fit("color", only[0], named=True) if len(only) == 1 else None
+    return _fit(image, "color", only[0], named=True) if len(only) == 1 else None
 
 
 _NEEDS = {
@@ -186,40 +286,31 @@ _COMPONENTS = {
 }
 
 
-def _fit(role: str, layer: Layer, *, named: bool) -> Layer | None:
+def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | None:
     """The layer with just the channels that the role uses; None if it has not got them.
 
     In a layer that is `named` for the role, one channel will do whatever it is called.
     """
-    by_component = {component_of(channel): channel for channel in reversed(layer.channels)}
+    by_component: dict[str, str] = {}
+    twice = {component_of(c) for c in layer.channels if by_component.setdefault(component_of(c), c) != c}
     for components in _COMPONENTS[role]:
         if all(c in by_component for c in components):
+            if named and twice & set(components):  # R beside r or red
+                raise ExrError(f"{image.path}: layer {layer} has two channels for {min(twice & set(components))}")
             return Layer(layer.name, layer.part, layer.view, tuple(by_component[c] for c in components))
     if named and role in ("depth", "variance", "alpha") and len(layer.channels) == 1:
         return layer
     return None
 
 
-def _search(image: ExrImage, role: str, color: Layer | None, profile: Profile) -> Layer | None:
-    """The layer whose name comes first in the profile; the first of the file among equals."""
-    if color is None:
-        layers = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
-    else:
-        layers = _same_group(image, color)
-    named = [(_tails(image, layer), layer) for layer in layers]
-    # A bare channel may have a name too: depth, a.
-    bare = [layer for layer in layers if not layer.name]
-    named += [([plain_name(c)], Layer("", layer.part, layer.view, (c,))) for layer in bare for c in layer.channels]
-    for name in profile.names(role):
-        for tails, layer in named:
-            if name in tails and (fitted := _fit(role, layer, named=bool(name))):
-                return fitted
-    return None
+def _group(layer: Layer) -> str:
+    """The view layer that a layer belongs to, as Cycles names them; "" for none."""
+    return without_view(layer).rpartition(".")[0]
 
 
 def _same_group(image: ExrImage, color: Layer) -> list[Layer]:
     """The layers of the color's view layer (or of none) and of its stereo view (or of none)."""
-    group = without_view(color).rpartition(".")[0]
+    group = _group(color)
     view = color.view or (image.views[0] if image.views else None)
     return [
         layer
@@ -253,13 +344,16 @@ _LACK = {
 def summarize_layers(layers: Layers) -> str:
     """Say in one line what was taken."""
     taken = [f"{role} {getattr(layers, role)}" for role in ROLES if getattr(layers, role) is not None]
+    taken += [f"aov {name} {layer}" for name, layer in layers.aovs.items()]
+    taken += [] if layers.target == layers.color else [f"result to {layers.target}"]
     return f"{layers.profile} ({layers.reason}): {', '.join(taken)}"
 
 
 def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
     """Rows for `ravg inspect`: role, channels taken or "missing", and what it means.
 
-    The third item says what the lack costs; for motion that is there, its convention; else it is empty.
+    The third item says what the lack costs; for motion that is there, its convention; for the color, what beside it
+    stays as it is; else it is empty.
     """
     rows = []
     for role in ROLES:
@@ -269,6 +363,7 @@ def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
         if layer is None:
             rows.append((role, "missing", _LACK[role]))
         else:
-            note = f"convention: {layers.motion_convention}" if role == "motion" else ""
+            notes = [f"convention: {layers.motion_convention}"] if role == "motion" else []
+            note = "; ".join(layers.notes if role == "color" else notes)
             rows.append((role, str(layer), note))
     return rows

@@ -109,12 +109,16 @@ class Profile:
         MotionConvention(**{**self.motion_assumed, **self.motion, **parts})
         return replace(self, motion={**self.motion, **parts})
 
-    def names(self, role: str) -> tuple[str, ...]:
-        """What layers of a role may be called, plain (`plain_name`), the preferred first."""
+    def own_names(self, role: str) -> tuple[str, ...]:
+        """What the renderer calls layers of a role, plain (`plain_name`), the preferred first."""
         own = self.layers.get(role, ())
         affixed = [text for name in own if name for affix in self.affixes for text in (affix + name, name + affix)]
+        return tuple(dict.fromkeys(plain_name(name) for name in (*own, *affixed)))
+
+    def names(self, role: str) -> tuple[str, ...]:
+        """The same, and after that what others call them."""
         common = read_profiles()[COMMON].layers.get(role, ())
-        return tuple(dict.fromkeys(plain_name(name) for name in (*own, *affixed, *common)))
+        return tuple(dict.fromkeys((*self.own_names(role), *map(plain_name, common))))
 
 
 def parse_motion(words: str) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import pairwise
 from pathlib import Path
 
 import fileseq
@@ -36,12 +38,14 @@ class Pattern:
     def files(self) -> dict[int, Path]:
         """Frame number → file, of those that are there, whatever the width of their numbers.
 
-        Where two names have one number, the width of the pattern decides for all. A name without a number is frame 1.
+        Where widths are mixed, that of the pattern decides. A name without a number is frame 1.
         """
         if not self.digits:
             return {1: self.single} if self.single.is_file() else {}
         found = [(n, path) for path in _names(self.folder) if (n := self.number(path.name)) is not None]
-        if len(dict(found)) < len(found):
+        shortest = min((len(path.name) for _, path in found), default=0) - len(self.before) - len(self.after)
+        padded = replace(self, digits=max(shortest, 1))
+        if any(path != padded.path(n) for n, path in found):
             found = [(n, path) for n, path in found if path == self.path(n)]
         return dict(sorted(found))
 
@@ -77,12 +81,14 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
     FileNotFoundError
         If nothing matches; says what the folder has.
     ValueError
-        If several sequences do.
+        If several sequences do, or it is both a file and the pattern of others.
     """
     path = Path(spec)
     if path.is_dir():
         return _only(_patterns(_names(path)), spec, path).files(), None
     if path.is_file():
+        if (called := parse_pattern(spec)[0]).digits and called.files():
+            raise ValueError(f"{spec} is a file, and a pattern that others match; expected one or the other")
         number = _pattern_of(path).number(path.name)
         return {1 if number is None else number: path}, None
     pattern, frames = parse_pattern(spec)
@@ -122,18 +128,24 @@ def _names(folder: Path) -> list[Path]:
     """The EXR files of a folder."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr" and not path.name.startswith("."))
+    with os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name.lower().endswith(".exr") and not e.is_dir(follow_symlinks=False)]
+    return sorted(folder / name for name in names if not name.startswith("."))
 
 
 def _patterns(paths: Iterable[Path]) -> list[Pattern]:
     """The sequences that files belong to."""
-    found: dict[tuple[str, str], Pattern] = {}
+    groups: dict[tuple[str, str], list[tuple[Pattern, Path]]] = {}
     for path in paths:
         pattern = _pattern_of(path)
-        key = pattern.before, pattern.after
-        if key not in found or pattern.digits < found[key].digits:
-            found[key] = pattern
-    return list(found.values())
+        groups.setdefault((pattern.before, pattern.after), []).append((pattern, path))
+    found: set[Pattern] = set()
+    for group in groups.values():
+        least = min((pattern for pattern, _ in group), key=lambda pattern: pattern.digits)
+        same = all(least.path(least.number(path.name) or 0) == path for _, path in group)
+        # Numbers that are padded differently are of different sequences.
+        found |= {least} if same else {pattern for pattern, _ in group}
+    return sorted(found, key=str)
 
 
 def _pattern_of(path: Path) -> Pattern:
@@ -183,3 +195,13 @@ def parse_frames(frames: str) -> list[int]:
 def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
     """The range of some frame numbers, such as 1001-1010x2."""
     return str(fileseq.FrameSet(sorted(numbers)))
+
+
+def name_holes(numbers: Iterable[int], step: int) -> str:
+    """The frames that are not there between those that are, `step` apart, in words; "" where all are.
+
+    Only their ends are looked at: between two files that dates have numbered lie millions.
+    """
+    holes = [range(a + step, b, step) for a, b in pairwise(sorted(numbers)) if b - a > step]
+    names = [f"{h[0]}-{h[-1]}{f'x{step}' if step > 1 else ''}" if len(h) > 1 else f"{h[0]}" for h in holes]
+    return ",".join(names[:8]) + (f" and {len(names) - 8} more ranges" if len(names) > 8 else "")

@@ -124,7 +124,8 @@ def test_parts_may_be_called_anything(tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     OpenEXR.File(parts).write(str(folder / "a.exr"))
-    assert main(["inspect", str(folder / "a.exr")]) == 0
+    for name in ("../../up", "/abs", "[red]"):
+        assert main(["inspect", str(folder / "a.exr"), "--layer", f"color={name}"]) == 0
     shot = open_shot(folder / "a.exr")
     assert output_path(tmp_path / "out", shot, 1) == tmp_path / "out" / "a.exr"
     write_exr(tmp_path / "b.exr", read_exr(folder / "a.exr"), {})

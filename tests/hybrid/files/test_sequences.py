@@ -2,7 +2,8 @@
 
 import pytest
 
-from hybrid.files.sequences import find_files, parse_frames, parse_pattern
+from hybrid.files.frames import Shot
+from hybrid.files.sequences import find_files, name_holes, parse_frames, parse_pattern
 
 
 @pytest.fixture
@@ -96,3 +97,48 @@ def test_what_is_not_there_is_said_with_what_is(folder):
             find_files(f"{folder}/{spec}")
     with pytest.raises(FileNotFoundError, match="there is no folder"):
         find_files(f"{folder}/nowhere/a.####.exr")
+
+
+def test_numbers_that_are_padded_differently_are_not_one_sequence(tmp_path):
+    """Whatever numbers did not clash were mixed: two takes, one picture from each."""
+    for name in ("a.10.exr", "a.11.exr", "a.0012.exr", "a.0013.exr", "b.998.exr", "b.1000.exr"):
+        (tmp_path / name).touch()
+    assert list(find_files(f"{tmp_path}/a.##.exr")[0]) == [10, 11]
+    assert list(find_files(f"{tmp_path}/a.####.exr")[0]) == [12, 13]
+    assert list(find_files(f"{tmp_path}/b.#.exr")[0]) == [998, 1000]
+    for name in ("a.###.exr", "a.*.exr"):
+        with pytest.raises((ValueError, FileNotFoundError), match=r"a\.####\.exr 12-13, a\.##\.exr 10-11"):
+            find_files(f"{tmp_path}/{name}")
+
+
+def test_a_file_that_is_called_like_a_pattern_is_not_taken_for_its_frames(tmp_path):
+    (tmp_path / "a.####.exr").touch()
+    assert list(find_files(f"{tmp_path}/a.####.exr")[0]) == [1]
+    (tmp_path / "a.0001.exr").touch()
+    with pytest.raises(ValueError, match="is a file, and a pattern that others match"):
+        find_files(f"{tmp_path}/a.####.exr")
+
+
+@pytest.mark.parametrize("name", ["a+b", "take(2)", "x{1,2}", "back\\slash", "new\nline"])
+def test_the_rest_of_a_name_is_taken_as_it_is_written(tmp_path, name):
+    for file in (f"{name}.0001.exr", f"{name}.0002.exr", "axb.0003.exr", "aab.0004.exr"):
+        (tmp_path / file).touch()
+    assert list(find_files(f"{tmp_path}/{name}.####.exr")[0]) == [1, 2]
+
+
+def test_hidden_files_folders_and_other_digits_are_no_frames(tmp_path):
+    for name in ("a.0001.exr", "._a.0001.exr", ".a.0002.exr", "a.\u0663.exr"):
+        (tmp_path / name).touch()
+    (tmp_path / "a.0003.exr").mkdir()
+    (tmp_path / "a.0004.exr").symlink_to("a.0004.exr")  # a loop: named when it is read
+    assert list(find_files(f"{tmp_path}/a.####.exr")[0]) == [1, 4]
+
+
+def test_millions_of_missing_frames_are_not_counted_one_by_one(tmp_path):
+    """Three files that were numbered by their dates took all memory."""
+    shot = Shot({1: tmp_path / "a", 3: tmp_path / "b", 10**15: tmp_path / "c"})
+    assert shot.warnings == [f"missing frames 2,4-{10**15 - 1}: the windows beside them are narrower"]
+    assert name_holes(range(0, 100, 5), 1).endswith(" and 11 more ranges")
+    assert name_holes([1, 3, 9, 11], 2) == "5-7x2"
+    with pytest.raises(ValueError, match="is not a range"):
+        parse_frames("1-100000000000")
