@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 
-from hybrid.alignment.align import Aligner
+from hybrid.alignment.align import Aligner, Estimates
 from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
 from hybrid.files.frames import Frame, Shot
 from hybrid.pipeline import DenoiseWindow
+from hybrid.plan import Rules
 
 # Pixels on a side of the part that is measured: large enough that threads have work, small enough for seconds.
 SIDE = 512
@@ -49,7 +50,7 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot, stages: Collection[str], estimate: str, load: Callable[[str], tuple[DenoiseWindow, int]]
+    shot: Shot, rules: Rules, estimate: str, load: Callable[[str], tuple[DenoiseWindow, int]]
 ) -> Iterator[Measured]:
     """Measure the presets on the middle of the shot, the most accurate first.
 
@@ -57,8 +58,8 @@ def measure_presets(
     ----------
     shot : Shot
         Its middle frames are read.
-    stages : collection of str
-        The plan's.
+    rules : Rules
+        What decides which stages run.
     estimate : str
         As for `hybrid.estimates.choose_estimate`.
     load : callable
@@ -86,8 +87,8 @@ def measure_presets(
         denoise, radius = load(preset)
         source = choose_estimate(estimate, part, mode=MODE_OF[preset])
         # A sequence's pictures are whole; what is measured is a part.
-        given = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
-        aligner = Aligner(part, stages, radius=radius, estimates=given)
+        given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
+        aligner = Aligner(part, rules, radius=radius, estimates=given)
         for number in numbers:
             start = time.perf_counter()
             denoise(aligner.align(number))

@@ -7,7 +7,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -52,7 +52,7 @@ class OfFrames:
     holds: int = 0
     from_noisy = False
 
-    def reach(self, radius: int, stages: Collection[str]) -> int:
+    def reach(self, radius: int) -> int:
         """See `hybrid.alignment.align.Estimates`."""
         return radius
 
@@ -82,26 +82,21 @@ class OfCleanGuides:
     holds: int = 0
     from_noisy = False
 
-    def reach(self, radius: int, stages: Collection[str]) -> int:
+    def reach(self, radius: int) -> int:
         """See `hybrid.alignment.align.Estimates`."""
-        return radius + self._guide_radius(stages)
+        return radius + GUIDE_RADIUS
 
     def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
         """See `hybrid.alignment.align.Estimates`."""
         ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        radius = self._guide_radius(aligner.stages)
-        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, radius))}))
+        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, GUIDE_RADIUS))}))
         for n in ahead:
             frame = aligner.frame(n)
             if frame is None:
                 continue
-            guides = aligner.clean_guides(n, radius) if radius else (frame.albedo, frame.normal)
-            alone = Frame(n, frame.radiance, *guides)
+            alone = Frame(n, frame.radiance, *aligner.clean_guides(n, GUIDE_RADIUS))
             with aligner.timings.stage("estimate"):
                 aligner.estimates[n] = _checked(self.function(alone), alone)
-
-    def _guide_radius(self, stages: Collection[str]) -> int:
-        return GUIDE_RADIUS if "prefilter" in stages else 0
 
 
 @dataclass(frozen=True)
@@ -118,7 +113,7 @@ class OfWindows:
     holds = 0
     from_noisy = True
 
-    def reach(self, radius: int, stages: Collection[str]) -> int:
+    def reach(self, radius: int) -> int:
         """See `hybrid.alignment.align.Estimates`."""
         return 2 * radius
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
+from collections.abc import Collection
 
 from hybrid.alignment.align import MARGIN, Estimates
 from hybrid.files.frames import Shot
-from hybrid.plan import Plan
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
@@ -54,7 +54,13 @@ def parse_size(words: str) -> int:
 
 
 def plan_rows(
-    limit: int, shot: Shot, plan: Plan, estimates: Estimates | None = None, *, radius: int = 2, neural: bool
+    limit: int,
+    shot: Shot,
+    stages: Collection[str],
+    estimates: Estimates | None = None,
+    *,
+    radius: int = 2,
+    neural: bool,
 ) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
 
@@ -64,8 +70,8 @@ def plan_rows(
         Bytes.
     shot : Shot
         Its headers are read.
-    plan : Plan
-        Which stages run.
+    stages : collection of str
+        Which may run on some frame.
     estimates : Estimates, optional
         Where the estimates of single frames come from.
     radius : int
@@ -89,7 +95,7 @@ def plan_rows(
     is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
     """
     height, width = shot.shape
-    kept, passing, worked = _planes(shot, plan, estimates, radius, neural)
+    kept, passing, worked = _planes(shot, stages, estimates, radius, neural)
     plane = 4 * height * width
     base = (BASE_NEURAL if neural else BASE) + (0 if estimates is None else estimates.holds)
 
@@ -111,27 +117,27 @@ def plan_rows(
 
 
 def _planes(
-    shot: Shot, plan: Plan, estimates: Estimates | None, radius: int, neural: bool
+    shot: Shot, stages: Collection[str], estimates: Estimates | None, radius: int, neural: bool
 ) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
     aovs = sum(len(layer.channels) for layer in layers.aovs.values())
-    if layers.alpha is not None and "alpha" in plan.stages:
+    if layers.alpha is not None and "alpha" in stages:
         aovs += 1
     guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
-    light = 3 if "gate" in plan.stages or estimates is not None else 0
+    light = 3 if "gate" in stages or estimates is not None else 0
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     frame = 3 + light + guides + motion + (layers.depth is not None) + 3 * (layers.variance is not None) + aovs + 0.25
-    reach = radius if estimates is None else estimates.reach(radius, plan.stages)
+    reach = radius if estimates is None else estimates.reach(radius)
     frames = min(2 * reach + 1, shot.count)
     kept = frames * frame + 3 + aovs  # and the result
-    if "warp" in plan.stages:
+    if "warp" in stages:
         kept += 2.25 * 4 * max(radius - 1, 0)
-        if plan.stages & {"refine", "dense-flow"} or (layers.motion_convention and not layers.motion_convention.pair):
+        if {*stages} & {"refine", "dense-flow"} or (layers.motion_convention and not layers.motion_convention.pair):
             kept += 2.25 * 2 * (frames - 1)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = len(header.channel_names) + frame + 14
-    if plan.stages & {"refine", "dense-flow"}:
+    if {*stages} & {"refine", "dense-flow"}:
         passing = max(passing, 45)
     window = (2 * radius + 1) * (3 + light + guides + aovs + 1)
     worked = 2.0 * window + 40

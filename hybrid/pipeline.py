@@ -13,7 +13,7 @@ from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import remove_leftovers
-from hybrid.plan import Plan
+from hybrid.plan import Plan, Rules
 from hybrid.timing import Timings
 
 Array = NDArray[np.float32]
@@ -47,10 +47,13 @@ class Finished:
 
     number: int
     path: Path
-    pixels: int
-    repaired: int
-    outliers: int
-    clamped: int
+    pixels: int = 0
+    repaired: int = 0
+    fireflies: int = 0
+    removed: float = 0.0  # share of the frame's light that went with the fireflies
+    outliers: int = 0
+    clamped: int = 0
+    plan: Plan | None = None  # which stages ran, and why
     resumed: bool = False  # it was there already
 
 
@@ -58,7 +61,7 @@ def denoise_shot(
     shot: Shot,
     output: str | Path,
     denoise: DenoiseWindow,
-    plan: Plan,
+    rules: Rules,
     *,
     radius: int = 2,
     estimates: Estimates | None = None,
@@ -77,8 +80,8 @@ def denoise_shot(
         Where to write: a pattern with a placeholder for the frame number, or a folder.
     denoise : callable
         From `AlignedWindow` to `Denoised`.
-    plan : Plan
-        Which stages to run.
+    rules : Rules
+        What decides which stages run on a frame.
     radius : int
         Frames on each side of the centre.
     estimates : Estimates, optional
@@ -108,35 +111,59 @@ def denoise_shot(
     earlier processes have left half written is removed.
     """
     timings = timings or Timings()
-    aligner = Aligner(shot, plan.stages, radius=radius, estimates=estimates, timings=timings)
+    aligner = Aligner(shot, rules, radius=radius, estimates=estimates, timings=timings)
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    reach = radius if estimates is None else estimates.reach(radius, plan.stages)
+    # What shines in one frame alone is told by the frames beside it.
+    reach = 1 + (radius if estimates is None else estimates.reach(radius))
     for number, path in paths.items():
         if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
-            yield Finished(number, path, 0, 0, 0, 0, resumed=True)
+            yield Finished(number, path, resumed=True)
             continue
-        denoised, repaired, outliers = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
+        denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
+        plan = rules.plan(*aligner.facts_of(aligner.around(number, radius)))
         with timings.stage("write"):
             images = {"color": denoised.color, **denoised.aovs}
-            clamped = shot.write(path, number, images, denoised.extra, attributes)
-        finished = Finished(number, path, denoised.color[..., 0].size, repaired, outliers, clamped)
-        del denoised  # or it would still be there while the next window is made
+            stages = {"ravg/stages": " ".join(sorted(plan.stages))}
+            clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages})
+        finished = Finished(
+            number=number,
+            path=path,
+            pixels=denoised.color[..., 0].size,
+            repaired=aligned.repaired,
+            fireflies=aligned.fireflies,
+            removed=aligned.removed,
+            outliers=aligned.outliers,
+            clamped=clamped,
+            plan=plan,
+        )
+        del denoised, aligned  # or they would still be there while the next window is made
         yield finished
 
 
-def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, int, int]:
-    """Denoise a frame, so many rows at a time; count the pixels that were repaired, and rejected as fireflies."""
+@dataclass(frozen=True)
+class _Counts:
+    """What there is to say of a window: as `AlignedWindow` has it, over all parts of the frame."""
+
+    repaired: int
+    fireflies: int
+    removed: float
+    outliers: int
+
+
+def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, _Counts]:
+    """Denoise a frame, so many rows at a time."""
     height, width = aligner.shot.shape
     whole: dict[tuple[str, str], Array] = {}
-    outliers = repaired = 0
+    outliers = 0
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
         aligned = aligner.align(number, band)
         part = denoise(aligned)
-        outliers, repaired = outliers + aligned.outliers, aligned.repaired
+        outliers += aligned.outliers
+        counts = _Counts(aligned.repaired, aligned.fireflies, aligned.removed, outliers)
         named = {("color", ""): part.color}
         named |= {("aovs", name): layer for name, layer in part.aovs.items()}
         named |= {("extra", name): layer for name, layer in part.extra.items()}
@@ -149,7 +176,7 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
             whole[name][band] = layer[aligned.inner]
         del aligned, part, named
     kinds = {kind: {name: layer for (k, name), layer in whole.items() if k == kind} for kind in ("aovs", "extra")}
-    return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), repaired, outliers
+    return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), counts
 
 
 def _files_around(shot: Shot, number: int, reach: int) -> list[Path]:

@@ -7,8 +7,9 @@ both read the `AlignedWindow` that it returns, and nothing after it warps again.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -20,11 +21,13 @@ from flow.motion import compose_flow, forward_backward_error
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
-from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
+from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
+from hybrid.alignment.prepare import ALPHA, PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.transfer import measure_exposure, remodulate
 from hybrid.files.frames import Frame, Shot
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
+from nlm.fireflies import find_fireflies, recurring, replace_fireflies
 from nlm.gate import color_gate
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
@@ -76,6 +79,10 @@ class AlignedWindow:
         Further layers, warped and demodulated like the color.
     repaired : int
         Pixels of the centre frame that were not finite.
+    fireflies : int
+        Single bright samples that were taken out of the centre frame before anything was made of it.
+    removed : float
+        Share of the centre's light that went with them, in [0, 1].
     outliers : int
         Pixels of the window, within `inner`, that were rejected as fireflies.
     exposure : float
@@ -100,6 +107,8 @@ class AlignedWindow:
     estimate: Array | None
     aovs: dict[str, Array]
     repaired: int
+    fireflies: int
+    removed: float
     outliers: int
     exposure: float
     moments: NDArray[np.float64]
@@ -157,11 +166,28 @@ class Estimates(Protocol):
     def from_noisy(self) -> bool:
         """Whether frames are prepared with their light."""
 
-    def reach(self, radius: int, stages: Collection[str]) -> int:
+    def reach(self, radius: int) -> int:
         """How many frames on each side of the centre are read, for windows of `radius` frames on each side."""
 
     def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
         """Load these frames (`Aligner.load`), and put an estimate of each that is there into `Aligner.estimates`."""
+
+
+class Decide(Protocol):
+    """What decides which stages run on a window (`hybrid.plan.Rules`).
+
+    Attributes
+    ----------
+    allowed : frozenset of str
+        The stages that may run at all.
+    """
+
+    @property
+    def allowed(self) -> frozenset[str]:
+        """The stages that may run at all."""
+
+    def __call__(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], /) -> Collection[str]:
+        """Say which stages frames call for that show this, with these pairs of neighbours among them."""
 
 
 class Aligner:
@@ -171,8 +197,8 @@ class Aligner:
     ----------
     shot : Shot
         Read lazily.
-    stages : collection of str
-        Which stages to run; see `hybrid.plan`.
+    stages : collection of str, or callable
+        Which stages run, on all frames; or what decides it for a window by what its frames show (`hybrid.plan.Rules`).
     radius : int
         Frames on each side of the centre; the window has 2 · radius + 1.
     estimates : Estimates, optional
@@ -186,7 +212,7 @@ class Aligner:
     def __init__(
         self,
         shot: Shot,
-        stages: Collection[str],
+        stages: Collection[str] | Decide,
         *,
         radius: int = 2,
         estimates: Estimates | None = None,
@@ -194,14 +220,18 @@ class Aligner:
         timings: Timings | None = None,
     ) -> None:
         self.shot = shot
-        self.stages = frozenset(stages)
+        self._decide = stages if callable(stages) else _Always(frozenset(stages))
         self.source = estimates
         self.radius = radius
         self.refine = refine
         self.timings = timings or Timings()
+        self._read: dict[int, tuple[Frame | None, PreparedFrame]] = {}
         self._frames: dict[int, PreparedFrame] = {}
+        self._small: dict[int, SmallFrame] = {}
+        self.frame_facts: dict[int, FrameFacts] = {}
+        self.pair_facts: dict[tuple[int, int], PairFacts] = {}
         self.estimates: dict[int, Array | None] = {}
-        self._flows: dict[tuple[int, int], tuple[Array, Mask]] = {}
+        self._flows: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
         self._chains: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
@@ -246,25 +276,85 @@ class Aligner:
             Called with each frame as it is read.
         """
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
+        near = {n + k * self.shot.step for n in numbers for k in (-1, 0, 1)}
+        self._read = {n: pair for n, pair in self._read.items() if n in near}
         self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
+        self._small = {n: small for n, small in self._small.items() if n in numbers}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
         self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in numbers}
-        # Where estimates of single frames are given, the gate compares those.
-        light = self.source is None or self.source.from_noisy
-        stages = self.stages if light else self.stages - {"gate"}
         for n in numbers:
             if n not in self._frames and self.shot.has(n):
-                with self.timings.stage("read"):
-                    frame = self.shot.read(n)
-                with self.timings.stage("prepare"):
-                    self._frames[n] = prepare(frame, stages)
-                seen(frame)
+                frame, prepared = self._read_once(n)
+                if "fireflies" in self._decide.allowed:
+                    frame, prepared = self._without_fireflies(frame, prepared)
+                self._frames[n] = prepared
+                self._read[n] = None, self._read[n][1]
+                if frame is not None:
+                    seen(frame)
+
+    def stages_of(self, numbers: Sequence[int]) -> frozenset[str]:
+        """Decide which stages these frames call for; they are loaded, where they are there."""
+        if isinstance(self._decide, _Always):  # nothing has to be measured
+            return self._decide.allowed
+        return frozenset(self._decide(*self.facts_of(numbers)))
+
+    def facts_of(self, numbers: Sequence[int]) -> tuple[list[FrameFacts], list[PairFacts]]:
+        """Return what those of these frames show that are there, and their pairs of neighbours; they are loaded."""
+        there = [n for n in numbers if n in self._frames]
+        pairs = [(a, b) for a, b in pairwise(there) if b - a == self.shot.step]
+        return [self._facts_of(n) for n in there], [self._facts_of_pair(a, b) for a, b in pairs]
+
+    def _facts_of(self, number: int) -> FrameFacts:
+        if number not in self.frame_facts:
+            with self.timings.stage("plan"):
+                self.frame_facts[number] = measure_frame(self._frames[number], self._shrunk(number))
+        return self.frame_facts[number]
+
+    def _facts_of_pair(self, a: int, b: int) -> PairFacts:
+        if (a, b) not in self.pair_facts:
+            with self.timings.stage("plan"):
+                smalls = self._shrunk(a), self._shrunk(b)
+                self.pair_facts[a, b] = measure_pair(self._frames[a], self._frames[b], smalls)
+        return self.pair_facts[a, b]
+
+    def _shrunk(self, number: int) -> SmallFrame:
+        if number not in self._small:
+            self._small[number] = shrink(self._frames[number])
+        return self._small[number]
+
+    def _read_once(self, number: int) -> tuple[Frame | None, PreparedFrame]:
+        if number not in self._read:
+            with self.timings.stage("read"):
+                frame = self.shot.read(number)
+            with self.timings.stage("prepare"):
+                self._read[number] = frame, prepare(frame, demodulated="demodulate" in self._decide.allowed)
+        return self._read[number]
+
+    def _without_fireflies(self, frame: Frame | None, prepared: PreparedFrame) -> tuple[Frame | None, PreparedFrame]:
+        """Take out the single bright samples that neither neighbour shows: before anything is made of the frame."""
+        places = find_fireflies(prepared.irradiance)
+        if not len(places):
+            return frame, prepared
+        known = np.zeros(len(places), bool)
+        for neighbour in (prepared.number - self.shot.step, prepared.number + self.shot.step):
+            if self.shot.has(neighbour):
+                _, there = self._read_once(neighbour)
+                flow, valid = rendered_flow(prepared, there) or (None, None)
+                known |= recurring(places, prepared.irradiance, there.irradiance, flow, valid)
+        places = places[~known]
+        clean, _, removed = replace_fireflies(prepared.irradiance, places)
+        prepared = replace(prepared, irradiance=clean, fireflies=len(places), removed=removed)
+        return None if frame is None else replace(frame, color=prepared.radiance), prepared
 
     def clean_guides(self, number: int, radius: int) -> tuple[Array | None, Array | None]:
-        """Albedo and normal of a loaded frame, prefiltered with those of `radius` frames on each side."""
+        """Albedo and normal of a loaded frame, where they have noise prefiltered with `radius` frames on each side."""
         frame = self._frames[number]
         layers = {name: layer for name, layer in _layers(frame).items() if name in ("albedo", "normal", "valid")}
-        window, confidence, _ = self._gather(number, self.around(number, radius), layers, slice(0, len(frame.valid)))
+        numbers = self.around(number, radius)
+        stages = self.stages_of(numbers)
+        if "prefilter" not in stages:
+            return frame.albedo, frame.normal
+        window, confidence, _ = self._gather(number, numbers, layers, slice(0, len(frame.valid)), stages)
         clean = {name: prefilter_guide(layer, confidence) for name, layer in window.items()}
         return clean.get("albedo"), clean.get("normal")
 
@@ -302,13 +392,17 @@ class Aligner:
                 self._flows[a, b] = self._measure_step(here, there)
         return self._flows[a, b]
 
-    def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask]:
+    def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
+        # What a pair calls for is decided from the pair alone: its flow is the same in every window.
+        stages = self.stages_of(sorted((here.number, there.number)))
         shape = here.irradiance.shape[:2]
-        if "warp" not in self.stages:
+        if "warp" not in stages:
             return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
-        dense = "dense-flow" in self.stages
+        dense = "dense-flow" in stages
         vectors = None if dense else rendered_flow(here, there)
-        if vectors is not None and "refine" not in self.stages:
+        if vectors is None and not dense:
+            return None  # something moves, and nobody is to say where to
+        if vectors is not None and "refine" not in stages:
             return vectors
         exposure = measure_exposure(here.radiance)
         guides = pair_guides(
@@ -326,21 +420,21 @@ class Aligner:
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
         self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
+        stages = self.stages_of(numbers)
         centre = self._frames[number]
         height = len(centre.irradiance)
         rows = slice(0, height) if rows is None else rows
         outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
         inner = slice(rows.start - outer.start, rows.stop - outer.start)
-        layers = {name: layer[outer] for name, layer in _layers(centre).items()}
-        if given:
-            layers.pop("light", None)
-        window, confidence, seen = self._gather(number, numbers, layers, outer)
+        light = "gate" in stages and not given
+        layers = {name: layer[outer] for name, layer in _layers(centre, light=light, alpha="alpha" in stages).items()}
+        window, confidence, seen = self._gather(number, numbers, layers, outer, stages)
         estimates = self._gather_estimates(number, numbers, seen, outer) if given else None
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, estimates, confidence, seen, inner)
+            return self._finish(centre, window, estimates, confidence, seen, inner, stages)
 
     def _gather(
-        self, number: int, numbers: list[int], layers: dict[str, Array], rows: slice
+        self, number: int, numbers: Sequence[int], layers: dict[str, Array], rows: slice, stages: frozenset[str]
     ) -> tuple[dict[str, Array], Array, Array]:
         """Warp the neighbours' layers to these rows of the centre, whose own are given.
 
@@ -367,7 +461,7 @@ class Aligner:
                     kept[index] = warped[name]
                 # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
                 measured = known & inside & (warped["valid"][..., 0] > 0.999)
-                novelty = self._novelty(flow)
+                novelty = _novelty(flow) if "fixed-noise" in stages else 1.0
                 seen[index] = novelty * measured
                 confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
         return window, confidence, seen
@@ -390,7 +484,7 @@ class Aligner:
                 # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth up to
                 # 0.5 dB here.
                 moved = there[rows]
-                if "warp" in self.stages:
+                if link[0].any():
                     moved, _ = warp(there, link[0][rows], interpolation="bicubic", first_row=rows.start)
                 np.copyto(estimates[index], moved, where=seen[index, ..., None] > 0)
         return estimates
@@ -399,24 +493,17 @@ class Aligner:
         self, there: PreparedFrame, wanted: Collection[str], flow: Array, rows: slice
     ) -> tuple[dict[str, Array], Mask]:
         """Warp a neighbour's layers to these rows of the centre."""
-        layers = _layers(there)
+        layers = _layers(there, light="light" in wanted, alpha=f"aov {ALPHA}" in wanted)
         if missing := set(wanted) - set(layers):
             raise ValueError(
                 f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
             )
-        if "warp" not in self.stages:
+        if not flow.any():
             return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
         warped = {}
         for name, layer in ((name, layers[name]) for name in wanted):
             warped[name], inside = warp(layer, flow, first_row=rows.start)
         return warped, inside
-
-    def _novelty(self, flow: Array) -> Array | float:
-        """How much of a neighbour's noise is its own, in [0, 1]."""
-        if "fixed-noise" not in self.stages:
-            return 1.0
-        distance = np.hypot(flow[..., 0], flow[..., 1])
-        return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
 
     def _trust(
         self,
@@ -431,7 +518,7 @@ class Aligner:
         return estimate_confidence(
             flow,
             inside=measured,
-            reverse=back if "warp" in self.stages else None,
+            reverse=back if flow.any() or back.any() else None,
             albedo=centre.get("albedo"),
             warped_albedo=warped.get("albedo"),
             normal=centre.get("normal"),
@@ -447,6 +534,7 @@ class Aligner:
         confidence: Array,
         seen: Array,
         inner: slice,
+        stages: frozenset[str],
     ) -> AlignedWindow:
         color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
         middle = len(color) // 2
@@ -458,12 +546,13 @@ class Aligner:
                 layer[middle][gone] = average(layer, confidence)[gone]
         there = [frame for n in self.around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
         lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
+        bright = lit.as_light if "light" in window else lit.as_rendered
         outliers = 0
-        if "outliers" in self.stages:
+        if "outliers" in stages:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected[:, inner]))
         trust = confidence
-        clean = None if albedo is None else _clean(albedo, trust, self.stages)
+        clean = None if albedo is None else _clean(albedo, trust, stages)
         modulation = np.ones_like(color[0])
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
@@ -471,11 +560,11 @@ class Aligner:
             # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
             estimates = estimates / modulation
         if estimates is not None:
-            gate = color_gate(estimates, color[middle], lit.exposure)
+            gate = color_gate(estimates, color[middle], bright.exposure)
             floor = np.minimum(seen, AGREEING) * gate
-            confidence = np.maximum(confidence * gate if "gate" in self.stages else confidence, floor) * (seen > 0)
-        elif "gate" in self.stages:
-            confidence = confidence * color_gate(window.pop("light"), color[middle], lit.exposure)
+            confidence = np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)
+        elif "gate" in stages:
+            confidence = confidence * color_gate(window.pop("light"), color[middle], bright.exposure)
         return AlignedWindow(
             number=centre.number,
             color=color,
@@ -487,13 +576,15 @@ class Aligner:
             trust=trust,
             rendered_variance=centre.variance,
             estimate=estimates,
-            aovs={name: window[f"aov {name}"] for name in centre.aovs},
+            aovs={name.removeprefix("aov "): layer for name, layer in window.items() if name.startswith("aov ")},
             repaired=centre.repaired,
             outliers=outliers,
-            exposure=lit.exposure,
-            moments=lit.moments,
+            fireflies=centre.fireflies,
+            removed=centre.removed,
+            exposure=bright.exposure,
+            moments=bright.moments,
             inner=inner,
-            stages=self.stages,
+            stages=stages,
         )
 
 
@@ -502,14 +593,31 @@ def _clean(layer: Array, trust: Array, stages: Collection[str]) -> Array:
     return prefilter_guide(layer, trust) if "prefilter" in stages else layer[len(layer) // 2]
 
 
-def _layers(frame: PreparedFrame) -> dict[str, Array]:
+@dataclass(frozen=True)
+class _Always:
+    """The same stages on all frames, whatever they show."""
+
+    allowed: frozenset[str]
+
+    def __call__(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], /) -> frozenset[str]:
+        return self.allowed
+
+
+def _novelty(flow: Array) -> Array:
+    """How much of a neighbour's noise is its own where one seed makes the noise of all frames, in [0, 1]."""
+    distance = np.hypot(flow[..., 0], flow[..., 1])
+    return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
+
+
+def _layers(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:
     """All layers of a frame that are warped."""
     named = {
         "color": frame.irradiance,
-        "light": frame.light,
+        "light": frame.light if light else None,
         "albedo": frame.albedo,
         "normal": frame.normal,
         **{f"aov {name}": layer for name, layer in frame.aovs.items()},
+        f"aov {ALPHA}": frame.alpha if alpha else None,
         "valid": frame.valid[..., None].astype(np.float32),
     }
     return {name: layer for name, layer in named.items() if layer is not None}

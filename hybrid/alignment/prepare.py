@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,24 @@ Mask = NDArray[np.bool_]
 ALPHA = "alpha"
 
 
+class Brightness(NamedTuple):
+    """How bright a frame is.
+
+    Attributes
+    ----------
+    exposure : float
+        Of the irradiance (`hybrid.alignment.transfer.measure_exposure`).
+    moments : (2, G + 1) array
+        Mean and deviation over the frame of `PreparedFrame.guide`'s channels, and of the tone-mapped irradiance.
+    """
+
+    exposure: float
+    moments: NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, made safe to filter: finite, divided by its albedo, perhaps with a rough idea of its light.
+    """One frame, made safe to filter: finite, and divided by its albedo.
 
     Attributes
     ----------
@@ -31,8 +47,6 @@ class PreparedFrame:
         The frame's number.
     irradiance : (H, W, 3) array
         Color divided by albedo (`hybrid.alignment.transfer.demodulate`), or the color itself if not `demodulated`.
-    light : (H, W, 3) array or None
-        Irradiance without most of its noise, by a guided filter: what the gate compares where nothing better is given.
     albedo, normal : (H, W, 3) array or None
         Guides, finite.
     valid : (H, W) bool array
@@ -45,19 +59,20 @@ class PreparedFrame:
         Distance; only its order is used.
     variance : (H, W, 3) array or None
         Of the irradiance, where the renderer gave one of the color.
+    alpha : (H, W, 1) array or None
+        Coverage, finite.
     aovs : dict of str to (H, W, C) array
         Further layers to be warped along, demodulated like the color.
     demodulated : bool
         Whether the albedo has been divided out.
-    exposure : float
-        Brightness of the irradiance (`hybrid.alignment.transfer.measure_exposure`).
-    moments : (2, G + 1) array
-        Mean and deviation over the frame of `guide`'s channels, and of the tone-mapped light.
+    fireflies : int
+        Single bright samples that were taken out.
+    removed : float
+        Share of the light that went with them, in [0, 1].
     """
 
     number: int
     irradiance: Array
-    light: Array | None
     albedo: Array | None
     normal: Array | None
     valid: Mask
@@ -65,10 +80,32 @@ class PreparedFrame:
     motion: Motion | None
     depth: Array | None
     variance: Array | None
+    alpha: Array | None
     aovs: dict[str, Array]
     demodulated: bool
-    exposure: float
-    moments: NDArray[np.float64]
+    fireflies: int = 0
+    removed: float = 0.0
+
+    @cached_property
+    def light(self) -> Array:
+        """Irradiance without most of its noise (H, W, 3): what the gate compares where nothing better is given."""
+        return rough_light(self.irradiance, self.albedo, self.normal)
+
+    @cached_property
+    def as_rendered(self) -> Brightness:
+        """Exposure and moments with the irradiance as it was rendered."""
+        return self._brightness(self.irradiance)
+
+    @cached_property
+    def as_light(self) -> Brightness:
+        """Exposure and moments with its light."""
+        return self._brightness(self.light)
+
+    def _brightness(self, shown: Array) -> Brightness:
+        exposure = measure_exposure(shown)
+        gray = compress(shown.mean(axis=-1, keepdims=True), exposure)
+        moments = [measure_guide(layer) for layer in (self.albedo, self.normal, gray) if layer is not None]
+        return Brightness(exposure, np.concatenate(moments, axis=1))
 
     @property
     def guide(self) -> Array | None:
@@ -84,15 +121,15 @@ class PreparedFrame:
         return remodulate(self.irradiance, self.albedo)
 
 
-def prepare(frame: Frame, stages: Collection[str]) -> PreparedFrame:
-    """Make one frame safe to filter, divide it by its albedo, and estimate its light where the gate will ask for it.
+def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
+    """Make one frame safe to filter, and divide it by its albedo.
 
     Parameters
     ----------
     frame : Frame
         As read.
-    stages : collection of str
-        The plan's; "demodulate", "alpha" and "gate" matter here.
+    demodulated : bool
+        Whether to divide by the albedo, where there is one.
     """
     color, bad = replace_nonfinite(frame.color)
     repaired = bad
@@ -109,22 +146,14 @@ def prepare(frame: Frame, stages: Collection[str]) -> PreparedFrame:
     for name, layer in frame.aovs.items():
         aovs[name], bad_here = replace_nonfinite(layer)
         repaired = repaired | bad_here
-    demodulated = albedo is not None and "demodulate" in stages
+    demodulated = albedo is not None and demodulated
     if albedo is not None and demodulated:
         color = demodulate(color, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
         aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
-    if frame.alpha is not None and "alpha" in stages:
-        aovs[ALPHA] = replace_nonfinite(frame.alpha[..., None])[0]
-    light = _rough_light(color, albedo, normal) if "gate" in stages else None
-    shown = color if light is None else light
-    exposure = measure_exposure(shown)
-    gray = compress(shown.mean(axis=-1, keepdims=True), exposure)
-    moments = [measure_guide(layer) for layer in (albedo, normal, gray) if layer is not None]
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
-        light=light,
         albedo=albedo,
         normal=normal,
         valid=~bad,
@@ -132,15 +161,27 @@ def prepare(frame: Frame, stages: Collection[str]) -> PreparedFrame:
         motion=frame.flows(),
         depth=frame.depth,
         variance=None if variance is None else np.maximum(variance, 0),
+        alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
-        exposure=exposure,
-        moments=np.concatenate(moments, axis=1),
     )
 
 
-def _rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
-    """Light of one frame, cheaply: what the gate compares must not be noise."""
+def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
+    """Estimate the light of one frame, cheaply: what the gate compares must not be noise.
+
+    Parameters
+    ----------
+    irradiance : (H, W, 3) array
+        Finite.
+    albedo, normal : (H, W, 3) array or None
+        Guides, finite.
+
+    Returns
+    -------
+    (H, W, 3) array
+        Irradiance.
+    """
     clean, _ = reject_outliers(irradiance[None], np.ones((1, *irradiance.shape[:2]), np.float32))
     guides = [layer for layer in (albedo, normal) if layer is not None]
     if guides:

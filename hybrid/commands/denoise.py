@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -38,7 +38,7 @@ from hybrid.commands.options import (
     ShotArgument,
     import_neural,
     open_input,
-    plan_input,
+    rules_of,
     usage,
 )
 from hybrid.interrupt import INTERRUPTED, interruptible
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from hybrid.estimates import EstimateSource
     from hybrid.files.frames import Shot
     from hybrid.pipeline import DenoiseWindow
-    from hybrid.plan import Plan
+    from hybrid.plan import Rules
     from hybrid.timing import Timings
 
 
@@ -78,10 +78,15 @@ def pseudoref(
     """
     from hybrid.estimates import choose_estimate
     from hybrid.pipeline import Denoised
+    from hybrid.plan import NEURAL_STAGES
     from hybrid.pseudo_reference import CLASSICAL_PRESETS, gated_average
     from hybrid.pseudo_reference import filter_window as estimate_centre
     from hybrid.timing import Timings
 
+    rules = rules_of(stages, no_stages)
+    if neural := rules.on & NEURAL_STAGES:
+        raise typer.BadParameter(f"--stages: {min(neural)} is a stage of the network, expected one that pseudoref has")
+    rules = replace(rules, off=rules.off | NEURAL_STAGES)
     chosen = CLASSICAL_PRESETS[preset]
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     timings = Timings()
@@ -101,7 +106,7 @@ def pseudoref(
             command="pseudoref",
             preset=preset,
             settings={"layer": layer, "profile": profile, "motion": motion, "estimate": estimate},
-            stages=(stages, no_stages),
+            rules=rules,
             resume=resume,
             max_memory=max_memory,
         )
@@ -204,7 +209,7 @@ def denoise(
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
     chosen: str = preset
     if budget is not None:
-        chosen = _fitting(opened, budget, estimate, plan_input(opened, stages, no_stages), precision)
+        chosen = _fitting(opened, budget, estimate, rules_of(stages, no_stages), precision)
     path = weights or neural.shipped_weights(chosen)
     if tile is None:
         tile = neural.TILE if max_memory is None else neural.SMALL_TILE
@@ -241,7 +246,7 @@ def denoise(
         command="denoise",
         preset=chosen if weights is None else path.name,
         settings=settings,
-        stages=(stages, no_stages),
+        rules=rules_of(stages, no_stages),
         resume=resume,
         max_memory=max_memory,
         radius=denoiser.radius,
@@ -283,7 +288,7 @@ def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictu
         check_sheet(contact)
 
 
-def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str) -> str:
+def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str) -> str:
     """The most accurate preset that is measured to fit a time per frame, or the fastest; says what was measured."""
     from hybrid.budget import measure_presets, parse_budget
 
@@ -296,7 +301,7 @@ def _fitting(shot: Shot, budget: str, estimate: str, plan: Plan, precision: str)
         return denoiser, denoiser.radius
 
     tried = []
-    for measured in measure_presets(shot, plan.stages, "nlm" if estimate == "none" else estimate, load):
+    for measured in measure_presets(shot, rules, "nlm" if estimate == "none" else estimate, load):
         tried.append(f"{measured.preset} {measured.seconds:.2g} s")
         fits = measured.seconds <= seconds
         if fits:
@@ -319,7 +324,7 @@ class Job:
     command: str
     preset: str
     settings: Mapping[str, object]  # all options that the pixels depend on
-    stages: tuple[Sequence[str] | None, Sequence[str] | None]  # forced on, forced off
+    rules: Rules
     resume: bool
     max_memory: str | None
     radius: int = 2
@@ -372,44 +377,36 @@ def _denoise(job: Job, done: list[int]) -> None:
     from hybrid.files.layers import summarize_layers
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
     from hybrid.pipeline import denoise_shot
-    from hybrid.plan import Plan
+    from hybrid.plan import NEURAL_STAGES, Plan, merge
 
     shot, source, timings = job.shot, job.source, job.timings
     with usage():
         limit = None if job.max_memory is None else parse_size(job.max_memory)
     if limit is None:
         keep_freed_memory()
-    fit = (
-        partial(plan_rows, limit, shot, estimates=source.estimates, radius=job.radius, neural=job.neural)
-        if limit
-        else None
-    )
-    if fit is not None:
-        fit(Plan(()))  # refuses what can never be enough before frames are read to make a plan
-    plan = plan_input(shot, *job.stages)
-    rows = None if fit is None else fit(plan)
+    rules = job.rules
+    rows = None
+    if limit is not None:
+        rows = plan_rows(limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural)
     layers = shot.layers(shot.numbers[0])
     for words in (f"layers: {summarize_layers(layers)}", *layers.notes):
         LOG.info(printable(words))
-    LOG.info("stages: " + ", ".join(d.stage for d in plan.decisions if d.on))
-    for decision in plan.decisions:
-        if not decision.on:
-            LOG.info(f"  not run: {decision.stage} ({decision.reason})")
     LOG.info(f"estimates: {source.name} ({source.reason})")
     attributes = {
         "ravg/command": job.command,
         "ravg/preset": job.preset,
         "ravg/estimate": source.name,
-        "ravg/stages": " ".join(sorted(plan.stages)),
+        "ravg/forced": " ".join([f"+{name}" for name in sorted(rules.on)] + [f"-{name}" for name in sorted(rules.off)]),
         "ravg/settings": json.dumps(job.settings, sort_keys=True),
     }
     pixels, outliers, resumed, finished = 0, 0, 0, None
+    plans, removed = {}, {}
     progress = Progress(job.command, len(shot))
     frames = denoise_shot(
         shot,
         job.output,
         job.denoise,
-        plan,
+        rules,
         radius=job.radius,
         estimates=source.estimates,
         attributes=attributes,
@@ -423,6 +420,12 @@ def _denoise(job: Job, done: list[int]) -> None:
         resumed += finished.resumed
         pixels += finished.pixels
         outliers += finished.outliers
+        if finished.plan is not None:
+            plans[finished.number] = finished.plan
+        if finished.fireflies:
+            removed[finished.number] = finished.removed
+            light = f"{finished.removed:.2%} of its light"
+            LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {light}")
         if finished.repaired:
             LOG.warning(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
         if finished.clamped:
@@ -434,6 +437,10 @@ def _denoise(job: Job, done: list[int]) -> None:
         return
     if resumed:
         LOG.info(f"{resumed} of {len(shot)} frames were finished already")
+    plan = merge(plans) if plans else Plan(())
+    for decision in plan.decisions:
+        if job.neural or decision.stage not in NEURAL_STAGES:
+            LOG.info(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
     table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
     for row in timings.rows(pixels):
         table.add_row(*row)
@@ -448,6 +455,7 @@ def _denoise(job: Job, done: list[int]) -> None:
         resumed=resumed,
         pixels=pixels,
         outliers=outliers,
+        light_removed=removed,
         plan=[vars(decision) for decision in plan.decisions],
     )
     LOG.info(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybrid.commands.log import printable
+from hybrid.commands.log import Progress, printable
 from hybrid.commands.options import (
     OUTPUT,
     FramesOption,
@@ -20,7 +20,7 @@ from hybrid.commands.options import (
     ProfileOption,
     ShotArgument,
     open_input,
-    plan_input,
+    rules_of,
 )
 
 if TYPE_CHECKING:
@@ -47,14 +47,16 @@ def inspect(
     from rich.text import Text
 
     from hybrid.files.layers import describe_layers
-    from hybrid.plan import STAGES
+    from hybrid.plan import STAGES, plan_shot
 
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     first = opened.numbers[0]
     height, width = opened.shape
     layers = opened.layers(first)
     rows = describe_layers(layers)
-    plan = plan_input(opened, stages, no_stages)
+    rules = rules_of(stages, no_stages)
+    progress = Progress("look", len(opened))
+    plan = plan_shot(opened, rules, advance=progress.advance)
     if as_json:
         document = {
             "frames": opened.numbers,

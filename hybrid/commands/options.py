@@ -13,7 +13,7 @@ from hybrid.commands.log import LOG
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
     from hybrid.files.frames import Shot
-    from hybrid.plan import Plan
+    from hybrid.plan import Rules
 
 Thing = TypeVar("Thing")
 
@@ -198,12 +198,12 @@ def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
     return overrides
 
 
-def plan_input(shot: Shot, on: Sequence[str] | None, off: Sequence[str] | None) -> Plan:
-    from hybrid.plan import plan_shot
+def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:
+    """What decides which stages run, with those that the user has forced."""
+    from hybrid.plan import Rules
 
-    plan = plan_shot(shot)
     with usage():
-        return plan.force(split_names(on), split_names(off))
+        return Rules(frozenset(split_names(on)), frozenset(split_names(off)))
 
 
 def split_names(names: Sequence[str] | None) -> list[str]:

@@ -24,7 +24,7 @@ from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, Shot
 from hybrid.oidn import Quality
-from hybrid.plan import Plan, plan_shot
+from hybrid.plan import Plan, Rules, plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average
 from nlm.average import average, replace_nonfinite, robust_average
 
@@ -96,7 +96,7 @@ def external(other: Shot) -> Method:
 
 @lru_cache(maxsize=1)
 def _plan(shot: Shot) -> Plan:
-    """The shot's plan: made once, whoever asks, since it is no cost of a frame."""
+    """The shot's plan, made once, whoever asks: which way round a stage is."""
     return plan_shot(shot)
 
 
@@ -109,21 +109,18 @@ def _windows(
     vectors: bool = True,
     solver: Mapping[str, Any] | None = None,
 ) -> Iterator[AlignedWindow]:
-    """Every aligned window with the stages that the plan asks for.
+    """Every aligned window with the stages that it calls for.
 
     `source` is that of the estimates (`hybrid.estimates`), `flip` a stage to be the other way round; without
     `vectors` those of the renderer are not looked at; `solver` has settings of TV-L1, and has it run.
     """
     seen = shot if vectors else _blind(shot)
-    plan = _plan(seen)
+    rules = Rules(on=frozenset({"refine"} if solver else ()))
     if flip:
-        plan = plan.force(**({"off": [flip]} if flip in plan.stages else {"on": [flip]}))
-    if solver:
-        plan = plan.force(on=["refine"])
+        runs = flip in _plan(seen).stages
+        rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
     refine = partial(refine_flow, **(solver or {}))
-    aligner = Aligner(
-        seen, plan.stages, radius=radius, estimates=choose_estimate(source, seen).estimates, refine=refine
-    )
+    aligner = Aligner(seen, rules, radius=radius, estimates=choose_estimate(source, seen).estimates, refine=refine)
     for number in shot.numbers:
         yield aligner.align(number)
 
@@ -220,8 +217,7 @@ def oidn(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> I
 
 def oidn_then_average(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
     """OIDN on each frame, then the aligned robust average of what it gave."""
-    stages = _plan(shot).stages
-    aligner = Aligner(_changed(shot, partial(_denoised, quality=quality, prefilter=prefilter)), stages)
+    aligner = Aligner(_changed(shot, partial(_denoised, quality=quality, prefilter=prefilter)), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(aligner.align(number))
 

@@ -13,7 +13,7 @@ from hybrid.alignment.align import Aligner
 from hybrid.estimates import choose_estimate
 from hybrid.files.frames import Shot
 from hybrid.neural.denoiser import tensor_of
-from hybrid.plan import plan_shot
+from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average
 from network.clips import Clip, importance, important_places, write_shards
 from network.inputs import window_exposure
@@ -82,8 +82,7 @@ def write_clips(
         what = ", ".join(levels) + ("" if reference is None else " and the reference")
         raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
     aligners = [
-        Aligner(shot, plan_shot(shot).stages, radius=radius, estimates=choose_estimate(estimate, shot).estimates)
-        for shot in shots
+        Aligner(shot, Rules(), radius=radius, estimates=choose_estimate(estimate, shot).estimates) for shot in shots
     ]
 
     def make() -> Iterator[Clip]:

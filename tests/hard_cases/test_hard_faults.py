@@ -22,7 +22,7 @@ from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.interrupt import interruptible
 from hybrid.memory import parse_size, plan_rows
-from hybrid.plan import plan_shot
+from hybrid.plan import STAGES
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.hard_cases.test_hard_files import ROOT, run_alone
 from tests.scenes import Scene
@@ -245,15 +245,14 @@ def test_the_network_in_parts_is_the_network(tall, rows):
 
 def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
     shot = open_shot(tall)
-    plan = plan_shot(shot)
-    assert plan_rows(2**40, shot, plan, None, neural=False) is None
+    assert plan_rows(2**40, shot, STAGES, None, neural=False) is None
     assert draft(tall, tmp_path / "out", "--max-memory", "10M") == 1
     assert "expected at least" in capsys.readouterr().err
     monkeypatch.setattr(type(shot), "shape", (2160, 3840))
     rows = []
     for size in range(2, 33):
         with suppress(ValueError):  # too little
-            rows.append(plan_rows(size * 2**30, shot, plan, None, neural=False) or 2160)
+            rows.append(plan_rows(size * 2**30, shot, STAGES, None, neural=False) or 2160)
     assert rows == sorted(rows)  # more memory, more rows
     assert len(set(rows)) > 2
     assert rows[-1] == 2160
@@ -274,7 +273,6 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
 
 FAULTS = """
 import resource
-from hybrid.estimates import OfWindows
 from hybrid.memory import keep_freed_memory
 
 def page_faults() -> int:

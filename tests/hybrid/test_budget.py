@@ -9,7 +9,7 @@ from hybrid.commands.denoise import _fitting
 from hybrid.estimates import MODE_OF
 from hybrid.files.frames import open_shot
 from hybrid.pipeline import Denoised
-from hybrid.plan import plan_shot
+from hybrid.plan import Rules
 from tests.scenes import Scene
 
 SCENE = Scene(height=40, width=56, frames=5)
@@ -47,7 +47,7 @@ def test_presets_are_measured_from_the_most_accurate_on(tmp_path, monkeypatch, e
         return (lambda window: seen.append((preset, window.number)) or Denoised(window.color[1])), 1
 
     spec = str(folder) if estimate == "sequence" else estimate
-    measured = list(measure_presets(shot, plan_shot(shot).stages, spec, load))
+    measured = list(measure_presets(shot, Rules(), spec, load))
     assert [m.preset for m in measured] == ["quality", "balanced", "fast"] == list(reversed(MODE_OF))
     assert all(m.seconds > 0 for m in measured)
     assert seen == [(m.preset, SCENE.first + k) for m in measured for k in (1, 2)]
@@ -65,7 +65,7 @@ def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, capsys, ask
             yield Measured(preset, seconds)
 
     monkeypatch.setattr(budget, "measure_presets", measure)
-    assert _fitting(shot, asked, "nlm", plan_shot(shot), "float32") == chosen
+    assert _fitting(shot, asked, "nlm", Rules(), "float32") == chosen
     assert len(measured) == tried  # nothing is measured that is not needed
     said = capsys.readouterr().err
     assert f"preset: {chosen}" in said

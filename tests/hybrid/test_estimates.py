@@ -101,7 +101,7 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
         aligner, read = Aligner(shot, stages, estimates=source), []
         aligner.shot.read = lambda number, read=read: read.append(number) or type(shot).read(shot, number)
         aligner.align(scene.first + 7)
-        reach = 2 if source is None else source.reach(2, stages)
+        reach = 2 if source is None else source.reach(2)
         assert sorted(read) == list(range(scene.first + 7 - reach, scene.first + 8 + reach))
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from hybrid.alignment.align import Aligner
 from hybrid.files.frames import open_shot
-from hybrid.plan import STAGES, plan_shot
+from hybrid.plan import STAGES, Rules, plan_shot
 from tests.scenes import Scene
 
 
@@ -82,7 +82,7 @@ def test_one_frame_has_a_plan(tmp_path):
 
 
 def test_the_user_may_force_what_was_measured(shot_folder):
-    plan = plan_shot(open_shot(shot_folder)).force(on=["refine"], off=["warp"])
+    plan = plan_shot(open_shot(shot_folder), Rules(on=frozenset({"refine"}), off=frozenset({"warp"})))
     assert "refine" in plan.stages
     assert "warp" not in plan.stages
     forced = [d for d in plan.decisions if d.forced]
@@ -91,9 +91,9 @@ def test_the_user_may_force_what_was_measured(shot_folder):
 
 
 @pytest.mark.parametrize(("on", "off"), [(["wrap"], []), ([], ["wrap"]), (["warp"], ["warp"])])
-def test_forcing_nonsense_is_refused(shot_folder, on, off):
+def test_forcing_nonsense_is_refused(on, off):
     with pytest.raises(ValueError, match=r"wrap|both"):
-        plan_shot(open_shot(shot_folder)).force(on=on, off=off)
+        Rules(on=frozenset(on), off=frozenset(off))
 
 
 @pytest.mark.parametrize("moving", [False, True])

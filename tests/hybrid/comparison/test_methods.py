@@ -16,7 +16,7 @@ from hybrid.comparison.methods import METHODS, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
 from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 from hybrid.files.frames import Shot, open_shot
-from hybrid.plan import STAGES, plan_shot
+from hybrid.plan import STAGES, Rules, plan_shot
 from hybrid.pseudo_reference import filter_window
 from nlm.average import average
 from tests.scenes import Scene
@@ -131,7 +131,7 @@ class TestSweep:
 
 
 def test_estimators_of_methods_are_those_of_the_library(shot: Shot) -> None:
-    aligned = Aligner(shot, plan_shot(shot).stages).align(SCENE.first)
+    aligned = Aligner(shot, Rules()).align(SCENE.first)
     np.testing.assert_array_equal(next(METHODS["standard"].run(shot))[1], filter_window(aligned))
 
 

@@ -12,7 +12,7 @@ from hybrid.comparison.metrics import mean_bias, psnr
 from hybrid.estimates import MODE_OF, OfWindows
 from hybrid.files.frames import open_shot
 from hybrid.neural.denoiser import Denoiser, shipped_weights
-from hybrid.plan import plan_shot
+from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window
 from nlm.average import robust_average
 
@@ -25,7 +25,7 @@ FRAME = 11
 @pytest.fixture(scope="module")
 def window():
     shot = open_shot(SHOT / "noisy.####.exr")
-    return Aligner(shot, plan_shot(shot).stages, estimates=OfWindows(FINAL)).align(FRAME)
+    return Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(FRAME)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,319 @@
+"""What frames and pairs of frames show: the figures that decisions are made of (`hybrid.plan`).
+
+Each figure depends on its frame, or on its two neighbouring frames, and on nothing else: so what is decided for a
+window is the same whatever part of a shot is denoised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.warp import warp
+from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
+from hybrid.alignment.transfer import compress, measure_exposure, remodulate
+from nlm.average import reject_outliers
+from nlm.gate import color_gate
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Frames are looked at this small: a mean of k×k pixels has a k-th of their noise, and costs a k²-th of their time. No
+# smaller than the whole frame below twice this.
+SHORT_SIDE = 270
+# Where the noise is compared that stands still: enough pixels to tell a correlation of 0.02.
+CROP = 512
+# Below half of this many pixels of motion a pixel counts as still, above one and a half its noise is another's.
+STILL_NOISE, MOVED_NOISE = 0.05, 1.5
+# Half floats are rounded by 2^-11 of their value: what differs by less is the same sample.
+SAME = 2.0**-10
+# A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
+NOISE_FREE = 1e-4
+TILE = 32
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """Figures of one frame.
+
+    Attributes
+    ----------
+    number : int
+        Of the frame.
+    albedo_spread : float or None
+        Standard deviation of the albedo over the frame; None without one.
+    guides : bool
+        Whether there is an albedo or a normal.
+    fireflies : int
+        Single bright samples that were taken out.
+    outliers : float
+        Share of the pixels that stand far above all their neighbours, in [0, 1].
+    transparent : float or None
+        Share of the pixels whose alpha is below 0.999; None without alpha.
+    noise_free : float
+        Share of the tiles that hold no noise, in [0, 1].
+    """
+
+    number: int
+    albedo_spread: float | None
+    guides: bool
+    fireflies: int
+    outliers: float
+    transparent: float | None
+    noise_free: float
+
+
+@dataclass(frozen=True)
+class PairFacts:
+    """Figures of two neighbouring frames.
+
+    Attributes
+    ----------
+    numbers : (int, int)
+        Of the frames, ascending.
+    vectors : bool
+        Whether the renderer says where pixels move.
+    speed : float
+        Pixels per frame of the fastest thousandth by these vectors; 0 without.
+    changed : float
+        Share of the picture that changes at equal pixels by more than noise, in [0, 1].
+    unexplained : float
+        Share of the picture whose light changes along the vectors by more than noise; `changed` without vectors.
+    fixed_noise : float
+        How much of the noise stands still on the screen, in [-1, 1]: about 1 with one seed for all frames, else 0.
+    guide_noise : float
+        Upper quartile of what albedo and normal differ by between the frames, along the vectors.
+    """
+
+    numbers: tuple[int, int]
+    vectors: bool
+    speed: float
+    changed: float
+    unexplained: float
+    fixed_noise: float
+    guide_noise: float
+
+
+@dataclass(frozen=True)
+class SmallFrame:
+    """A frame as it is looked at: reduced by a whole factor, with its light.
+
+    Attributes
+    ----------
+    factor : int
+        Pixels of the frame on a side of one here.
+    irradiance, light : (h, w, 3) array
+        Means over these pixels, and the same without most of the noise.
+    albedo : (h, w, 3) array or None
+        What the irradiance was divided by.
+    """
+
+    factor: int
+    irradiance: Array
+    light: Array
+    albedo: Array | None
+
+    def textured(self) -> SmallFrame:
+        """Multiply by the albedo again: what moves shows in its texture first."""
+        if self.albedo is None:
+            return self
+        irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
+        return SmallFrame(self.factor, irradiance, light, None)
+
+
+def shrink(frame: PreparedFrame) -> SmallFrame:
+    """Reduce a frame for looking at it; its size decides by how much."""
+    height, width = frame.irradiance.shape[:2]
+    factor = max(1, min(height, width) // SHORT_SIDE)
+    if factor == 1:
+        return SmallFrame(1, frame.irradiance, frame.light, frame.albedo if frame.demodulated else None)
+    irradiance = _means(frame.irradiance, factor)
+    albedo, normal = (None if layer is None else _means(layer, factor) for layer in (frame.albedo, frame.normal))
+    light = rough_light(irradiance, albedo, normal)
+    return SmallFrame(factor, irradiance, light, albedo if frame.demodulated else None)
+
+
+def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
+    """Measure one frame.
+
+    Parameters
+    ----------
+    frame : PreparedFrame
+        The frame.
+    small : SmallFrame
+        The same, from `shrink`.
+    """
+    _, rejected = reject_outliers(frame.irradiance[None], frame.valid[None].astype(np.float32))
+    return FrameFacts(
+        number=frame.number,
+        albedo_spread=None if frame.albedo is None else float(frame.albedo.std()),
+        guides=frame.albedo is not None or frame.normal is not None,
+        fireflies=frame.fireflies,
+        outliers=float(np.mean(rejected)),
+        transparent=None if frame.alpha is None else float(np.mean(frame.alpha < 0.999)),
+        noise_free=_noise_free_share(small),
+    )
+
+
+def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallFrame, SmallFrame]) -> PairFacts:
+    """Measure two neighbouring frames.
+
+    Parameters
+    ----------
+    here, there : PreparedFrame
+        The frames, in order of time.
+    smalls : (SmallFrame, SmallFrame)
+        The same, from `shrink`.
+    """
+    vectors = rendered_flow(here, there)
+    changed = _changed(smalls[0].textured(), smalls[1].textured(), None)
+    speed = 0.0
+    if vectors is not None:
+        length = np.hypot(vectors[0][..., 0], vectors[0][..., 1])
+        speed = float(np.quantile(length, 0.999))
+    return PairFacts(
+        numbers=(here.number, there.number),
+        vectors=vectors is not None,
+        speed=speed,
+        changed=changed,
+        unexplained=changed if vectors is None else _changed(*smalls, _reduced(vectors, smalls[0])),
+        fixed_noise=fixed_noise(here, there, moves=changed > 0),
+        guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
+    )
+
+
+def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> float:
+    """Tell how much of the noise of two frames is the same at equal pixels.
+
+    Parameters
+    ----------
+    here, there : PreparedFrame
+        Neighbouring frames of one size.
+    moves : bool
+        Whether the picture changes at equal pixels; asked only where no vectors tell.
+
+    Returns
+    -------
+    float
+        In [-1, 1]; 0 where there is no noise.
+
+    Notes
+    -----
+    Detail correlates at equal pixels as a fixed noise does, so it is taken out first. Where the picture moves, each
+    frame is compared with the other one, warped to it: d_a = a - b(x + v), d_b = b - a(x - v). With a seed for each
+    frame their covariance at equal pixels is 0, detail or not; with one seed it is half of their variance. Where the
+    picture stands still, samples of one seed are equal to the bit, and samples of two seeds are not. Both are relative
+    to the light, without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
+    """
+    block = _middle(here.irradiance.shape[:2])
+    a, b = (frame.irradiance[block].mean(axis=-1) for frame in (here, there))
+    level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
+    floor = 0.01 * measure_exposure(level[..., None])
+    noise = [_high_pass(image / (level + floor)) for image in (a, b)]
+    grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > 4 * SAME
+    forth, back = rendered_flow(here, there), rendered_flow(there, here)
+    if forth is None or back is None:
+        if moves:  # detail moves as well, and only noise can correlate
+            return _correlation(*noise)
+        still, moved = np.ones(a.shape, bool), np.zeros(a.shape, bool)
+    else:
+        length = np.hypot(forth[0][block][..., 0], forth[0][block][..., 1])
+        still = (length < STILL_NOISE) & forth[1][block]
+        moved = (length > MOVED_NOISE) & forth[1][block] & back[1][block]
+    shares, figures = [], []
+    compared = still & grainy
+    if compared.any():
+        equal = np.abs(a - b) <= SAME * np.maximum(np.abs(a), np.abs(b))
+        shares.append(int(compared.sum()))
+        figures.append(float(np.mean(equal[compared])))
+    if moved.sum() > CROP and forth is not None and back is not None:
+        full = [frame.irradiance.mean(axis=-1) for frame in (here, there)]
+        d_a = full[0] - warp(full[1][..., None], forth[0])[0][..., 0]
+        d_b = full[1] - warp(full[0][..., None], back[0])[0][..., 0]
+        d = [_high_pass(image[block] / (level + floor))[moved] for image in (d_a, d_b)]
+        shares.append(int(moved.sum()))
+        figures.append(2 * _correlation(*d))
+    return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
+
+
+def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
+    """Share of the picture whose light differs between two frames by more than its noise, along `vectors`."""
+    exposure = measure_exposure(here.light)
+    other, inside = there.light, np.ones(here.light.shape[:2], bool)
+    if vectors is not None:
+        other, inside = warp(other, vectors[0])
+        inside &= vectors[1]
+    window = np.stack([other, here.light, other])
+    weight = color_gate(window, here.irradiance, exposure)[0]
+    # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
+    # noise brings one in a thousand.
+    return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
+
+
+def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mask]:
+    """Vectors of the small frame: the means of those that are known, in its pixels."""
+    flow, valid = vectors
+    if small.factor == 1:
+        return vectors
+    known = _means(valid.astype(np.float32)[..., None], small.factor)[..., 0]
+    mean = _means(np.where(valid[..., None], flow, np.float32(0)), small.factor)
+    share = np.maximum(known, np.float32(1 / small.factor**2))[..., None]
+    return np.asarray(mean / share / np.float32(small.factor), np.float32), known > 0.5
+
+
+def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int) -> float:
+    """Upper quartile over every `factor`-th pixel; smaller guides would have less noise."""
+    guides = here.guide, there.guide
+    if guides[0] is None or guides[1] is None:
+        return 0.0
+    grid = np.s_[factor // 2 :: factor, factor // 2 :: factor]
+    warped: Array = guides[1][grid]
+    if vectors is not None:
+        rows, columns = np.mgrid[: guides[0].shape[0], : guides[0].shape[1]][(slice(None), *grid)].astype(np.float32)
+        flow = vectors[0][grid]
+        places = columns + flow[..., 0], rows + flow[..., 1]
+        warped = np.asarray(
+            cv2.remap(guides[1], *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+        )
+    return float(np.quantile(np.abs(guides[0][grid] - warped).max(axis=-1), 0.75))
+
+
+def _noise_free_share(small: SmallFrame) -> float:
+    exposure = measure_exposure(small.light)
+    removed = np.abs(compress(small.irradiance, exposure) - compress(small.light, exposure)).max(axis=-1)
+    side = max(TILE // small.factor, 1)
+    tiles = [
+        removed[y : y + side, x : x + side].max() < NOISE_FREE
+        for y in range(0, removed.shape[0], side)
+        for x in range(0, removed.shape[1], side)
+    ]
+    return float(np.mean(tiles))
+
+
+def _middle(shape: tuple[int, int]) -> tuple[slice, slice]:
+    """The block of at most `CROP` pixels on a side in the middle of a frame."""
+    starts = [max(size - CROP, 0) // 2 for size in shape]
+    return slice(starts[0], starts[0] + CROP), slice(starts[1], starts[1] + CROP)
+
+
+def _high_pass(image: Array) -> Array:
+    noise = image - cv2.blur(image, (5, 5))
+    limit = 3 * float(np.median(np.abs(noise)))
+    return np.asarray(np.clip(noise, -limit, limit), np.float32)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    first, second = a - a.mean(), b - b.mean()
+    power = float(np.sqrt(np.mean(first**2) * np.mean(second**2)))
+    return float(np.mean(first * second)) / power if power > 0 else 0.0
+
+
+def _means(layer: Array, factor: int) -> Array:
+    """Means over blocks of factor × factor pixels; rows and columns that fill none at the end are left out."""
+    height, width = (size // factor for size in layer.shape[:2])
+    cut = np.ascontiguousarray(layer[: height * factor, : width * factor])
+    small = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small.reshape(height, width, layer.shape[-1]), np.float32)

@@ -1,0 +1,197 @@
+"""One odd window in a calm shot: what it calls for runs there, whatever part of the shot is asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.measure import fixed_noise
+from hybrid.alignment.prepare import prepare
+from hybrid.estimates import OfFrames
+from hybrid.files.exr import read_exr
+from hybrid.files.frames import open_shot
+from hybrid.pipeline import Denoised, denoise_shot
+from hybrid.plan import STAGES, Rules, plan_shot
+from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
+from tests.scenes import Scene
+
+# Locked off: what is odd is odd by itself. Frame numbers 1001 to 1012; the odd one is 1009.
+CALM = Scene(frames=12, step=(0, 0), height=48, width=64)
+ODD = 8
+FORCED = Rules(on=frozenset({"warp", "gate", "fireflies"}))
+
+
+def brighter(index, layers):
+    if index == ODD:
+        layers["ViewLayer.Combined"] *= 5
+
+
+def switched(index, layers):
+    if index >= ODD:
+        layers["ViewLayer.Combined"] *= np.float32(0.2)
+
+
+def moving(index, layers):
+    """From frame 1009 to 1011 the wall slides by three pixels per frame, and stops."""
+    shift = 3 * min(max(index - ODD, 0), 3)
+    for name in layers:
+        if name != "ViewLayer.Vector":
+            layers[name] = np.roll(layers[name], shift, axis=1)
+    vector = layers["ViewLayer.Vector"]
+    # The previous frame is sampled at (x + X, y - Y), the next one at (x - Z, y + W).
+    vector[..., 0] = -3 if ODD < index <= ODD + 3 else 0
+    vector[..., 2] = -3 if ODD <= index < ODD + 3 else 0
+
+
+def burnt(index, layers):
+    if index == ODD:
+        layers["ViewLayer.Combined"][20, 30] = 5000
+
+
+def picture(shot, number, rules, estimates=None):
+    window = Aligner(shot, rules, estimates=estimates).align(number)
+    return filter_window(window, STANDARD) if estimates is None else gated_average(window)
+
+
+@pytest.mark.parametrize("change", [brighter, switched, moving, burnt])
+@pytest.mark.parametrize("given", [False, True])
+def test_every_frame_is_as_good_as_with_everything_on(tmp_path, change, given):
+    shot = open_shot(CALM.write(tmp_path, edit=change))
+    estimates = OfFrames(lambda frame: frame.color) if given else None
+    for number in range(1006, 1013):
+        planned = picture(shot, number, Rules(), estimates)
+        forced = picture(shot, number, FORCED, estimates)
+        assert planned.mean() == pytest.approx(forced.mean(), rel=0.01), number
+        error, bound = (np.abs(image - truth(change, number)).mean() for image in (planned, forced))
+        assert error < 1.05 * bound, number  # 0.2 dB are 1.02 in amplitude; noise decides which pixels count
+
+
+def truth(change, number):
+    index = number - CALM.first
+    layers = CALM.clean(index)
+    if change is not burnt:
+        change(index, layers)
+    return layers["ViewLayer.Combined"]
+
+
+def test_the_plan_says_on_which_frames_a_stage_runs(tmp_path):
+    found = {d.stage: d for d in plan_shot(open_shot(CALM.write(tmp_path, edit=brighter))).decisions}
+    assert found["gate"].frames == tuple(range(1007, 1012))
+    assert "frames 1007-1011 of 1001-1012" in found["gate"].reason
+    assert found["warp"].frames == ()
+    found = {d.stage: d for d in plan_shot(open_shot(CALM.write(tmp_path, edit=moving))).decisions}
+    assert found["warp"].frames == tuple(range(1008, 1013))
+    assert not found["gate"].on
+    found = {d.stage: d for d in plan_shot(open_shot(CALM.write(tmp_path, edit=burnt))).decisions}
+    assert found["fireflies"].frames == tuple(range(1007, 1012))
+
+
+@pytest.mark.parametrize("change", [brighter, moving, burnt])
+def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, change):
+    folder = CALM.write(tmp_path / "in", edit=change)
+
+    def run(name, frames):
+        shot = open_shot(folder, frames=frames)
+        estimates = OfFrames(lambda frame: frame.color)
+        for _ in denoise_shot(
+            shot, tmp_path / name, lambda w: Denoised(gated_average(w)), Rules(), estimates=estimates
+        ):
+            pass
+
+    run("whole", None)
+    for part in ("1001-1004", "1005", "1006-1008", "1009-1012"):
+        run("parts", part)
+    for path in sorted((tmp_path / "whole").glob("*.exr")):
+        one, other = read_exr(path), read_exr(tmp_path / "parts" / path.name)
+        assert one.parts[0].header["ravg/stages"] == other.parts[0].header["ravg/stages"]
+        for name in one.channel_names:
+            np.testing.assert_array_equal(one.channel(name), other.channel(name), err_msg=f"{path.name} {name}")
+
+
+def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
+    def lamp(index, layers):
+        layers["ViewLayer.Combined"][20, 30] = 500
+
+    shot = open_shot(CALM.write(tmp_path, edit=lamp))
+    window = Aligner(shot, Rules()).align(1006)
+    assert window.fireflies == 0
+    assert (window.color[2] * window.modulation)[20, 30].mean() == pytest.approx(500, rel=1e-3)
+
+
+def test_what_fireflies_take_with_them_is_counted(tmp_path):
+    shot = open_shot(CALM.write(tmp_path, edit=burnt))
+    window = Aligner(shot, Rules()).align(1009)
+    assert window.fireflies == 1
+    color = shot.read(1009).color
+    assert window.removed == pytest.approx(5000 * 3 / color.sum(), rel=0.2)
+    estimated = picture(shot, 1009, Rules(), OfFrames(lambda frame: frame.color))
+    clean = CALM.clean(ODD)["ViewLayer.Combined"]
+    np.testing.assert_array_less(estimated[14:27, 24:37], 3 * clean[14:27, 24:37].max())
+    spread = picture(shot, 1009, Rules(off=frozenset({"fireflies", "outliers", "gate"})), OfFrames(lambda f: f.color))
+    assert spread.max() > 100  # that is what is guarded against
+
+
+@pytest.mark.parametrize("samples", [16, 256, 4096])
+@pytest.mark.parametrize("step", [(0, 0), (3, 1)])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_noise_that_stands_still_is_told_from_detail(samples, step, fixed):
+    """Detail of a single pixel, which no smoothing keeps, correlates at equal pixels as much as a fixed noise does."""
+    scene = Scene(height=96, width=128, step=step)
+    detail = np.random.default_rng(2).uniform(0.5, 1.5, (400, 400, 1)).astype(np.float32)
+
+    def frame(index):
+        layers = scene.clean(index)
+        y, x = 200 - step[1] * index, 200 - step[0] * index
+        shape = samples / 4
+        grain = (
+            np.random.default_rng(5 if fixed else 5 + index).gamma(shape, 1 / shape, (96, 128, 1)).astype(np.float32)
+        )
+        color = layers["ViewLayer.Combined"] * detail[y : y + 96, x : x + 128] * grain
+        return prepare(hard_frame(layers, color, index))
+
+    found = fixed_noise(frame(0), frame(1), moves=any(step))
+    assert found > 0.6 if fixed else abs(found) < 0.15
+
+
+def hard_frame(layers, color, index):
+    from flow.motion import CYCLES
+    from hybrid.files.frames import Frame
+
+    return Frame(
+        number=index,
+        color=color.astype(np.float32),
+        albedo=layers["ViewLayer.Denoising Albedo"],
+        normal=layers["ViewLayer.Denoising Normal"],
+        motion=layers["ViewLayer.Vector"],
+        motion_convention=CYCLES,
+    )
+
+
+@pytest.mark.parametrize("stage", sorted(STAGES))
+def test_every_stage_can_be_forced_either_way(tmp_path, stage):
+    shot = open_shot(replace(CALM, frames=5, step=(2, 1)).write(tmp_path, edit=burnt))
+    for rules, there in ((Rules(on=frozenset({stage})), True), (Rules(off=frozenset({stage})), False)):
+        window = Aligner(shot, rules, radius=1).align(1003)
+        assert (stage in window.stages) == there
+        decision = next(d for d in plan_shot(shot, rules, radius=1).decisions if d.stage == stage)
+        assert (decision.on, decision.forced) == (there, True)
+
+
+def test_dense_flow_forced_on_leaves_the_vectors_alone_and_forced_off_has_no_neighbours(tmp_path):
+    moving_scene = replace(CALM, frames=5, step=(3, 0))
+    wrong = open_shot(moving_scene.write(tmp_path / "wrong", edit=lambda i, layers: layers["ViewLayer.Vector"].fill(7)))
+    believed, found = (
+        flow_of(wrong, Rules(on=frozenset(on), off=frozenset({"refine"}))) for on in ((), {"dense-flow"})
+    )
+    assert np.median(np.abs(believed[0][..., 0])) == 7
+    assert np.median(np.abs(np.abs(found[0][10:-10, 10:-10, 0]) - 3)) < 1
+    blind = open_shot(moving_scene.write(tmp_path / "blind", without={"Vector"}))
+    window = Aligner(blind, Rules(off=frozenset({"dense-flow"})), radius=1).align(1003)
+    assert (window.confidence[[0, 2]] == 0).all()
+
+
+def flow_of(shot, rules):
+    aligner = Aligner(shot, rules, radius=1)
+    aligner.load([1002, 1003])
+    return aligner.flow(1002, 1003)
