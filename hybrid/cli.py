@@ -15,6 +15,7 @@ from hybrid.commands.inspect import inspect
 from hybrid.commands.log import LOG, end_log, lasting_streams, logged, one_line, start_log
 from hybrid.commands.simulate import simulate
 from hybrid.commands.train import prepare, train
+from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt
 
 app = typer.Typer(
@@ -26,6 +27,7 @@ for command, panel in (
     (inspect, "Frames"),
     (denoise, "Frames"),
     (pseudoref, "Frames"),
+    (view, "Frames"),
     (compare, "Frames"),
     (prepare, "Networks"),
     (train, "Networks"),

@@ -10,7 +10,10 @@ import os
 for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,3 +24,18 @@ from tests.scenes import Scene
 def shot_folder(tmp_path: Path) -> Path:
     """Three noisy frames on disk."""
     return Scene().write(tmp_path / "noisy")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium without a window; tests that ask for it carry the mark `browser`."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("chromium is not installed")
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+    flags += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files"]
+    with playwright.sync_playwright() as running:
+        instance = running.chromium.launch(executable_path=program, args=flags)
+        yield instance
+        instance.close()

@@ -282,10 +282,11 @@ def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictu
     for option, path in pictures.items():
         if path is not None and shot.reads(path):
             raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
-    if (preview := pictures.get("preview")) is not None:
-        check_preview(preview)
-    if (contact := pictures.get("contact")) is not None:
-        check_sheet(contact)
+    with usage():
+        if (preview := pictures.get("preview")) is not None:
+            check_preview(preview)
+        if (contact := pictures.get("contact")) is not None:
+            check_sheet(contact)
 
 
 def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str) -> str:

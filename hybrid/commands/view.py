@@ -1,0 +1,48 @@
+"""`ravg view`: a local page that plays frames, also while others are still being made."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from hybrid.commands.options import RateOption
+
+
+def view(
+    output: Annotated[str, typer.Argument(metavar="OUT", help="denoised frames: OUT.####.exr, or a folder")],
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SHOT", help="frames to compare with: the noisy ones, another denoiser's"),
+    ] = None,
+    fps: RateOption = 24,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: one that is free")] = 0,
+    browser: Annotated[bool, typer.Option(help="open the page in a browser, where there is a screen")] = True,
+) -> None:
+    """Look at frames in a browser: play, wipe, exposure, layers, weights, what each stage did. Ctrl-C ends it.
+
+    OUT may still be empty: frames appear as they are finished. The page is on this machine alone, and asks for nothing
+    from elsewhere.
+    """
+    import webbrowser
+
+    from hybrid.viewer.sequence import Sequence
+    from hybrid.viewer.server import ViewServer
+
+    sequences = [Sequence(output, finished=True), *(Sequence(spec, finished=False) for spec in beside or ())]
+    if not any(sequence.files() for sequence in sequences):
+        raise FileNotFoundError(f"no frames in {' or '.join(sequence.spec for sequence in sequences)}")
+    for sequence in sequences[1:]:
+        if not sequence.files():
+            raise FileNotFoundError(f"no frames in {sequence.spec}")
+    with ViewServer(sequences, rate=fps, port=port) as server:
+        typer.echo(f"{server.url}\nCtrl-C ends it")
+        screen = sys.platform in ("darwin", "win32") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+        if browser and screen:
+            webbrowser.open(server.url)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            typer.echo("")

@@ -1,0 +1,222 @@
+"""A sequence of EXR files as someone watches it: frames that come, layers, each as a picture of 8 bits."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.files.exr import ExrImage, Layer, component_of, read_exr
+from hybrid.files.layers import Layers, find_layers
+from hybrid.files.pictures import encode_srgb
+from hybrid.files.sequences import find_files, parse_frames
+from nlm.average import replace_nonfinite
+
+Picture = NDArray[np.uint8]
+
+# Layers of frames that were looked at lately, so that another exposure is a matter of milliseconds.
+KEPT_BYTES = 512 * 2**20
+
+
+class Sequence:
+    """Frames of a pattern or a folder; there may be none yet.
+
+    Parameters
+    ----------
+    spec : str
+        ``shot.####.exr``, a folder, or one file.
+    finished : bool
+        Whether it is a result: then the denoised picture is shown first, also where the file keeps a noisy one.
+    """
+
+    def __init__(self, spec: str, *, finished: bool) -> None:
+        self.spec = spec
+        self.finished = finished
+        self._files: dict[int, Path] = {}
+        self._kept: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self._lock = threading.Lock()
+
+    def files(self) -> dict[int, Path]:
+        """Frame number → file, of what is there now."""
+        try:
+            found, frames = find_files(self.spec)
+        except FileNotFoundError:
+            found, frames = {}, None
+        wanted = found.keys() if frames is None else found.keys() & set(parse_frames(frames))
+        self._files = {number: found[number] for number in wanted}
+        return self._files
+
+    def versions(self) -> dict[int, str]:
+        """Frame number → what changes when its file is replaced."""
+        found = {}
+        for number, path in self.files().items():
+            try:
+                status = path.stat()
+            except OSError:  # gone since the folder was listed
+                continue
+            found[number] = f"{status.st_mtime_ns:x}-{status.st_size:x}"
+        return found
+
+    def layers(self, number: int) -> tuple[list[str], str]:
+        """Names of the layers of a frame, and of the one to begin with; from the header."""
+        image = read_exr(self._path(number), pixels=False)
+        taken = find_layers(image)
+        first = taken.target if self.finished else taken.color
+        return [_name(layer) for layer in image.layers], _name(first)
+
+    def exposure(self, number: int) -> float:
+        """What the color of a frame is divided by for a mean of 0.18."""
+        image = read_exr(self._path(number))
+        color, _ = replace_nonfinite(image.pixels(find_layers(image).color.channels))
+        return float(measure_exposure(color) / 0.18)
+
+    def picture(self, number: int, name: str, gain: float, ev: float) -> Picture:
+        """Show a layer of a frame.
+
+        Parameters
+        ----------
+        number : int
+            Frame number.
+        name : str
+            Of the layer, as `layers` gives it.
+        gain : float
+            What radiance is multiplied by.
+        ev : float
+            Stops that albedo and single channels are brightened by.
+
+        Returns
+        -------
+        (H, W, 3) uint8 array
+            On the display window, black outside the data. Radiance and albedo are sRGB encoded. Vectors have their zero
+            at middle gray; single channels are gray, those in [0, 1] as they are. What black and white are of vectors
+            and of other channels is the range of the first frame that was looked at.
+
+        Raises
+        ------
+        KeyError
+            If there is no such frame or layer.
+        OSError, ExrError
+            If the file cannot be read, for instance because it is not whole yet.
+        """
+        path = self._path(number)
+        key = path, path.stat().st_mtime_ns, name
+        with self._lock:
+            pixels = self._kept.get(key)
+        image = read_exr(path, pixels=pixels is None)
+        layer = {_name(layer): layer for layer in image.layers}[name]
+        if pixels is None:
+            pixels = _on_display_window(image, layer)
+            self._keep(key, pixels)
+        return self._encode(pixels, layer, find_layers(image), gain, ev)
+
+    def facts(self, number: int) -> dict[str, Any]:
+        """What a frame's header says of its making, and the mean weight of each frame of its window, if it has them."""
+        path = self._path(number)
+        image = read_exr(path, pixels=False)
+        header = image.parts[0].header
+        made = {key.removeprefix("ravg/"): str(value) for key, value in header.items() if key.startswith("ravg/")}
+        with suppress(ValueError, AttributeError):  # options that were given stand in a header by themselves, as JSON
+            settings = json.loads(made.get("settings", "{}")).items()
+            made = {name: value for name, value in made.items() if name != "settings"}
+            made |= {name: str(value) for name, value in settings if value not in (None, False)}
+        weights = {
+            layer.name.removeprefix("weight."): layer for layer in image.layers if layer.name.startswith("weight.")
+        }
+        if weights:
+            image = read_exr(path)
+        ordered = sorted(weights, key=lambda name: _time_of(name))
+        means = {name: float(image.pixels(weights[name].channels).mean()) for name in ordered}
+        return {"file": path.name, "made": made, "weights": means}
+
+    def record(self) -> dict[str, Any]:
+        """What a run has left beside its frames: stages with their cost, and the plan; empty where there is nothing."""
+        beside = next(iter(self._files.values()), None)
+        if beside is None:
+            return {}
+        try:
+            found = json.loads(beside.with_name("ravg.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _path(self, number: int) -> Path:
+        return self._files[number] if number in self._files else self.files()[number]
+
+    def _keep(self, key: Hashable, pixels: NDArray[Any]) -> None:
+        with self._lock:
+            self._kept[key] = pixels
+            while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > KEPT_BYTES:
+                self._kept.popitem(last=False)
+
+    def _encode(self, pixels: NDArray[Any], layer: Layer, taken: Layers, gain: float, ev: float) -> Picture:
+        components = [component_of(channel) for channel in layer.channels]
+        roles = {kind.name: role for role, kind in vars(taken).items() if isinstance(kind, Layer)}
+        shown: NDArray[Any]
+        if components[:3] == ["R", "G", "B"]:
+            shown = encode_srgb(pixels[..., :3] * np.float32(2**ev if roles.get(layer.name) == "albedo" else gain))
+        elif len(components) > 1:
+            vectors = pixels[..., : 3 if len(components) == 3 else 2]  # of four, the others lead to another frame
+            low, high = self._range(layer.name, vectors)
+            shown = np.full((*pixels.shape[:2], 3), 0.5, np.float32)
+            shown[..., : vectors.shape[2]] += vectors / max(2 * max(high, -low), 1e-30)  # where all is zero, gray
+        else:
+            low, high = self._range(layer.name, pixels)
+            brightness = 2**ev / max(high - low, 1e-30)  # where all is one value, black
+            shown = np.repeat((pixels - low) * brightness, 3, axis=2)
+        return np.round(np.clip(np.nan_to_num(shown), 0, 1) * 255).astype(np.uint8)
+
+    def _range(self, name: str, pixels: NDArray[Any]) -> tuple[float, float]:
+        """What is black and white in a layer: the same for all frames, or they would flicker."""
+        with self._lock:
+            if name not in self._ranges:
+                finite = pixels[np.isfinite(pixels)]
+                low, high = np.percentile(finite, (0.5, 99.5)) if finite.size else (0.0, 1.0)
+                inside = finite.size and finite.min() >= 0 and finite.max() <= 1
+                self._ranges[name] = (0.0, 1.0) if inside else (float(low), float(high))
+            return self._ranges[name]
+
+
+def _time_of(name: str) -> int:
+    """Where a frame of the window stands in time: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
+    digits = name.strip("abcdefghijklmnopqrstuvwxyz")
+    return (-1 if name.startswith("before") else 1) * int(digits or 0)
+
+
+def _name(layer: Layer) -> str:
+    return layer.name or "RGBA"
+
+
+def _on_display_window(image: ExrImage, layer: Layer) -> NDArray[np.float32]:
+    part = image.parts[layer.part]
+    left, top, right, bottom = part.display_window
+    x, y, last_x, last_y = part.data_window
+    pixels = image.pixels(layer.channels)
+    if (left, top, right, bottom) == (x, y, last_x, last_y):
+        return pixels
+    shown = np.zeros((bottom - top + 1, right - left + 1, pixels.shape[2]), np.float32)
+    rows = slice(max(top, y), min(bottom, last_y) + 1)
+    columns = slice(max(left, x), min(right, last_x) + 1)
+    if rows.start < rows.stop and columns.start < columns.stop:
+        cut = pixels[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
+        shown[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = cut
+    return shown
+
+
+def encode_picture(picture: Picture, suffix: str) -> bytes:
+    """A picture as a browser takes it: exact as "png", or small and quick as "jpg"."""
+    settings = {
+        "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+        "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
+    }
+    _, data = cv2.imencode(f".{suffix}", picture[..., ::-1], settings[suffix])
+    return data.tobytes()

@@ -1,0 +1,182 @@
+"""The page and its pictures over HTTP: to this machine alone, and to whoever has the address that is printed.
+
+Every address begins with a secret that is drawn anew for each run, so that no other user of the machine, and no page
+from elsewhere in the same browser, can ask for a picture. A request whose ``Host`` is not this server's own is refused:
+it comes from a page whose name was pointed at this machine (DNS rebinding). No part of an address is ever a path: a
+sequence goes by its position, a frame by its number, a layer by its name in the file's header.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from hybrid.files.exr import ExrError
+from hybrid.viewer.sequence import Sequence, encode_picture
+
+LOOPBACK = "127.0.0.1"
+# What the page may do: show and ask for what this server has, and nothing else.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+PAGE = {
+    "": ("page.html", "text/html; charset=utf-8"),
+    "page.css": ("page.css", "text/css; charset=utf-8"),
+    "page.js": ("page.js", "text/javascript; charset=utf-8"),
+}
+KINDS = {"png": "image/png", "jpg": "image/jpeg"}
+
+
+class ViewServer(ThreadingHTTPServer):
+    """Serves sequences to a browser on this machine.
+
+    Parameters
+    ----------
+    sequences : list of Sequence
+        The first is the result, the others stand beside it.
+    rate : float
+        Frames per second.
+    port : int
+        0: one that is free.
+
+    Raises
+    ------
+    OSError
+        If the port is taken.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, sequences: list[Sequence], *, rate: float = 24, port: int = 0) -> None:
+        self.sequences = sequences
+        self.rate = rate
+        self.secret = secrets.token_urlsafe(16)
+        self._exposure: float | None = None
+        super().__init__((LOOPBACK, port), _Handler)
+
+    @property
+    def port(self) -> int:
+        return int(self.server_address[1])
+
+    @property
+    def url(self) -> str:
+        """The address to open."""
+        return f"http://{LOOPBACK}:{self.port}/{self.secret}/"
+
+    @property
+    def hosts(self) -> set[str]:
+        """What a request may name as its host."""
+        return {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
+
+    @property
+    def exposure(self) -> float:
+        """What radiance is divided by at 0 EV, everywhere: measured on a frame of the last sequence that has one."""
+        if self._exposure is None:
+            for sequence in reversed(self.sequences):
+                numbers = sorted(sequence.files())
+                if numbers:
+                    try:
+                        self._exposure = sequence.exposure(numbers[len(numbers) // 2])
+                    except (OSError, ExrError):  # not whole yet
+                        continue
+                    break
+        return self._exposure or 1.0
+
+    def state(self) -> dict[str, Any]:
+        """What there is now: frames with their versions, layers, the record of the run."""
+        names = [Path(sequence.spec).name for sequence in self.sequences]
+        if len(set(names)) < len(names):  # noisy/shot.####.exr and denoised/shot.####.exr
+            names = ["/".join(Path(sequence.spec).parts[-2:]) for sequence in self.sequences]
+        described = [{"name": n, **self._describe(s)} for n, s in zip(names, self.sequences, strict=True)]
+        return {"rate": self.rate, "sequences": described}
+
+    def _describe(self, sequence: Sequence) -> dict[str, Any]:
+        versions = sequence.versions()
+        layers: list[str] = []
+        first = ""
+        for number in versions:
+            try:
+                layers, first = sequence.layers(number)
+            except (OSError, ExrError):
+                continue
+            break
+        return {
+            "frames": versions,
+            "layers": layers,
+            "layer": first,
+            "record": sequence.record() if sequence.finished else {},
+        }
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: ViewServer
+    protocol_version = "HTTP/1.1"
+    timeout = 60  # a connection that nobody uses is closed
+
+    def do_GET(self) -> None:
+        if self.headers.get("Host") not in self.server.hosts:
+            self._answer(403, "text/plain", b"this server answers to its own name only")
+            return
+        parts = urlsplit(self.path)
+        secret, _, rest = parts.path.removeprefix("/").partition("/")
+        if not secrets.compare_digest(secret.encode(), self.server.secret.encode()):
+            self._answer(404, "text/plain", b"not found")
+            return
+        try:
+            code, kind, body, lasting = self._find(rest, parse_qs(parts.query))
+        except (KeyError, IndexError, ValueError) as error:
+            # A damaged file is one that the page may ask for again: it may not be whole yet.
+            code = 409 if isinstance(error, ExrError) else 404
+            self._answer(code, "text/plain; charset=utf-8", str(error).encode())
+        except OSError as error:
+            self._answer(409, "text/plain; charset=utf-8", str(error).encode())
+        else:
+            self._answer(code, kind, body, lasting=lasting)
+
+    def _find(self, rest: str, query: dict[str, list[str]]) -> tuple[int, str, bytes, bool]:
+        """Code, media type, body, and whether the browser may keep it."""
+        if rest in PAGE:
+            name, kind = PAGE[rest]
+            return 200, kind, files("hybrid.viewer").joinpath(name).read_bytes(), False
+        if rest == "state":
+            return 200, "application/json", json.dumps(self.server.state()).encode(), False
+        what, index, name = rest.split("/")
+        if not index.isdecimal():
+            raise KeyError(index)
+        sequence = self.server.sequences[int(index)]
+        number, _, suffix = name.rpartition(".")
+        if what == "facts" and suffix == "json":
+            return 200, "application/json", json.dumps(sequence.facts(int(number))).encode(), False
+        if what != "frame" or suffix not in KINDS:
+            raise KeyError(rest)
+        ev = float(query["ev"][0])
+        if not -32 <= ev <= 32:  # NaN is refused as well
+            raise ValueError(f"ev is {ev}, expected -32 to 32")
+        picture = sequence.picture(int(number), query["layer"][0], 2**ev / self.server.exposure, ev)
+        # The address holds the version of the file.
+        return 200, KINDS[suffix], encode_picture(picture, suffix), "version" in query
+
+    def _answer(self, code: int, kind: str, body: bytes, *, lasting: bool = False) -> None:
+        self.send_response(code)
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "private, max-age=86400, immutable" if lasting else "no-store")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: the terminal is for the person who started this."""

@@ -1,0 +1,52 @@
+"""`ravg view` as a command: its address, what it refuses, how it ends."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from hybrid.cli import main
+from tests.scenes import Scene
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+def test_it_serves_until_ctrl_c(tmp_path):
+    """The result may be empty: it is watched while it is being made."""
+    noisy = Scene().write(tmp_path / "noisy")
+    words = ["view", str(tmp_path / "out"), "--beside", str(noisy), "--no-browser"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybrid.cli", *words], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ
+    )
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/", url)
+        with urllib.request.urlopen(url + "state", timeout=30) as answer:
+            assert b'"1003"' in answer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+    finally:
+        process.kill()
+
+
+def test_without_any_frame_there_is_nothing_to_view(tmp_path, capsys):
+    assert main(["view", str(tmp_path / "a.####.exr")]) == 1
+    assert "no frames in" in capsys.readouterr().err
+
+
+def test_a_sequence_beside_must_be_there(shot_folder, tmp_path, capsys):
+    assert main(["view", str(shot_folder), "--beside", str(tmp_path / "gone")]) == 1
+    assert f"no frames in {tmp_path / 'gone'}" in " ".join(capsys.readouterr().err.split())
+
+
+def test_two_sequences_in_one_folder_are_told_apart_by_the_user(shot_folder, capsys):
+    (shot_folder / "other.1001.exr").write_bytes((shot_folder / "shot.1001.exr").read_bytes())
+    assert main(["view", str(shot_folder)]) == 1
+    assert "several sequences" in capsys.readouterr().err
