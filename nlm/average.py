@@ -182,7 +182,7 @@ def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _average(window, weight):  # type: ignore[no-untyped-def]
+def _average(window: Floats, weight: Floats) -> Floats:
     T, H, W, C = window.shape
     out = np.empty((H, W, C), np.float32)
     for y in prange(H):
@@ -200,7 +200,7 @@ def _average(window, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _robust_average(window, weight):  # type: ignore[no-untyped-def]
+def _robust_average(window: Floats, weight: Floats) -> Floats:
     T, H, W, C = window.shape
     out = np.empty((H, W, C), np.float32)
     for y in prange(H):
@@ -237,7 +237,7 @@ def _robust_average(window, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _reject_outliers(window, weight):  # type: ignore[no-untyped-def]
+def _reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     T, H, W, C = window.shape
     cleaned, mask = window.copy(), np.zeros((T, H, W), np.bool_)
     level = np.empty((T, H, W), np.float32)
@@ -262,9 +262,9 @@ def _reject_outliers(window, weight):  # type: ignore[no-untyped-def]
                         counts[x] += 1
         for x in range(W):
             left, right = max(x - 1, 0), min(x + 2, W)
-            total, count = 0.0, 0
+            near, count = 0.0, 0
             for nx in range(left, right):
-                total += sums[nx]
+                near += sums[nx]
                 count += counts[nx]
             highest, frames = np.float32(-np.inf), 0
             for t in range(T):
@@ -272,7 +272,7 @@ def _reject_outliers(window, weight):  # type: ignore[no-untyped-def]
                     frames += 1
                     highest = max(highest, level[t, y, x])
             # of the others, so that a firefly does not hide itself where there are few
-            floor = 8 * (total - highest) / max(count - 1, 1)
+            floor = 8 * (near - highest) / max(count - 1, 1)
             if not highest > floor:
                 continue
             n = 0

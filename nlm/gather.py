@@ -82,7 +82,9 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _gather(estimates, residuals, confidence, exposure):  # type: ignore[no-untyped-def]
+def _gather(
+    estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32
+) -> tuple[Floats, Floats, Floats]:
     T, H, W, C = estimates.shape
     average, image = np.empty((H, W, C), np.float32), np.empty((H, W, C), np.float32)
     samples = np.empty((H, W), np.float32)

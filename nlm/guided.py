@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nlm.average import replace_nonfinite
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 # Rows that one thread filters with the same running sums.
 _STRIP = 64
@@ -22,7 +23,7 @@ def guided_filter(
     radius: int,
     eps: float = 1e-2,
     subsample: int = 1,
-    moments: NDArray[np.float64] | None = None,
+    moments: Doubles | None = None,
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 
@@ -97,7 +98,7 @@ def guided_filter(
     return np.asarray(np.clip(output, low, high), np.float32)
 
 
-def measure_guide(guide: Floats) -> NDArray[np.float64]:
+def measure_guide(guide: Floats) -> Doubles:
     """Measure what a guide is brought to a common scale by.
 
     Parameters
@@ -115,7 +116,7 @@ def measure_guide(guide: Floats) -> NDArray[np.float64]:
     return np.stack([first, np.sqrt(np.maximum(second - first * first, 0))])
 
 
-def _standardise(guide: Floats, moments: NDArray[np.float64]) -> Floats:
+def _standardise(guide: Floats, moments: Doubles) -> Floats:
     """Bring each channel to mean 0 and variance 1; a constant channel becomes 0."""
     mean, deviation = moments
     # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
@@ -125,7 +126,7 @@ def _standardise(guide: Floats, moments: NDArray[np.float64]) -> Floats:
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _row_moments(image):  # type: ignore[no-untyped-def]
+def _row_moments(image: Floats) -> Doubles:
     """Sums over each row of x and of x², (H, 2, C)."""
     H, W, C = image.shape
     sums = np.zeros((H, 2, C))
@@ -139,7 +140,7 @@ def _row_moments(image):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _scale(image, centre, scale):  # type: ignore[no-untyped-def]
+def _scale(image: Floats, centre: Floats, scale: Floats) -> Floats:
     """Return (image − centre) · scale, channel by channel."""
     H, W, C = image.shape
     out = np.empty((H, W, C), np.float32)
@@ -151,7 +152,7 @@ def _scale(image, centre, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _shrink(image, step):  # type: ignore[no-untyped-def]
+def _shrink(image: Floats, step: int) -> Floats:
     """Mean of each step × step block, of what there is of it at the lower and right edge."""
     H, W, C = image.shape
     out = np.zeros((-(-H // step), -(-W // step), C), np.float32)
@@ -169,7 +170,7 @@ def _shrink(image, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, boundscheck=False, inline="always")
-def _add_moments(sums, image, guide, weight):  # type: ignore[no-untyped-def]
+def _add_moments(sums: Doubles, image: Floats, guide: Floats, weight: float) -> None:
     """Add (or with a negative weight take away) Σ w, w I, w I Iᵀ, w p, w I pᵀ of one pixel."""
     G, C = guide.size, image.size
     sums[0] += weight
@@ -189,7 +190,7 @@ def _add_moments(sums, image, guide, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
-def _solve_box(out, sums, matrix, right, G, C, eps):  # type: ignore[no-untyped-def]
+def _solve_box(out: Floats, sums: Doubles, matrix: Doubles, right: Doubles, G: int, C: int, eps: float) -> None:
     """Coefficients of one box, a (C × G) then b (C) then 1; all 0 where nothing is trusted."""
     if not sums[0] > 0:
         out[:] = 0
@@ -232,7 +233,7 @@ def _solve_box(out, sums, matrix, right, G, C, eps):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _solve(image, guide, weight, radius, eps):  # type: ignore[no-untyped-def]
+def _solve(image: Floats, guide: Floats, weight: Floats, radius: int, eps: float) -> Floats:
     """Coefficients of the box around each pixel, (H, W, C·G + C + 1)."""
     H, W, C = image.shape
     G = guide.shape[2]
@@ -268,7 +269,7 @@ def _solve(image, guide, weight, radius, eps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _box_sum(values, radius):  # type: ignore[no-untyped-def]
+def _box_sum(values: Floats, radius: int) -> Floats:
     """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge."""
     H, W, M = values.shape
     out = np.empty((H, W, M), np.float32)
@@ -305,7 +306,7 @@ def _box_sum(values, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, boundscheck=False, error_model="numpy")
-def _apply(coefficients, guide, image, step):  # type: ignore[no-untyped-def]
+def _apply(coefficients: Floats, guide: Floats, image: Floats, step: int) -> Floats:
     """Apply coefficients, enlarged bilinearly, to the guide; keep the image where there are none."""
     H, W, G = guide.shape
     C = image.shape[2]

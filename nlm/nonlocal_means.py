@@ -35,7 +35,6 @@ def joint_nlm(
     window: Floats,
     variance: Floats,
     features: Floats | None = None,
-    feature_variance: Floats | None = None,
     confidence: Floats | None = None,
     *,
     radius: int = 3,
@@ -54,8 +53,6 @@ def joint_nlm(
     features : (H, W, F) float32, optional
         The centre's albedo, normal, depth …, of about unit range and prefiltered: see `prefilter_guide`. The frames are
         aligned, so they serve all of them.
-    feature_variance : (H, W, F) float32, optional
-        Variance of the features; 0 if not given.
     confidence : (T, H, W) float32, optional
         Trust in each pixel of each frame, in [0, 1]; 1 if not given.
     radius, patch_radius : int
@@ -79,7 +76,7 @@ def joint_nlm(
     For pixels p of the centre and q of the window, u the values and V their variance::
 
         d(p, q) = ((u_p − u_q)² − (V_p + min(V_p, V_q))) / (k² (V_p + V_q))    averaged over patch and channels
-        f(p, q) = max over features ((f_p − f_q)² − 2 V_p) / max(V_p, |∇f_p|², 1e-3)
+        f(p, q) = max over features (f_p − f_q)² / max(|∇f_p|², 1e-3)
         w(p, q) = confidence_q · exp(−max(d, f, 0))
 
     A share of u² (1e-6 / k²) is added to V: no division by 0, and the filter stays scale equivariant. In a
@@ -98,15 +95,12 @@ def joint_nlm(
     _, height, width, _ = window.shape
     if features is None:
         features = np.empty((height, width, 0), np.float32)
-    if feature_variance is None:
-        feature_variance = np.zeros(features.shape, np.float32)
     if confidence is None:
         confidence = np.ones(window.shape[:3], np.float32)
     if features.ndim != 3 or features.shape[:2] != (height, width):
         raise ValueError(f"features: expected ({height}, {width}, channels), got {features.shape}")
     for name, array, shape in (
         ("variance", variance, window.shape[1:]),
-        ("feature_variance", feature_variance, features.shape),
         ("confidence", confidence, window.shape[:3]),
     ):
         if array.shape != shape:
@@ -116,14 +110,15 @@ def joint_nlm(
             raise ValueError(f"{name}: expected 0 to {max(height, width)}, got {number}")
     if not k > 0:
         raise ValueError(f"k: expected a positive number, got {k}")
-    variance, features, feature_variance, confidence = (
-        np.ascontiguousarray(array, np.float32) for array in (variance, features, feature_variance, confidence)
+    variance, features, confidence = (
+        np.ascontiguousarray(array, np.float32) for array in (variance, features, confidence)
     )
-    return _filter(window, variance, features, feature_variance, confidence, radius, patch_radius, np.float32(k))
+    filtered: Floats = _filter(window, variance, features, confidence, radius, patch_radius, np.float32(k))
+    return filtered
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _add_color_distance(d, pu, pa, qu, qa, cancel):  # type: ignore[no-untyped-def]
+def _add_color_distance(d: Floats, pu: Floats, pa: Floats, qu: Floats, qa: Floats, cancel: np.float32) -> None:
     for x in range(d.size):
         diff = pu[x] - qu[x]
         a, b = pa[x], qa[x]
@@ -133,29 +128,29 @@ def _add_color_distance(d, pu, pa, qu, qa, cancel):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _max_feature_distance(d, pf, qf, noise, scale):  # type: ignore[no-untyped-def]
+def _max_feature_distance(d: Floats, pf: Floats, qf: Floats, scale: Floats) -> None:
     for x in range(d.size):
         diff = pf[x] - qf[x]
-        v = (diff * diff - noise[x]) * scale[x]
+        v = diff * diff * scale[x]
         d[x] = v if v > d[x] else d[x]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _reject_far(d, pu, pa, qu, qa, limit):  # type: ignore[no-untyped-def]
+def _reject_far(d: Floats, pu: Floats, pa: Floats, qu: Floats, qa: Floats, limit: np.float32) -> None:
     for x in range(d.size):
         diff = pu[x] - qu[x]
         d[x] = np.float32(_NEVER) if diff * diff > limit * (pa[x] + qa[x]) else d[x]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _accumulate(total, w, values, centre):  # type: ignore[no-untyped-def]
+def _accumulate(total: Floats, w: Floats, values: Floats, centre: Floats) -> None:
     # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
     for x in range(w.size):
         total[x] += w[x] * (values[x] - centre[x])
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
-def _load(target, source, top, left):  # type: ignore[no-untyped-def]
+def _load(target: Floats, source: Floats, top: int, left: int) -> None:
     """Copy a tile of (H, W, C) into planes (C, h, w); beyond the frame the edge is repeated."""
     planes, h, w = target.shape
     height, width = source.shape[:2]
@@ -173,11 +168,21 @@ def _load(target, source, top, left):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_frame(u, a, trust, window, variance, confidence, k, top, left):  # type: ignore[no-untyped-def]
+def _load_frame(
+    u: Floats,
+    a: Floats,
+    trust: Floats,
+    frame: Floats,
+    variance: Floats,
+    confidence: Floats,
+    k: np.float32,
+    top: int,
+    left: int,
+) -> None:
     """Load values `u`, their noise term `a` and the weight `trust` of each tap, 0 outside the frame."""
     channels, h, w = u.shape
     height, width = confidence.shape
-    _load(u, window, top, left)
+    _load(u, frame, top, left)
     _load(a, variance, top, left)
     trust[:] = 0
     for y in range(max(-top, 0), min(height - top, h)):
@@ -195,7 +200,7 @@ def _load_frame(u, a, trust, window, variance, confidence, k, top, left):  # typ
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_features(f, noise, scale, features, variance, top, left):  # type: ignore[no-untyped-def]
+def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: int) -> None:
     """Load the centre's features `f`, and what turns a squared difference into a distance."""
     planes, h, w = f.shape
     height, width = features.shape[:2]
@@ -208,14 +213,14 @@ def _load_features(f, noise, scale, features, variance, top, left):  # type: ign
             before, after = max(sx - 1, 0), min(sx + 1, width - 1)
             for c in range(planes):
                 gx, gy = here[after, c] - here[before, c], down[sx, c] - up[sx, c]
-                v = variance[top + y, sx, c]
-                noise[c, y, x] = 2 * v
-                tolerance = max(v, np.float32(0.25) * (gx * gx + gy * gy), np.float32(_FEATURE_FLOOR))
+                tolerance = max(np.float32(0.25) * (gx * gx + gy * gy), np.float32(_FEATURE_FLOOR))
                 scale[c, y, x] = 1 / tolerance
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", boundscheck=False)
-def _filter(window, variance, features, feature_variance, confidence, radius, patch, k):  # type: ignore[no-untyped-def]
+def _filter(
+    window: Floats, variance: Floats, features: Floats, confidence: Floats, radius: int, patch: int, k: np.float32
+) -> Floats:
     T, H, W, C = window.shape
     F = features.shape[2]
     centre = T // 2
@@ -234,12 +239,12 @@ def _filter(window, variance, features, feature_variance, confidence, radius, pa
         qu, qa = np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32)
         trust = np.empty((h, w), np.float32)
         pf, qf = np.empty((F, th, tw), np.float32), np.empty((F, h, w), np.float32)
-        fn, fs = np.empty((F, th, tw), np.float32), np.empty((F, th, tw), np.float32)
+        fs = np.empty((F, th, tw), np.float32)
         total, weight = np.zeros((C, th, tw), np.float32), np.zeros((th, tw), np.float32)
         ring = np.empty((2 * patch + 1, pw), np.float32)
         column, wrow, frow = np.empty(pw, np.float32), np.empty(tw, np.float32), np.empty(tw, np.float32)
         _load_frame(pu, pa, trust, window[centre], variance, confidence[centre], k, top, left)
-        _load_features(pf, fn, fs, features, feature_variance, y0, x0)
+        _load_features(pf, fs, features, y0, x0)
         _load(qf, features, top, left)
         for t in range(T):
             _load_frame(qu, qa, trust, window[t], variance, confidence[t], k, top, left)
@@ -274,7 +279,7 @@ def _filter(window, variance, features, feature_variance, confidence, radius, pa
                                 wrow[x] += column[x + n]
                         frow[:] = 0
                         for f in range(F):
-                            _max_feature_distance(frow, pf[f, oy], qf[f, qy, qx : qx + tw], fn[f, oy], fs[f, oy])
+                            _max_feature_distance(frow, pf[f, oy], qf[f, qy, qx : qx + tw], fs[f, oy])
                         for c in range(C):
                             _reject_far(
                                 frow,

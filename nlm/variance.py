@@ -18,6 +18,8 @@ _CAP = 16.0
 # Variance of a bilinearly warped frame over the centre's: the mean of (2/3)² (any fraction of a pixel along
 # both axes), 2/3 (along one) and 1 (none). It counts only where side frames are few.
 _WARPED = 0.7
+# Of the boxes that variances are smoothed with, pixels.
+_RADIUS = 2
 
 
 def variance_from_halves(a: Floats, b: Floats) -> Floats:
@@ -40,10 +42,10 @@ def variance_from_halves(a: Floats, b: Floats) -> Floats:
     """
     if a.shape != b.shape:
         raise ValueError(f"b: expected shape {a.shape} like a, got {b.shape}")
-    return np.square(a - b, dtype=np.float32) * np.float32(0.25)
+    return np.asarray(np.square(a - b, dtype=np.float32) * np.float32(0.25))
 
 
-def variance_from_window(window: Floats, confidence: Floats, *, radius: int = 2) -> Floats:
+def variance_from_window(window: Floats, confidence: Floats) -> Floats:
     """Variance of the centre frame's pixels, from how much the aligned frames differ.
 
     Parameters
@@ -52,8 +54,6 @@ def variance_from_window(window: Floats, confidence: Floats, *, radius: int = 2)
         Aligned frames, finite, in any unit; the centre is ``T // 2``.
     confidence : (T, H, W) float32
         In [0, 1].
-    radius : int
-        Of the box that the estimate is smoothed with.
 
     Returns
     -------
@@ -75,23 +75,21 @@ def variance_from_window(window: Floats, confidence: Floats, *, radius: int = 2)
     """
     window, confidence = check_window(window, confidence, "confidence")
     deviation, trust = _centre_deviation(window, confidence)
-    temporal = smooth_variance(deviation, radius)
+    temporal = smooth_variance(deviation)
     if trust.min() >= 1:
         return temporal
-    spatial = variance_from_residual(window[window.shape[0] // 2], radius=radius)
+    spatial = variance_from_residual(window[window.shape[0] // 2])
     # Not the sum where trust is 1: it would round otherwise in a part of a frame than in the whole.
     return np.where(trust[..., None] >= 1, temporal, spatial + trust[..., None] * (temporal - spatial))
 
 
-def variance_from_residual(image: Floats, *, radius: int = 2) -> Floats:
+def variance_from_residual(image: Floats) -> Floats:
     """Variance of the noise in a single image, from what is left of it after a high-pass filter.
 
     Parameters
     ----------
     image : (H, W, C) float32
         Finite, in any unit.
-    radius : int
-        Of the box that the estimate is smoothed with.
 
     Returns
     -------
@@ -109,23 +107,21 @@ def variance_from_residual(image: Floats, *, radius: int = 2) -> Floats:
     """
     kernel = np.array([1, -2, 1], np.float32)
     residual = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-    return smooth_variance(np.square(residual.reshape(image.shape)) * np.float32(1 / 36), radius)
+    return smooth_variance(np.square(residual.reshape(image.shape)) * np.float32(1 / 36))
 
 
-def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
+def smooth_variance(variance: Floats) -> Floats:
     """Box-filter a variance of few degrees of freedom, bounding what a single pixel contributes.
 
     Parameters
     ----------
     variance : (H, W, C) float32
         At least 0, finite.
-    radius : int
-        Of the box.
 
     Returns
     -------
     (H, W, C) float32
-        The smoothed variance.
+        Means of 5×5 pixels.
 
     Notes
     -----
@@ -139,11 +135,11 @@ def smooth_variance(variance: Floats, radius: int = 2) -> Floats:
     median = np.stack([cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])], -1)
     cut = np.minimum(variance, np.float32(_CAP) * median)
     # Running sums beside values of 1e24 round to below 0.
-    smooth = np.asarray(cv2.blur(cut, (2 * radius + 1, 2 * radius + 1)), np.float32)
+    smooth = np.asarray(cv2.blur(cut, (2 * _RADIUS + 1, 2 * _RADIUS + 1)), np.float32)
     return np.maximum(smooth, 0).reshape(variance.shape)
 
 
-def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patch_radius: int = 1) -> Floats:
+def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     """Take the noise out of the centre frame's guides: albedo and normals under depth of field or behind glass.
 
     Parameters
@@ -152,17 +148,20 @@ def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patc
         Aligned guides, finite, of about unit range.
     confidence : (T, H, W) float32
         In [0, 1].
-    radius, patch_radius : int
-        Of the non-local means, see `joint_nlm`.
 
     Returns
     -------
     (H, W, F) float32
         The centre's guides. Where they hold no noise they are what they were, to about 1e-3.
 
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other or T is even.
+
     Notes
     -----
-    Non-local means over space and time steered by the guides' own variance: the lesser of that between
+    Non-local means over 3×3 pixels and all frames, steered by the guides' own variance: the lesser of that between
     frames and that of the spatial residual, for noise shows in both, while texture shows only in the
     second, and texture resampled by warping mainly in the first. A radius above 1 gains nothing on Cycles shots.
     """
@@ -170,11 +169,11 @@ def prefilter_guide(guides: Floats, confidence: Floats, *, radius: int = 1, patc
     between = variance_from_window(guides, confidence)
     # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
     variance = np.maximum(np.minimum(between, variance_from_residual(guides[guides.shape[0] // 2])), np.float32(1e-8))
-    return joint_nlm(guides, variance, confidence=confidence, radius=radius, patch_radius=patch_radius, k=1.0)
+    return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _centre_deviation(window, confidence):  # type: ignore[no-untyped-def]
+def _centre_deviation(window: Floats, confidence: Floats) -> tuple[Floats, Floats]:
     """Squared deviation of the centre from the side frames, and in [0, 1] whether two of those are trusted."""
     T, H, W, C = window.shape
     centre = T // 2

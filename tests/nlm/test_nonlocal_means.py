@@ -12,7 +12,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(3)
 
 
-def naive(window, variance, features, feature_variance, confidence, radius, patch, k):
+def naive(window, variance, features, confidence, radius, patch, k):
     """The formulas of the docstring, pixel by pixel, in float64; taps outside the frame do not exist."""
     window, variance = window.astype(np.float64), variance.astype(np.float64)
     T, H, W, C = window.shape
@@ -29,7 +29,7 @@ def naive(window, variance, features, feature_variance, confidence, radius, patc
             *(np.gradient(np.pad(features[..., f], 1, mode="edge")) for f in range(features.shape[2])), strict=True
         )
     )
-    tolerance = np.maximum(feature_variance, np.maximum((gx**2 + gy**2)[1:-1, 1:-1], 1e-3))
+    tolerance = np.maximum((gx**2 + gy**2)[1:-1, 1:-1], 1e-3)
     for y in range(H):
         for x in range(W):
             total, weights = np.zeros(C), 0.0
@@ -50,7 +50,7 @@ def naive(window, variance, features, feature_variance, confidence, radius, patc
                         spread = a[y + m, x + m] + b[qy + m, qx + m]
                         if ((u[y + m, x + m] - v[qy + m, qx + m]) ** 2 > 400 / k**2 * spread).any():
                             continue
-                        f = (features[y, x] - features[qy, qx]) ** 2 - 2 * feature_variance[y, x]
+                        f = (features[y, x] - features[qy, qx]) ** 2
                         d = max(d, (f / tolerance[y, x]).max(), 0)
                         w = max(1 - d / 16, 0) ** 16 * confidence[t, qy, qx]
                         total, weights = total + w * window[t, qy, qx], weights + w
@@ -62,13 +62,10 @@ def test_matches_the_formula(rng):
     window = rng.gamma(4, 0.25, (3, 9, 11, 3)).astype(np.float32)
     variance = rng.uniform(0.1, 0.4, (9, 11, 3)).astype(np.float32)
     features = rng.uniform(0, 0.2, (9, 11, 2)).astype(np.float32)
-    feature_variance = rng.uniform(0, 0.01, (9, 11, 2)).astype(np.float32)
     confidence = rng.uniform(0.1, 1, (3, 9, 11)).astype(np.float32)
     for radius, patch, k in ((2, 1, 0.5), (1, 2, 0.8)):
-        result = joint_nlm(
-            window, variance, features, feature_variance, confidence, radius=radius, patch_radius=patch, k=k
-        )
-        expected = naive(window, variance, features, feature_variance, confidence, radius, patch, k)
+        result = joint_nlm(window, variance, features, confidence, radius=radius, patch_radius=patch, k=k)
+        expected = naive(window, variance, features, confidence, radius, patch, k)
         np.testing.assert_allclose(result, expected, rtol=2e-4)  # running sums in float32
 
 
