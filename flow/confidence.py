@@ -19,7 +19,7 @@ def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray, first_row: in
     error = forward_backward_error(flow, reverse, first_row=first_row)
     # The loop is f + r, so r at the arrival is about -f within the error: |r| is taken as |f| + error at most.
     length = np.hypot(flow[..., 0], flow[..., 1])
-    return error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5
+    return np.asarray(error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5)
 
 
 def _agree_albedo(albedo: np.ndarray, warped: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ def _agree_albedo(albedo: np.ndarray, warped: np.ndarray) -> np.ndarray:
         planes = (image[..., c] for image in map(np.atleast_3d, (albedo, warped)) for c in range(image.shape[-1]))
         greatest = reduce(np.maximum, planes)
         scale = np.square(np.maximum(greatest, 1))
-        return np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * _ALBEDO_SIGMA**2))
+        return np.asarray(np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * _ALBEDO_SIGMA**2)))
 
 
 def _agree_normal(normal: np.ndarray, warped: np.ndarray) -> np.ndarray:
@@ -42,7 +42,7 @@ def _agree_normal(normal: np.ndarray, warped: np.ndarray) -> np.ndarray:
     surface, warped_surface = square > 0.01, warped_square > 0.01
     cosine = product / np.sqrt(np.maximum(square * warped_square, 1e-4))
     agreement = np.clip((cosine - 0.8) / 0.2, 0, 1)
-    return np.where(surface & warped_surface, agreement, surface == warped_surface)
+    return np.asarray(np.where(surface & warped_surface, agreement, surface == warped_surface))
 
 
 def estimate_confidence(

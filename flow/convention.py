@@ -236,7 +236,7 @@ class _Patches:
         reach = np.arange(-self.radius, self.radius + 1)
         rows = self.rows[at, None, None] + reach[:, None]
         columns = self.columns[at, None, None] + reach
-        return layer[rows, columns].reshape(-1, len(reach), layer.shape[2])
+        return np.asarray(layer[rows, columns].reshape(-1, len(reach), layer.shape[2]))
 
     def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray) -> np.ndarray:
         difference = np.empty(len(at), np.float32)
@@ -250,7 +250,7 @@ class _Patches:
             self.radius,
             difference,
         )
-        return np.minimum(np.square(difference / self.scale[at]), 1)
+        return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 
 @njit(nogil=True, cache=True)

@@ -17,7 +17,7 @@ def _luminance(image: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         luminance = np.asarray(image, np.float32) @ _REC709
     # No more than 1e30: the median of two of the largest floats is infinite, and so is an exposure made of it.
-    return np.clip(np.nan_to_num(luminance, nan=0.0, posinf=1e30), 0, np.float32(1e30))
+    return np.asarray(np.clip(np.nan_to_num(luminance, nan=0.0, posinf=1e30), 0, np.float32(1e30)))
 
 
 def median_luminance(color: np.ndarray) -> float:

@@ -327,4 +327,4 @@ def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: 
     """
     loop, _ = warp(reverse, flow, first_row=first_row)
     loop += flow
-    return np.hypot(loop[..., 0], loop[..., 1])
+    return np.asarray(np.hypot(loop[..., 0], loop[..., 1]))

@@ -138,7 +138,7 @@ def _solve(
     for level in reversed(_build_pyramid(guides, scales)):
         size = level.centre.shape[1::-1]
         change = _solve_level(level, _rescale(base, *size), _rescale(change, *size), warps, iterations, attachment)
-    return base + change
+    return np.asarray(base + change)
 
 
 def _build_pyramid(guides: GuidePair, scales: int) -> list[GuidePair]:

@@ -50,10 +50,11 @@ def interpolate(
     image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
 ) -> np.float32:
     """Sample a channel of (H, W, C) bilinearly, with the weights of `weigh`."""
-    return (
+    value: np.float32 = (
         weights[0] * image[place.y0, place.x0, channel] + weights[1] * image[place.y0, place.x1, channel]
         + weights[2] * image[place.y1, place.x0, channel] + weights[3] * image[place.y1, place.x1, channel]
     )  # fmt: skip
+    return value
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -125,7 +126,7 @@ def _bicubic(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarra
                 out[y, x, c] = min(max(total, low), high)
 
 
-_KERNELS: dict[str, Callable] = {"nearest": _nearest, "bilinear": _bilinear, "bicubic": _bicubic}
+_KERNELS: dict[str, Callable[..., None]] = {"nearest": _nearest, "bilinear": _bilinear, "bicubic": _bicubic}
 
 
 def warp(

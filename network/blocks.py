@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -50,7 +50,7 @@ def ravg(frames: Sequence[Tensor]) -> Tensor:
     if len(frames) == 2:
         return torch.lerp(frames[0], frames[1], 0.5)
     if len(frames) == 4:
-        average: Tensor = _MeanOfMiddleTwo.apply(*frames)
+        average: Tensor = _MeanOfMiddleTwo.apply(*frames)  # type: ignore[no-untyped-call]
         return average
     low, high = torch.minimum(frames[0], frames[1]), torch.maximum(frames[0], frames[1])
     total = torch.zeros_like(low)
@@ -118,7 +118,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``(N, C, H, W)`` to the same shape."""
-        return x + self.second(torch.relu(self.first(torch.relu(x))))
+        return x + cast(Tensor, self.second(torch.relu(self.first(torch.relu(x)))))
 
 
 class RobustAverage(nn.Module):

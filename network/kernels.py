@@ -176,7 +176,7 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     padded = frames.new_zeros((n, t, c + 1, h + 2 * margin, w + 2 * margin), dtype=working)
     padded[:, :, :c, margin : margin + h, margin : margin + w] = frames
     padded[:, :, c, margin : margin + h, margin : margin + w] = 1
-    sums: Tensor = _ApplyKernels.apply(kernels.to(working), padded, size)
+    sums: Tensor = _ApplyKernels.apply(kernels.to(working), padded, size)  # type: ignore[no-untyped-call]
     numerators, denominators = sums.to(dtype).split((c, 1), 2)
     return numerators, denominators
 
@@ -302,13 +302,15 @@ def check_threshold(relative: float) -> float:
 
 def halve(image: Tensor) -> Tensor:
     """Mean of 2×2 pixels of ``(..., H, W)``; H and W even."""
-    return functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
+    halved: Tensor = functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
+    return halved
 
 
 def double(image: Tensor) -> Tensor:
     """Linear interpolation of ``(..., H, W)`` to twice the size."""
-    doubled = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
-    return doubled.unflatten(0, image.shape[:-3])
+    flat = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
+    doubled: Tensor = flat.unflatten(0, image.shape[:-3])
+    return doubled
 
 
 def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:
@@ -320,7 +322,7 @@ def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, re
         threshold = 0.5 / taps
     if not isinstance(threshold, Tensor) and not 0 <= threshold < 1 / taps:
         raise ValueError(f"threshold: expected 0 <= t < 1/K = {1 / taps:.6g} for K = {taps}, got {threshold}")
-    kernel: Tensor = _Threshold.apply(weights, threshold, centre, relative)
+    kernel: Tensor = _Threshold.apply(weights, threshold, centre, relative)  # type: ignore[no-untyped-call]
     return kernel
 
 

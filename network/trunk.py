@@ -143,7 +143,7 @@ class Trunk(nn.Module):
         for stage, skip in zip(self.decoder, reversed(skips), strict=True):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = stage(torch.cat([x, skip], 1))
-        return self.last(x.to(self.last.weight.dtype))
+        return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
 
 
 def _convolutions(width: int, widths: Sequence[int]) -> nn.Sequential:
@@ -377,7 +377,7 @@ def _run(trunk: Trunk, layers: list[Tensor]) -> Tensor:
         raise ValueError(f"inputs: expected {trunk.config.inputs} channels as the weights are for, got {x.shape[1]}")
     height, width = x.shape[2:]
     padded = functional.pad(x, (0, -width % trunk.multiple, 0, -height % trunk.multiple))
-    return trunk(padded)[..., :height, :width].float()
+    return cast(Tensor, trunk(padded))[..., :height, :width].float()
 
 
 def _clip(x: Tensor, low: float, high: float) -> Tensor:

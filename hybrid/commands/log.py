@@ -170,7 +170,7 @@ def _into(file: Path, form: LogFormat) -> logging.Handler:
     return handler
 
 
-class _Lines(logging.StreamHandler):
+class _Lines(logging.StreamHandler[Any]):
     """Records as lines. A bar that moves by less than a percent is no line, but for the end of a frame."""
 
     def __init__(self, stream: Any, *, own: bool = False) -> None:

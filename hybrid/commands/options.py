@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
@@ -131,7 +132,7 @@ AovOption = Annotated[
 ]
 
 
-def import_neural():  # type: ignore[no-untyped-def]
+def import_neural() -> ModuleType:
     """The boundary to torch, or a clear word on how to get it."""
     try:
         from hybrid import neural

@@ -505,7 +505,7 @@ def _static_pixels(
         most = tone if most is None else np.maximum(most, tone)
     if least is None or most is None or len(pairs) < len(numbers) - 1 or not pairs:
         return np.zeros(load_frame(folder, "reference", numbers[0]).shape[:2], bool)
-    static = np.all(most - least < STEADY, axis=-1)
+    static: NDArray[np.bool_] = np.all(most - least < STEADY, axis=-1)
     for _, number in pairs:
         motion = load_frame(folder, "flow", number)
         static &= (np.hypot(motion[..., 0], motion[..., 1]) < STILL) & (motion[..., 2] > 0)

@@ -289,7 +289,7 @@ def bootstrap_interval(
     parts = _by_shot(data, shots)
 
     def draw(part: NDArray[np.float64]) -> NDArray[np.float64]:
-        return part[rng.integers(0, part.size, (resamples, part.size))].mean(axis=1)
+        return np.asarray(part[rng.integers(0, part.size, (resamples, part.size))].mean(axis=1))
 
     if len(parts) == 1:
         means = draw(parts[0])

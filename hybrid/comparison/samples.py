@@ -52,7 +52,7 @@ class NoiseLaw:
         for (n0, e0), (n1, e1) in pairwise(known):
             if min(e0, e1) <= rest <= max(e0, e1) and e0 != e1:
                 share = math.log(rest / e0) / math.log(e1 / e0)
-                return n0 * (n1 / n0) ** share / self.samples
+                return float(n0 * (n1 / n0) ** share / self.samples)
         n, e = known[-1] if rest < known[-1][1] else known[0]
         return n * e / rest / self.samples
 

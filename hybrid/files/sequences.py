@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
-import fileseq
+from fileseq.frameset import FrameSet
 
 # Where a number goes: #### (Nuke, RV), @@@@, %04d (ffmpeg, Nuke), $F4 (Houdini), <frame04> and <F4> (Maya, Karma).
 _PLACE = re.compile(r"(#+|@+)|%(\d*)d|\$(?:F(\d*)|\{F(\d*)\})|<(?:frame|f)(\d*)>", re.IGNORECASE)
@@ -184,7 +184,7 @@ def _listing(folder: Path) -> str:
 def parse_frames(frames: str) -> list[int]:
     """Ascending frame numbers of a range like 1001-1010x2."""
     try:
-        numbers = list(fileseq.FrameSet(frames))
+        numbers = list(FrameSet(frames))
     except ValueError:
         numbers = []
     if not numbers or any(number != int(number) for number in numbers):
@@ -194,7 +194,7 @@ def parse_frames(frames: str) -> list[int]:
 
 def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
     """The range of some frame numbers, such as 1001-1010x2."""
-    return str(fileseq.FrameSet(sorted(numbers)))
+    return str(FrameSet(sorted(numbers)))
 
 
 def name_holes(numbers: Iterable[int], step: int) -> str:

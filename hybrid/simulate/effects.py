@@ -522,4 +522,4 @@ def _circle_of_confusion(scene: Any) -> float:
     lens = data.lens / 1000 / data.dof.aperture_fstop  # metres, as Cycles takes it
     pixels = scene.render.resolution_x * scene.render.resolution_percentage / 100 / (data.sensor_width / data.lens)
     distances = [max((position - eye).dot(forward), 1e-6) for position, _ in visible_points(scene)] or [1e6]
-    return max(lens * abs(1 / focus - 1 / distance) * pixels for distance in distances)
+    return float(max(lens * abs(1 / focus - 1 / distance) * pixels for distance in distances))
