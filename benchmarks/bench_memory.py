@@ -20,6 +20,7 @@ import numpy as np
 
 from hybrid.files.exr import read_exr, write_layers
 from hybrid.memory import parse_size
+from hybrid.records import read_records
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 FRAMES = 5
@@ -53,7 +54,7 @@ def run(command: str, folder: Path, out: Path, limit: str | None) -> dict[str, o
         return {"refused": done.stderr.strip().splitlines()[-1]}
     if done.returncode != 0:
         raise RuntimeError(done.stderr)
-    report = json.loads((out / "ravg.json").read_text())
+    *_, (_, report) = read_records(out)
     seconds = sum(stage["cpu_seconds"] for stage in report["stages"].values())
     return {"peak_gib": round(report["peak_bytes"] / 2**30, 2), "cpu_seconds": round(seconds, 1)}
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid.files.exr import read_exr, write_layers
+from hybrid.records import read_records
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 REPEAT = 6
@@ -49,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             subprocess.run(words, check=True, stderr=subprocess.DEVNULL)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            report = json.loads((out / "ravg.json").read_text())
+            *_, (_, report) = read_records(out)
             stages = {
                 stage: {
                     "seconds": round(cost["seconds"] / options.frames, 3),

@@ -16,6 +16,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import signal
 import struct
 import sys
@@ -30,6 +31,8 @@ os.environ.update(NUMBA_THREADING_LAYER="workqueue", NUMBA_NUM_THREADS="1", OMP_
 
 import numpy as np
 import OpenEXR
+
+from hybrid.records import FOLDER
 
 SECONDS = 5
 BYTES = 2**30
@@ -176,7 +179,7 @@ def run_case(source: Path, folder: Path) -> Outcome:
     seconds = usage.ru_utime + usage.ru_stime
     grown = int((folder / "grown").read_text()) if (folder / "grown").exists() else 0
     text = said.read_text(errors="replace")
-    left = sorted(path.name for path in output.glob("*")) if output.exists() else []
+    left = sorted(path.name for path in output.glob("*") if path.name != FOLDER) if output.exists() else []
     errors = [line for line in text.splitlines() if line.startswith("error: ")]
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
@@ -199,8 +202,8 @@ def run_case(source: Path, folder: Path) -> Outcome:
             verdict = f"wrote what cannot be read: {error}"
     else:
         verdict = f"exit code {code}"
-    for path in [*output.glob("*"), folder / "grown"]:
-        path.unlink(missing_ok=True)
+    shutil.rmtree(output, ignore_errors=True)
+    (folder / "grown").unlink(missing_ok=True)
     return Outcome(verdict, seconds, grown, text)
 
 

@@ -35,6 +35,7 @@ import numpy as np
 
 from hybrid.cli import main as ravg
 from hybrid.files.exr import write_layers
+from hybrid.records import FOLDER
 
 FRAMES = 6
 NOBODY = 65534
@@ -230,11 +231,11 @@ def forbid(bench: Bench) -> None:
 
 
 def check_refused(bench: Bench, what: str, code: int, said: Path, folder: Path) -> None:
-    """Exit code 1, one line, nothing left."""
+    """Exit code 1, one line, nothing left but the record of it."""
     words = said.read_text(errors="replace")
     if code != 1 or "Traceback" in words or not words.rstrip().splitlines()[-1].startswith("error: "):
         bench.problems.append(f"{what}: exit code {code}: {words[-600:]}")
-    if left := [path.name for path in folder.glob("*")] + [path.name for path in folder.glob(".*")]:
+    if left := {path.name for pattern in ("*", ".*") for path in folder.glob(pattern)} - {FOLDER}:
         bench.problems.append(f"{what}: left {left}")
 
 

@@ -14,6 +14,7 @@ from hybrid.commands.denoise import denoise, pseudoref
 from hybrid.commands.inspect import inspect
 from hybrid.commands.log import LOG, end_log, lasting_streams, logged, one_line, start_log
 from hybrid.commands.simulate import simulate
+from hybrid.commands.status import status
 from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt
@@ -28,6 +29,7 @@ for command, panel in (
     (denoise, "Frames"),
     (pseudoref, "Frames"),
     (view, "Frames"),
+    (status, "Frames"),
     (compare, "Frames"),
     (prepare, "Networks"),
     (train, "Networks"),

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import platform
 import resource
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-
-from hybrid.files.replace import replace_file
 
 
 @dataclass
@@ -59,18 +55,6 @@ class Timings:
             )
             for name, stage in self.stages.items()
         ]
-
-    def write(self, path: Path, **facts: object) -> None:
-        """Write the stages, `facts` and what ran them as JSON."""
-        document = {
-            **facts,
-            "stages": {name: asdict(stage) for name, stage in self.stages.items()},
-            "peak_bytes": peak_memory(),
-            "python": platform.python_version(),
-            "machine": platform.machine(),
-        }
-        with replace_file(path) as temporary:
-            temporary.write_text(json.dumps(document, indent=2, default=str) + "\n", encoding="utf-8")
 
 
 def peak_memory() -> int:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hybrid.commands.log import LOG, Progress, print_table, printable
+from hybrid.commands.log import LOG, Progress, one_line, print_table, printable
 from hybrid.commands.options import (
     OUTPUT,
     RESOURCES,
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from hybrid.files.frames import Shot
     from hybrid.pipeline import DenoiseWindow
     from hybrid.plan import Rules
+    from hybrid.records import Record
     from hybrid.timing import Timings
 
 
@@ -98,6 +99,7 @@ def pseudoref(
         make = partial(gated_average, timings=timings)
     _run(
         Job(
+            shot,
             opened,
             output,
             lambda aligned: Denoised(make(aligned)),
@@ -238,6 +240,7 @@ def denoise(
         "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
     }
     job = Job(
+        shot,
         opened,
         output,
         denoiser,
@@ -317,6 +320,7 @@ def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: st
 class Job:
     """What `pseudoref` and `denoise` have to say before frames can be made."""
 
+    input: str
     shot: Shot
     output: str
     denoise: DenoiseWindow
@@ -356,23 +360,47 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
 
 
 def _run(job: Job) -> None:
-    """Denoise the shot; stopped by Ctrl-C, say what is finished."""
-    done: list[int] = []
+    """Denoise the shot; leave a record beside the frames however it ends; stopped by Ctrl-C, say what is finished."""
+    from hybrid.files.frames import output_path
+    from hybrid.records import Record, sequence_name
+
+    first = output_path(job.output, job.shot, job.shot.numbers[0])
+    record = Record(
+        first.parent,
+        sequence_name(first),
+        job.shot.numbers,
+        command=job.command,
+        input=job.input,
+        output=job.output,
+        preset=job.preset,
+        options=job.settings,
+        estimate=job.source.name,
+    )
 
     def report() -> None:
-        count = f"{len(done)} of {len(job.shot)} frames are finished"
-        last = f", the last is {done[-1]}" if done else ""
+        count = f"{len(record.done)} of {len(job.shot)} frames are finished"
+        last = f", the last is {record.done[-1]}" if record.done else ""
         LOG.error(f"stopped: {count}{last}; --resume goes on from there")
+        record.write(job.timings, "stopped")
 
     try:
         with interruptible(report):
-            _denoise(job, done)
+            _denoise(job, record)
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        if not isinstance(error, typer.BadParameter):
+            with suppress(OSError):  # on a full disk, say
+                record.write(job.timings, "failed", error=one_line(error))
+        raise
+    record.write(job.timings, "finished")
+    if there := len(record.done) - len(record.made):
+        LOG.info(f"{there} of {len(job.shot)} frames were finished already")
+    LOG.info(f"wrote {len(record.made)} frames to {first.parent} and a record of them to {record.path}")
 
 
-def _denoise(job: Job, done: list[int]) -> None:
-    """Denoise with a progress bar, say what was met on the way, and leave the timings beside the output."""
+def _denoise(job: Job, record: Record) -> None:
+    """Denoise; say how far it has come, and what was met on the way."""
     from rich.table import Table
 
     from hybrid.files.layers import summarize_layers
@@ -389,8 +417,9 @@ def _denoise(job: Job, done: list[int]) -> None:
     rows = None
     if limit is not None:
         rows = plan_rows(limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural)
-    layers = shot.layers(shot.numbers[0])
-    for words in (f"layers: {summarize_layers(layers)}", *layers.notes):
+    taken = shot.layers(shot.numbers[0])
+    layers = summarize_layers(taken)
+    for words in (f"layers: {layers}", *taken.notes):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
     attributes = {
@@ -400,8 +429,9 @@ def _denoise(job: Job, done: list[int]) -> None:
         "ravg/forced": " ".join([f"+{name}" for name in sorted(rules.on)] + [f"-{name}" for name in sorted(rules.off)]),
         "ravg/settings": json.dumps(job.settings, sort_keys=True),
     }
-    pixels, outliers, resumed, finished = 0, 0, 0, None
-    plans, removed = {}, {}
+    record.write(timings, layers=layers)
+    pixels, outliers = 0, 0
+    plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))
     frames = denoise_shot(
         shot,
@@ -417,49 +447,34 @@ def _denoise(job: Job, done: list[int]) -> None:
     )
     started = time.perf_counter()
     for finished in frames:
-        done.append(finished.number)
-        resumed += finished.resumed
         pixels += finished.pixels
         outliers += finished.outliers
         if finished.plan is not None:
             plans[finished.number] = finished.plan
         if finished.fireflies:
-            removed[finished.number] = finished.removed
             light = f"{finished.removed:.2%} of its light"
             LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {light}")
         if finished.repaired:
             LOG.warning(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
         if finished.clamped:
             LOG.warning(f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504")
-        seconds, started = time.perf_counter() - started, time.perf_counter()
-        words = f"frame {finished.number} was there" if finished.resumed else f"frame {finished.number} {seconds:.1f} s"
-        progress.advance(message=words, frame=finished.number, seconds=round(seconds, 3), path=str(finished.path))
-    if finished is None:
-        return
-    if resumed:
-        LOG.info(f"{resumed} of {len(shot)} frames were finished already")
-    plan = merge(plans) if plans else Plan(())
-    for decision in plan.decisions:
+        seconds, started = round(time.perf_counter() - started, 3), time.perf_counter()
+        state, words = ("there", "was there") if finished.resumed else ("made", f"{seconds:.1f} s")
+        facts = {"file": finished.path.name, "seconds": seconds, "light_removed": finished.removed}
+        stages = sorted(finished.plan.stages) if finished.plan else None
+        record.add(finished.number, state, **facts, stages=stages)
+        record.write(timings, pixels=pixels, outliers=outliers)
+        message = f"frame {finished.number} {words}"
+        progress.advance(message=message, frame=finished.number, seconds=seconds, path=str(finished.path))
+    plan = merge(plans).decisions if plans else ()
+    record.write(timings, plan=[vars(decision) for decision in plan])
+    for decision in plan:
         if job.neural or decision.stage not in NEURAL_STAGES:
             LOG.info(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
     table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
     for row in timings.rows(pixels):
         table.add_row(*row)
     print_table(table, stages={name: asdict(stage) for name, stage in timings.stages.items()})
-    folder = finished.path.parent
-    timings.write(
-        folder / "ravg.json",
-        command=job.command,
-        preset=job.preset,
-        estimate=source.name,
-        frames=len(shot),
-        resumed=resumed,
-        pixels=pixels,
-        outliers=outliers,
-        light_removed=removed,
-        plan=[vars(decision) for decision in plan.decisions],
-    )
-    LOG.info(f"wrote {len(shot) - resumed} frames to {folder} and their timings to {folder / 'ravg.json'}")
 
 
 def _look(shot: Shot, output: str, preview: Path | None, fps: float, contact: Path | None) -> None:

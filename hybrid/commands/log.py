@@ -208,7 +208,7 @@ class _TextLine(logging.Formatter):
             text = _plain_table(table)
         facts = getattr(record, "facts", {})
         if (progress := getattr(record, "progress", None)) is not None:
-            left = f", about {_duration(facts['seconds_left'])} left" if "seconds_left" in facts else ""
+            left = f", about {duration(facts['seconds_left'])} left" if "seconds_left" in facts else ""
             count = f"{progress.done:.0f} of {progress.total:.0f} {progress.unit}"
             text = f"{text}: {count}, {facts['percent']:.0f} %{left}"
         lines = [text]
@@ -291,7 +291,7 @@ def _time(record: logging.LogRecord) -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(record.created))
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

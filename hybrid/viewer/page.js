@@ -293,9 +293,9 @@ async function showFacts() {
 }
 
 function showRecord() {
-  const { stages = {}, plan = [], command, preset, estimate, frames, peak_bytes: peak } = state.sequences[0].record;
+  const { stages = {}, plan = [], command, preset, estimate, asked = [], peak_bytes: peak } = state.sequences[0].record;
   $("#record").hidden = !command;
-  pairs($("#record dl"), { command, preset, estimate, frames, ...(peak && { memory: mebibytes(peak) }) });
+  pairs($("#record dl"), { command, preset, estimate, frames: asked.length, ...(peak && { memory: mebibytes(peak) }) });
   $("#record tbody").replaceChildren(...Object.entries(stages).map(([name, cost]) => {
     const row = document.createElement("tr");
     row.append(element("td", name), element("td", cost.seconds.toFixed(2)), element("td", mebibytes(cost.peak_bytes)));

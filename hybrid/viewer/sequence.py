@@ -19,6 +19,7 @@ from hybrid.files.exr import ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.pictures import encode_srgb
 from hybrid.files.sequences import find_files, parse_frames
+from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
 
 Picture = NDArray[np.uint8]
@@ -139,15 +140,10 @@ class Sequence:
         return {"file": path.name, "made": made, "weights": means}
 
     def record(self) -> dict[str, Any]:
-        """What a run has left beside its frames: stages with their cost, and the plan; empty where there is nothing."""
+        """What the latest run has left beside its frames: stages with their cost, and the plan; {} where none has."""
         beside = next(iter(self._files.values()), None)
-        if beside is None:
-            return {}
-        try:
-            found = json.loads(beside.with_name("ravg.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return found if isinstance(found, dict) else {}
+        records = [] if beside is None else list(read_records(beside.parent, sequence_name(beside)))
+        return records[-1][1] if records else {}
 
     def _path(self, number: int) -> Path:
         return self._files[number] if number in self._files else self.files()[number]

@@ -174,7 +174,7 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
             code = run("denoise", folder, "-o", out, "--passes", passes, "--no-effects", "refine", *options)
             assert code == 0, capsys.readouterr().err
             left = {item.name for item in out.iterdir()}  # nothing of the first pass
-            assert left == {"ravg.json", *(f"shot.{number}.exr" for number in (1001, 1002, 1003))}
+            assert left == {"ravg", *(f"shot.{number}.exr" for number in (1001, 1002, 1003))}
             first.append(open_shot(out).read(SCENE.first).color)
         seen.append(not np.array_equal(*first))
     assert seen == [False, True]
@@ -194,7 +194,7 @@ def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, 
     assert code == 0, capsys.readouterr().err
     assert run("denoise", folder, "-o", tmp_path / "one", "--estimate", "nlm", "--frames", "1003", *options) == 0
     name = "shot.1003.exr"
-    assert {path.name for path in (tmp_path / "one").iterdir()} == {"ravg.json", name}
+    assert {path.name for path in (tmp_path / "one").iterdir()} == {"ravg", name}
     assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
 
 
@@ -227,7 +227,7 @@ def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):
     assert run(*words, "--breakdown", picture) == 0
     printed = capsys.readouterr()
     assert "3 of 3 frames were finished already" in printed.err
-    assert "no weights to print: all frames were finished already" in printed.out
+    assert "no weights to print: all frames were finished already" in printed.err
     assert "average weight" not in printed.out
     assert picture.read_bytes() == whole
 

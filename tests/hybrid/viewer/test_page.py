@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -11,6 +10,8 @@ import numpy as np
 import pytest
 
 from hybrid.files.pictures import encode_srgb
+from hybrid.records import Record
+from hybrid.timing import Stage, Timings
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 from tests.scenes import Scene
@@ -39,13 +40,10 @@ def shot(tmp_path):
     """Six noisy frames, of which four are denoised."""
     write(tmp_path / "noisy", 1, FRAMES)
     out = write(tmp_path / "out", 0.5, 4)
-    record = {
-        "command": "denoise",
-        "preset": EVIL,
-        "stages": {"network": {"seconds": 1.5, "peak_bytes": 300 << 20}},
-        "plan": [{"stage": "gate", "on": False, "reason": "nothing changes its light"}],
-    }
-    (out / "ravg.json").write_text(json.dumps(record), encoding="utf-8")
+    timings = Timings()
+    timings.stages["network"] = Stage(seconds=1.5, peak_bytes=300 << 20)
+    plan = [{"stage": "gate", "on": False, "reason": "nothing changes its light"}]
+    Record(out, "shot", range(1, 7), command="denoise", preset=EVIL, plan=plan).write(timings)
     return tmp_path
 
 

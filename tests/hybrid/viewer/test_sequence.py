@@ -12,6 +12,8 @@ import pytest
 
 from hybrid.files.exr import read_exr, write_layers
 from hybrid.files.pictures import encode_srgb
+from hybrid.records import Record
+from hybrid.timing import Timings
 from hybrid.viewer import sequence as module
 from hybrid.viewer.sequence import Sequence, encode_picture
 from tests.scenes import Scene
@@ -164,12 +166,11 @@ def test_the_record_is_what_lies_beside_the_frames(tmp_path):
     watched = Sequence(str(tmp_path), finished=True)
     assert watched.versions()
     assert watched.record() == {}
-    (tmp_path / "ravg.json").write_text("not json", encoding="utf-8")
+    for preset in ("fast", "quality"):
+        Record(tmp_path, "shot", [1], preset=preset).write(Timings())
+        assert watched.record()["preset"] == preset, "the latest"
+    (tmp_path / "ravg" / "shot.1.json").write_text("[1]", encoding="utf-8")
     assert watched.record() == {}
-    (tmp_path / "ravg.json").write_text("[1]", encoding="utf-8")
-    assert watched.record() == {}
-    (tmp_path / "ravg.json").write_text(json.dumps({"preset": "fast"}), encoding="utf-8")
-    assert watched.record() == {"preset": "fast"}
 
 
 def test_what_is_not_there_is_a_key_error(scene):

@@ -1,0 +1,95 @@
+"""`ravg status`: how far the runs have come that write into a folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybrid.commands.log import duration, printable
+from hybrid.commands.options import OUTPUT, FramesOption, usage
+
+if TYPE_CHECKING:
+    from hybrid.records import Status
+
+
+def status(
+    output: Annotated[str, typer.Argument(metavar="OUT", help="where frames are written: OUT.####.exr, or a folder")],
+    frames: FramesOption = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="all of it as one JSON object", rich_help_panel=OUTPUT)
+    ] = False,
+) -> None:
+    """Show what is finished, missing and failed, by the records that runs leave beside their frames.
+
+    Ends with 0 where all that was asked for is finished, else with 1.
+    """
+    from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
+    from hybrid.records import gather_status, sequence_name
+
+    folder, name = Path(output), None
+    if not folder.is_dir():
+        pattern, _ = parse_pattern(output)
+        folder, name = pattern.folder, sequence_name(pattern.path(1))
+    with usage():
+        numbers = None if frames is None else parse_frames(frames)
+    found = gather_status(folder, name, numbers)
+    left = found.asked - found.finished
+    if as_json:
+        document = {
+            "asked": sorted(found.asked),
+            "finished": sorted(found.finished),
+            "running": sorted(found.running),
+            "missing": sorted(found.missing),
+            "failed": {str(number): found.failed[number] for number in sorted(found.failed)},
+            "workers": found.workers,
+            "seconds_per_frame": found.seconds_per_frame,
+            "seconds_left": found.seconds_left if left else 0.0,
+            "records": found.records,
+        }
+        typer.echo(json.dumps(document, indent=1))
+    else:
+        _show(found)
+        for what, of in (("finished", found.finished), ("running", found.running), ("missing", found.missing)):
+            if of:
+                typer.echo(f"{what}: {len(of)} of {len(found.asked)} frames, {format_frames(of)}")
+        for error in dict.fromkeys(found.failed.values()):
+            of = {number for number, other in found.failed.items() if other == error}
+            typer.echo(f"failed: {len(of)} of {len(found.asked)} frames, {format_frames(of)}: {printable(error)}")
+        if found.seconds_per_frame is not None:
+            words = f"{found.seconds_per_frame:.2f} s a frame"
+            if left and found.seconds_left is not None:
+                words += f"; about {duration(found.seconds_left)} left with {max(found.workers, 1)} at work"
+            typer.echo(words)
+    if left:
+        raise typer.Exit(1)
+
+
+def _show(found: Status) -> None:
+    """One row for each run."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from hybrid.files.sequences import format_frames
+    from hybrid.records import goes_on
+
+    heads = "frames", "state", "made", "s a frame", "peak", "host", "last heard of"
+    table = Table(*heads, box=SIMPLE_HEAD, pad_edge=False)
+    for record in found.records:
+        made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]
+        state = record["state"] if record["state"] != "running" or goes_on(record) else "died"
+        table.add_row(
+            format_frames(record["asked"]),
+            state,
+            f"{len(made)} of {len(record['asked'])}",
+            f"{sum(made) / len(made):.2f}" if made else "–",
+            f"{record.get('peak_bytes', 0) / 2**20:.0f} MiB",
+            Text(printable(str(record["host"]))),
+            time.strftime("%m-%d %H:%M:%S", time.localtime(record.get("updated", record["started"]))),
+        )
+    Console().print(table)

@@ -1,0 +1,256 @@
+"""What was done, beside what was made: one record for each run, and what all records of a folder say together.
+
+A farm makes a shot in chunks, on many machines at once. Every run writes a file of its own,
+``OUT/ravg/NAME.RANGE.json``, after every frame, so that nothing is overwritten and nothing is lost when a machine dies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from hybrid.files.replace import remove_leftovers, replace_file
+from hybrid.files.sequences import format_frames
+from hybrid.timing import Timings, peak_memory
+
+FOLDER = "ravg"
+# The sequence whose files are called by their numbers alone.
+NAMELESS = "frames"
+# Packages that pixels may depend on.
+PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "OpenEXR", "pyoidn", "torch")
+# A longer list of frames is named by its ends and a hash in the record's name.
+LONGEST = 60
+
+
+class Record:
+    """The record of one run, written anew after each frame.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the frames go.
+    name : str
+        Of the sequence, without number and extension.
+    numbers : sequence of int
+        The frames that were asked for.
+    **facts : object
+        What else is known from the beginning: command, input, options.
+
+    Raises
+    ------
+    ValueError
+        If another file has the record's name.
+    """
+
+    def __init__(self, folder: Path, name: str, numbers: Sequence[int], **facts: object) -> None:
+        self.path = folder / FOLDER / f"{name or NAMELESS}.{_range(numbers)}.json"
+        if self.path.exists() and _read(self.path) is None:
+            raise ValueError(f"{self.path} is there and no record of ravg, expected a name of its own")
+        self._start = time.time()
+        self._written = False
+        self._document: dict[str, Any] = {
+            "ravg": _versions().get("ravg", "unknown"),
+            **facts,
+            "asked": list(numbers),
+            "host": platform.node(),
+            "process": os.getpid(),
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            "versions": _versions(),
+            "started": self._start,
+            "state": "running",
+            "frames": {},
+        }
+
+    @property
+    def done(self) -> list[int]:
+        """The frames that are there, made by this run or before it, in the order in which they came."""
+        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] != "failed"]
+
+    @property
+    def made(self) -> list[int]:
+        """The frames that this run has made."""
+        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "made"]
+
+    def add(self, number: int, state: str, **facts: object) -> None:
+        """Count a frame: its state is "made", "there" (an earlier run had made it) or "failed"."""
+        self._document["frames"][str(number)] = {"state": state, **facts}
+
+    def write(self, timings: Timings, state: str = "running", **facts: object) -> None:
+        """Write all that is known by now; `state` is "running", "finished", "failed" or "stopped"."""
+        now = time.time()
+        self._document |= facts
+        document = {
+            **self._document,
+            "state": state,
+            "updated": now,
+            "seconds": round(now - self._start, 3),
+            "stages": {name: asdict(stage) for name, stage in timings.stages.items()},
+            "peak_bytes": peak_memory(),
+        }
+        if not self._written:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(self.path.parent)
+            self._written = True
+        with replace_file(self.path) as temporary:
+            temporary.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+
+
+@dataclass
+class Status:
+    """What the records of a folder say of a sequence.
+
+    Attributes
+    ----------
+    asked : set of int
+        Frames that some run was to make.
+    finished, running : set of int
+        Those that are there; and those that a run has still to make, as far as can be told.
+    failed : dict of int to str
+        Those that could not be made, with the reason.
+    seconds : list of float
+        Of each frame that was made.
+    workers : int
+        Runs that go on.
+    records : list of dict
+        The records themselves, oldest first.
+    """
+
+    asked: set[int] = field(default_factory=set)
+    finished: set[int] = field(default_factory=set)
+    running: set[int] = field(default_factory=set)
+    failed: dict[int, str] = field(default_factory=dict)
+    seconds: list[float] = field(default_factory=list)
+    workers: int = 0
+    records: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def missing(self) -> set[int]:
+        """Frames that were asked for, are not there, and that nobody makes."""
+        return self.asked - self.finished - self.running - set(self.failed)
+
+    @property
+    def seconds_per_frame(self) -> float | None:
+        """Mean time of the frames that were made; None where none was."""
+        return sum(self.seconds) / len(self.seconds) if self.seconds else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """How long the frames that are not there take with as many runs as there are now, or with one."""
+        if self.seconds_per_frame is None:
+            return None
+        return len(self.asked - self.finished) * self.seconds_per_frame / max(self.workers, 1)
+
+
+def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The records of a folder of frames, or of one sequence in it, oldest first; files that are none are left out."""
+    paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
+    if name is not None:
+        paths = [path for path in paths if path.stem.rpartition(".")[0] == (name or NAMELESS)]
+    found = [(path, document) for path in paths if (document := _read(path)) is not None]
+    yield from sorted(found, key=lambda item: item[1]["started"])
+
+
+def gather_status(folder: Path, name: str | None = None, frames: Collection[int] | None = None) -> Status:
+    """Find how far the runs have come that write into a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the frames.
+    name : str, optional
+        Of the sequence; all records of the folder count without.
+    frames : collection of int, optional
+        Only these, whether or not a run has been asked for them yet.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no record.
+    """
+    status = Status()
+    for _, document in read_records(folder, name):
+        status.records.append(document)
+        wanted = {n for n in document["asked"] if frames is None or n in frames}
+        status.asked |= wanted
+        alive = goes_on(document)
+        status.workers += alive
+        for number in wanted:  # a later record overrules
+            entry = document["frames"].get(str(number))
+            if entry is None:
+                if number in status.finished:
+                    continue
+                if alive:
+                    status.running.add(number)
+                elif "error" in document:
+                    status.failed[number] = document["error"]
+                continue
+            status.running.discard(number)
+            status.failed.pop(number, None)
+            status.finished.discard(number)
+            if entry["state"] == "failed":
+                status.failed[number] = entry["error"]
+            elif (folder / entry["file"]).is_file():
+                status.finished.add(number)
+            if entry["state"] == "made":
+                status.seconds.append(entry["seconds"])
+    if not status.records:
+        raise FileNotFoundError(f"{folder} has no records of runs, expected some in {folder / FOLDER}")
+    status.asked |= set(frames or ())
+    return status
+
+
+def goes_on(document: Mapping[str, Any]) -> bool:
+    """Whether a run that has not said its end still lives: told by its process here, believed elsewhere."""
+    if document["state"] != "running":
+        return False
+    if document["host"] != platform.node():
+        return True
+    try:
+        os.kill(document["process"], 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is somebody else's
+        pass
+    return True
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(document, dict) or not {"ravg", "asked", "frames", "started", "state"} <= document.keys():
+        return None
+    return document
+
+
+def _range(numbers: Sequence[int]) -> str:
+    text = format_frames(numbers).replace(":", "y")
+    if len(text) <= LONGEST:
+        return text
+    return f"{numbers[0]}-{numbers[-1]}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def sequence_name(file: Path) -> str:
+    """The name of a sequence, of one of its files: without number and extension."""
+    return re.sub(r"[._-]?-?[0-9]+$", "", file.stem)

@@ -1,0 +1,140 @@
+"""Records of runs, and what they say together."""
+
+import json
+import os
+import platform
+
+import pytest
+
+from hybrid.cli import main
+from hybrid.records import FOLDER, Record, gather_status, read_records, sequence_name
+from hybrid.timing import Timings
+
+
+def made(folder, record, *numbers, seconds=2.0):
+    for number in numbers:
+        name = f"shot.{number}.exr"
+        (folder / name).touch()
+        record.add(number, "made", file=name, seconds=seconds)
+    record.write(Timings())
+
+
+def test_runs_of_one_shot_write_one_record_each(tmp_path):
+    for first in (1, 4, 7):
+        made(tmp_path, Record(tmp_path, "shot", range(first, first + 3), command="denoise"), first)
+    made(tmp_path, Record(tmp_path, "other", [1]), 1)
+    assert sorted(path.name for path, _ in read_records(tmp_path)) == [
+        "other.1.json",
+        "shot.1-3.json",
+        "shot.4-6.json",
+        "shot.7-9.json",
+    ]
+    status = gather_status(tmp_path, "shot")
+    assert status.asked == set(range(1, 10))
+    assert status.finished == {1, 4, 7}
+    assert status.running == {2, 3, 5, 6, 8, 9}
+    assert status.workers == 3
+    assert status.seconds_per_frame == 2
+    assert status.seconds_left == 6 * 2 / 3
+
+
+def test_what_ended_is_not_running(tmp_path):
+    for state in ("finished", "stopped"):
+        record = Record(tmp_path, state, [1, 2])
+        made(tmp_path, record, 1)
+        record.write(Timings(), state)
+        assert gather_status(tmp_path, state).missing == {2}
+    record = Record(tmp_path, "killed", [1, 2])
+    made(tmp_path, record, 1)
+    document = json.loads(record.path.read_text())
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)  # a process that is no more
+    for host, running in ((platform.node(), set()), ("elsewhere", {2})):
+        record.path.write_text(json.dumps({**document, "process": child, "host": host}))
+        assert gather_status(tmp_path, "killed").running == running
+
+
+def test_a_later_run_overrules(tmp_path):
+    first = Record(tmp_path, "shot", [1, 2, 3])
+    made(tmp_path, first, 1)
+    first.add(2, "failed", error="shot.2.exr: damaged")
+    first.write(Timings())
+    assert gather_status(tmp_path).failed == {2: "shot.2.exr: damaged"}
+    first.write(Timings(), "failed", error="no space left")
+    assert gather_status(tmp_path).failed == {2: "shot.2.exr: damaged", 3: "no space left"}
+    second = Record(tmp_path, "shot", [2, 3])
+    made(tmp_path, second, 2, 3)
+    second.write(Timings(), "finished")
+    status = gather_status(tmp_path)
+    assert status.finished == {1, 2, 3}
+    assert not status.failed
+    (tmp_path / "shot.3.exr").unlink()  # somebody has tidied up
+    assert gather_status(tmp_path).missing == {3}
+
+
+def test_frames_that_no_run_was_asked_for_are_missing_where_they_are_named(tmp_path):
+    made(tmp_path, Record(tmp_path, "shot", [1, 2]), 1, 2)
+    assert gather_status(tmp_path).missing == set()
+    assert gather_status(tmp_path, frames=range(1, 5)).missing == {3, 4}
+    assert gather_status(tmp_path, frames=[2]).asked == {2}
+
+
+def test_long_lists_of_frames_have_short_and_different_names(tmp_path):
+    primes = [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97]
+    names = {Record(tmp_path, "shot", numbers).path.name for numbers in (primes, [*primes[:-2], 90, 97])}
+    assert len(names) == 2
+    assert all(len(name) < 40 for name in names)
+
+
+def test_another_file_is_not_overwritten(tmp_path):
+    path = Record(tmp_path, "shot", [1]).path
+    path.parent.mkdir()
+    path.write_text('{"frames": "mine"}')
+    with pytest.raises(ValueError, match="no record of ravg"):
+        Record(tmp_path, "shot", [1])
+    assert path.read_text() == '{"frames": "mine"}'
+    with pytest.raises(FileNotFoundError, match="no records"):
+        gather_status(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "name"), [("a.0001.exr", "a"), ("a_v2-7.exr", "a_v2"), ("done.exr", "done"), ("0001.exr", "")]
+)
+def test_names_of_sequences(tmp_path, file, name):
+    assert sequence_name(tmp_path / file) == name
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_status_of_two_chunks(shot_folder, tmp_path, capsys):
+    out = tmp_path / "out" / "done.####.exr"
+    words = ["pseudoref", shot_folder, "-o", out, "--preset", "draft"]
+    assert run(capsys, *words, "--frames", "1001-1002")[0] == 0
+    code, text, _ = run(capsys, "status", out)
+    assert code == 0
+    assert "finished: 2 of 2 frames, 1001-1002" in text
+    code, text, _ = run(capsys, "status", out, "--frames", "1001-1003")
+    assert code == 1
+    assert "missing: 1 of 3 frames, 1003" in text
+    (shot_folder / "shot.1003.exr").write_bytes(b"damaged")
+    assert run(capsys, *words, "--frames", "1003")[0] == 1
+    code, text, _ = run(capsys, "status", out.parent, "--json")
+    document = json.loads(text)
+    assert code == 1
+    assert document["finished"] == [1001, 1002]
+    assert "shot.1003.exr" in document["failed"]["1003"]
+    first = document["records"][0]
+    assert first["host"] == platform.node()
+    assert {"ravg", "numpy", "numba"} <= first["versions"].keys()
+    assert first["input"] == str(shot_folder)
+    assert "color" in first["layers"]
+    assert first["stages"]["write"]["peak_bytes"] > 0
+    assert len(first["plan"]) > 5
+    assert run(capsys, "status", tmp_path)[0] == 1
+    assert FOLDER not in [path.name for path in tmp_path.iterdir()]
