@@ -21,14 +21,37 @@ def _luminance(image: np.ndarray) -> np.ndarray:
 
 
 def median_luminance(color: np.ndarray) -> float:
-    """Median of the positive luminances of (H, W, 3) radiance; 1 where there are none."""
+    """Median of the positive luminances of a picture.
+
+    Parameters
+    ----------
+    color : (H, W, 3) float array
+        Linear radiance; what is not finite counts as 0, or as very bright.
+
+    Returns
+    -------
+    float
+        Positive; 1 where no luminance is.
+    """
     luminance = _luminance(color)
     positive = luminance[luminance > 0]
     return float(np.median(positive)) if positive.size else 1.0
 
 
 def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Luminance of (H, W, 3) radiance in [0, 1], ``L / (L + exposure)``; NaN is 0, Inf is 1.
+    """Luminance of a picture on Reinhard's curve, ``L / (L + exposure)``.
+
+    Parameters
+    ----------
+    color : (H, W, 3) float array
+        Linear radiance. Negative and NaN count as 0, Inf as white.
+    exposure : float
+        The radiance that maps to 0.5.
+
+    Returns
+    -------
+    (H, W) float32 array
+        In [0, 1].
 
     Raises
     ------

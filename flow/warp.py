@@ -23,7 +23,20 @@ class Place(NamedTuple):
 
 @njit(inline="always")
 def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
-    """Find the four pixels around a position."""
+    """Find the four pixels around a position.
+
+    Parameters
+    ----------
+    px, py : float32
+        The position, pixels, from the centre of the first pixel; NaN and infinities are outside.
+    width, height : int
+        Of the frame.
+
+    Returns
+    -------
+    Place
+        Outside the frame its edge.
+    """
     # Written so that a NaN or infinite position fails the test.
     inside = px >= -0.5 and px <= width - 0.5 and py >= -0.5 and py <= height - 0.5
     # Clamping the position is the same as repeating the edge; NaN falls to 0.
@@ -39,7 +52,18 @@ def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
 
 @njit(inline="always")
 def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Bilinear weights of the four pixels around a position, row by row; they sum to 1."""
+    """Bilinear weights of the four pixels around a position.
+
+    Parameters
+    ----------
+    place : Place
+        From `locate`.
+
+    Returns
+    -------
+    tuple of float32
+        Row by row; they sum to 1.
+    """
     one = np.float32(1)
     fx, fy = place.fx, place.fy
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
@@ -49,7 +73,24 @@ def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]
 def interpolate(
     image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
 ) -> np.float32:
-    """Sample a channel of (H, W, C) bilinearly, with the weights of `weigh`."""
+    """Sample a channel bilinearly.
+
+    Parameters
+    ----------
+    image : (H, W, C) float32 array
+        In any unit.
+    channel : int
+        Which.
+    place : Place
+        From `locate`.
+    weights : tuple of float32
+        From `weigh`; the same for all channels.
+
+    Returns
+    -------
+    float32
+        In the image's unit.
+    """
     value: np.float32 = (
         weights[0] * image[place.y0, place.x0, channel] + weights[1] * image[place.y0, place.x1, channel]
         + weights[2] * image[place.y1, place.x0, channel] + weights[3] * image[place.y1, place.x1, channel]

@@ -117,7 +117,18 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(channels, channels, kernel_size, padding=kernel_size // 2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, C, H, W)`` to the same shape."""
+        """Add what two convolutions make of the features.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(N, C, H, W)``.
+
+        Returns
+        -------
+        Tensor
+            As x.
+        """
         return x + cast(Tensor, self.second(torch.relu(self.first(torch.relu(x)))))
 
 
@@ -208,7 +219,20 @@ class UNet(nn.Module):
         self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
 
     def scales(self, x: Tensor, frames: int) -> list[Tensor]:
-        """``(T·N, C, H, W)``, time first, to the features of every scale, finest first."""
+        """Features of every scale.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(T·N, inputs, H, W)``, time first.
+        frames : int
+            T.
+
+        Returns
+        -------
+        list of Tensor
+            ``(T·N, width, h, w)``, finest first, after the ReLU.
+        """
         x = self.stem(x)
         scales: list[Tensor] = []
         for scale, block in enumerate(self.encode):
@@ -257,7 +281,20 @@ class TemporalModule(nn.Module):
         self.split = nn.Conv2d(channels, frames * channels, 1)
 
     def forward(self, x: Tensor, frames: int) -> Tensor:
-        """``(T·N, C, H, W)``, time first, to the same shape."""
+        """Mix the frames.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(T·N, C, H, W)``, time first.
+        frames : int
+            T.
+
+        Returns
+        -------
+        Tensor
+            As x.
+        """
         window = self.join(torch.cat(torch.relu(x).chunk(frames), 1))
         for block in self.blocks:
             window = block(window)
@@ -265,5 +302,16 @@ class TemporalModule(nn.Module):
 
 
 def outermost_first(frames: int) -> list[int]:
-    """Order in which a Robust Average block visits a window: 0, 4, 1, 3, 2 for five frames."""
+    """Order in which a Robust Average block visits a window: 0, 4, 1, 3, 2 for five frames.
+
+    Parameters
+    ----------
+    frames : int
+        T.
+
+    Returns
+    -------
+    list of int
+        Indices of the frames.
+    """
     return sorted(range(frames), key=lambda i: (-abs(i - frames // 2), i))

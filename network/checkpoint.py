@@ -47,14 +47,35 @@ CLASSES: dict[str, tuple[Any, Any]] = {
 
 
 def describe(model: Model) -> dict[str, Any]:
-    """What is needed to build the model anew, as plain JSON values."""
+    """What is needed to build the model anew.
+
+    Parameters
+    ----------
+    model : Model
+        Any.
+
+    Returns
+    -------
+    dict
+        Plain JSON values.
+    """
     if isinstance(model, MultiScale):
         return {"model": "MultiScale", "scales": model.config.scales, "base": describe(model.base)}
     return {"model": type(model).__name__, "config": asdict(model.config)}
 
 
 def build(description: Mapping[str, Any]) -> Model:
-    """Model of a description, with initial weights.
+    """Build the model of a description, with initial weights.
+
+    Parameters
+    ----------
+    description : mapping
+        From `describe`.
+
+    Returns
+    -------
+    Model
+        In training layout.
 
     Raises
     ------
@@ -87,13 +108,8 @@ def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
     return kind(**values)
 
 
-def save_model(
-    path: str | os.PathLike[str],
-    model: Model,
-    notes: Mapping[str, Any] | None = None,
-    dtype: torch.dtype = torch.float16,
-) -> None:
-    """Write a model; the file appears whole or not at all.
+def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, Any] | None = None) -> None:
+    """Write a model in half precision; the file appears whole or not at all.
 
     Parameters
     ----------
@@ -103,18 +119,16 @@ def save_model(
         The model, in any precision.
     notes : mapping, optional
         Where the weights come from (training configuration, validation), as JSON values.
-    dtype : torch.dtype
-        Stored precision.
 
     Raises
     ------
     ValueError
-        If a weight is not finite in the stored precision.
+        If a weight is not finite in half precision.
     """
-    tensors = {name: value.detach().to("cpu", dtype).contiguous() for name, value in model.state_dict().items()}
+    tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in model.state_dict().items()}
     for name, value in tensors.items():
         if not bool(torch.isfinite(value).all()):
-            raise ValueError(f"{name}: expected finite weights in {dtype}, got NaN or infinity")
+            raise ValueError(f"{name}: expected finite weights in half precision, got NaN or infinity")
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),
@@ -183,7 +197,23 @@ def _refuse_huge(value: Any) -> None:
 
 
 def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read where weights come from: the notes given to `save_model`. Raises as `load_model`."""
+    """Read where weights come from.
+
+    Parameters
+    ----------
+    path : path
+        File from `save_model`.
+
+    Returns
+    -------
+    dict
+        The notes given to `save_model`.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `load_model`.
+    """
     metadata, _ = _read(path)
     try:
         notes: dict[str, Any] = json.loads(metadata["notes"])

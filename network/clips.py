@@ -92,7 +92,20 @@ class Clip:
                 raise ValueError(f"{name}: expected finite values, got NaN or infinity")
 
     def crop(self, y: int, x: int, size: int) -> Clip:
-        """Square tile with its corner at row y and column x; the exposure stays the frame's."""
+        """Cut a square tile out of the clip.
+
+        Parameters
+        ----------
+        y, x : int
+            Row and column of its corner.
+        size : int
+            Of its sides, pixels.
+
+        Returns
+        -------
+        Clip
+            With the exposures of the whole frame.
+        """
         here = np.s_[..., y : y + size, x : x + size]
         return Clip(**{n: v if n == "exposure" else v[here] for n, v in _values(self).items()})
 
@@ -157,7 +170,22 @@ def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tens
 
 
 def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]], np.ndarray]:
-    """Corners of the possible tiles, every 8 pixels, and the chance of each: half even, half by importance."""
+    """Chances of the possible tiles of a picture, half even, half by importance.
+
+    Parameters
+    ----------
+    importance : Tensor
+        ``(H, W)``, at least 0, from `importance`.
+    size : int
+        Of the sides of a tile, pixels; at most H and W.
+
+    Returns
+    -------
+    corners : list of (int, int)
+        Row and column of each, every 8 pixels.
+    chances : numpy.ndarray
+        One for each corner; they sum to 1.
+    """
     height, width = importance.shape
     sums = np.zeros((height + 1, width + 1))
     sums[1:, 1:] = importance.double().numpy().cumsum(0).cumsum(1)
@@ -172,7 +200,24 @@ def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]],
 
 
 def important_places(importance: Tensor, size: int, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Corners of up to `count` tiles, drawn by importance, none closer to another than half a tile both ways."""
+    """Draw tiles by importance, none closer to another than half a tile both ways.
+
+    Parameters
+    ----------
+    importance : Tensor
+        ``(H, W)``, at least 0, from `importance`.
+    size : int
+        Of the sides of a tile, pixels.
+    count : int
+        How many at most.
+    rng : numpy.random.Generator
+        What they are drawn with.
+
+    Returns
+    -------
+    list of (int, int)
+        Row and column of the corners, fewer than `count` where no more fit.
+    """
     corners, chances = place_chances(importance, size)
     places: list[tuple[int, int]] = []
     while len(places) < count and chances.sum() > 0:
@@ -297,18 +342,61 @@ class Clips:
         return min(min(shard.shape[4:]) for shard in self._shards)
 
     def of(self, shots: Sequence[str]) -> Clips:
-        """Those of some shots."""
+        """Those of some shots.
+
+        Parameters
+        ----------
+        shots : sequence of str
+            Names.
+
+        Returns
+        -------
+        Clips
+            In the order they have here.
+        """
         return Clips([shard for shard in self._shards if shard.shot in shots])
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
-        """For each noise level of a clip its targets: the reference where there is one, else its `noise_pairs`."""
+        """What each noise level of a clip may be trained towards.
+
+        Parameters
+        ----------
+        index : int
+            Of the clip.
+
+        Returns
+        -------
+        list of list of (int, str)
+            For each level its targets: the reference where there is one, else its `noise_pairs`.
+        """
         shard = self._find(index)[0]
         if shard.clean:
             return [[(level, "reference")] for level in range(len(shard.samples))]
         return noise_pairs(shard.samples)
 
     def read(self, index: int, level: int, target: tuple[int, str]) -> dict[str, Tensor]:
-        """One level of a clip with a target of `pairs`: `Clip`'s fields without L, ``target``, and float32 exposure."""
+        """Read one level of a clip with a target.
+
+        Parameters
+        ----------
+        index : int
+            Of the clip.
+        level : int
+            Of the noise.
+        target : (int, str)
+            Level and kind, one of `pairs`.
+
+        Returns
+        -------
+        dict of Tensor
+            The fields of `Clip` that are inputs, without L, and ``target``, float16; the exposure float32. Radiance and
+            irradiance are over the exposure of the clip's last level.
+
+        Raises
+        ------
+        ValueError
+            If the file is cut short.
+        """
         shard, number = self._find(index)
         names = ("color", "albedo", "normal", "estimate", "confidence", "modulation", "exposure")
         try:
@@ -326,6 +414,16 @@ class Clips:
 
 def open_clips(folder: str | os.PathLike[str]) -> Clips:
     """Open all shards of a folder and of those in it.
+
+    Parameters
+    ----------
+    folder : path
+        Where `write_shards` has written.
+
+    Returns
+    -------
+    Clips
+        In the order of the shards' paths.
 
     Raises
     ------
@@ -367,6 +465,11 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
         All clips.
     validation : sequence of str
         Names of the shots to keep out of training.
+
+    Returns
+    -------
+    training, validation : Clips
+        The rest, and those named.
 
     Raises
     ------
@@ -444,7 +547,18 @@ class Samples(Dataset[dict[str, Tensor]]):
         self._cycle: tuple[int, np.ndarray] | None = None
 
     def clip_of(self, number: int) -> int:
-        """The clip that a sample is made of."""
+        """The clip that a sample is made of.
+
+        Parameters
+        ----------
+        number : int
+            Of the sample.
+
+        Returns
+        -------
+        int
+            Index of the clip.
+        """
         cycle, place = divmod(number, len(self.clips))
         if self._cycle is None or self._cycle[0] != cycle:
             rng = np.random.default_rng((self.seed, 1, cycle))
@@ -517,7 +631,21 @@ class Samples(Dataset[dict[str, Tensor]]):
 
 
 def input_error(batch: dict[str, Tensor], loss: ImageLoss) -> Tensor:
-    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's estimate; ``(N,)``."""
+    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's estimate.
+
+    Parameters
+    ----------
+    batch : dict of Tensor
+        As from `Samples`, with N in front: ``color``, ``estimate``, ``confidence``, ``modulation``, ``exposure`` and
+        ``target``.
+    loss : ImageLoss
+        What it is measured with.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``, at least 1e-6.
+    """
     color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
     centre = color.shape[1] // 2
     mean = mean_of(color * confidence, confidence, color[:, centre])

@@ -250,7 +250,20 @@ class Filtered:
 
     @classmethod
     def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Filtered:
-        """Apply kernels of one or more resolutions to a window ``(N, T, C, H, W)``."""
+        """Apply kernels of one or more resolutions to a window.
+
+        Parameters
+        ----------
+        kernels : Tensor or Pyramid
+            From a model.
+        color : Tensor
+            ``(N, T, C, H, W)``, any linear quantity.
+
+        Returns
+        -------
+        Filtered
+            The sums of each frame.
+        """
         if isinstance(kernels, Tensor):
             return cls(*apply_kernels(kernels, color), kernels)
         sums = apply_kernels(kernels.kernels[0], color)
@@ -260,11 +273,37 @@ class Filtered:
         return cls(*sums, kernels, cls.of(rest, halve(color)), kernels.blends[0])
 
     def apply(self, layers: Tensor) -> Tensor:
-        """Filter other layers of the window, ``(N, T, C, H, W)``, with the same kernels; ``(N, C, H, W)``."""
+        """Filter other layers of the window with the same kernels.
+
+        Parameters
+        ----------
+        layers : Tensor
+            ``(N, T, C, H, W)``.
+
+        Returns
+        -------
+        Tensor
+            ``(N, C, H, W)``.
+        """
         return Filtered.of(self.kernels, layers).image(layers[:, layers.shape[1] // 2])
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
-        """Image that these frames give together, all without; fallback and epsilon as for `mean_of`."""
+        """Image that some frames give together.
+
+        Parameters
+        ----------
+        fallback : Tensor
+            ``(N, C, H, W)``, as for `mean_of`.
+        frames : sequence of int, optional
+            Which; all without.
+        epsilon : float
+            As for `mean_of`.
+
+        Returns
+        -------
+        Tensor
+            ``(N, C, H, W)``.
+        """
         numerators, denominators = self.numerators, self.denominators
         if frames is not None:
             numerators, denominators = numerators[:, list(frames)], denominators[:, list(frames)]
@@ -294,20 +333,58 @@ class Filtered:
 
 
 def check_threshold(relative: float) -> float:
-    """A threshold in units of 1/K, checked."""
+    """Check a threshold of kernels.
+
+    Parameters
+    ----------
+    relative : float
+        t·K, in units of the mean weight of K taps.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If it is outside [0, 1).
+    """
     if not 0 <= relative < 1:
         raise ValueError(f"threshold: expected 0 <= t·K < 1, so that t < 1/K, got t·K = {relative}")
     return relative
 
 
 def halve(image: Tensor) -> Tensor:
-    """Mean of 2×2 pixels of ``(..., H, W)``; H and W even."""
+    """Mean of 2×2 pixels.
+
+    Parameters
+    ----------
+    image : Tensor
+        ``(..., H, W)``, H and W even.
+
+    Returns
+    -------
+    Tensor
+        ``(..., H / 2, W / 2)``.
+    """
     halved: Tensor = functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
     return halved
 
 
 def double(image: Tensor) -> Tensor:
-    """Linear interpolation of ``(..., H, W)`` to twice the size."""
+    """Linear interpolation to twice the size.
+
+    Parameters
+    ----------
+    image : Tensor
+        ``(..., H, W)``.
+
+    Returns
+    -------
+    Tensor
+        ``(..., 2 H, 2 W)``.
+    """
     flat = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
     doubled: Tensor = flat.unflatten(0, image.shape[:-3])
     return doubled

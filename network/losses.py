@@ -31,6 +31,9 @@ Term = tuple[tuple[int, ...], float]
 #: which they give less than this is mostly its own unfiltered pixels, and dividing by its share stays harmless.
 SUBSET_EPSILON = 1e-3
 
+#: Floor of the denominator of `relmse`, in squared scales: what is darker than a third of the scale counts as that.
+RELMSE_FLOOR = 0.1
+
 
 class ImageLoss(Protocol):
     """An image loss: ``(N, C, H, W)`` prediction and target, ``(N,)`` scale, weights of the errors, to ``(N,)``."""
@@ -39,12 +42,41 @@ class ImageLoss(Protocol):
 
 
 def l1(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median)."""
+    """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median).
+
+    Parameters
+    ----------
+    prediction, target : Tensor
+        ``(N, C, H, W)`` radiance.
+    scale : Tensor
+        ``(N,)`` of the radiance.
+    weight : Tensor, optional
+        ``(N, C, H, W)`` factors of the errors.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
+    """
     return _mean((prediction - target).abs(), weight) / scale
 
 
 def smape(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
     """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2.
+
+    Parameters
+    ----------
+    prediction, target : Tensor
+        ``(N, C, H, W)`` radiance.
+    scale : Tensor
+        ``(N,)`` of the radiance.
+    weight : Tensor, optional
+        ``(N, C, H, W)`` factors of the errors.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
 
     Notes
     -----
@@ -64,21 +96,18 @@ def relmse(
     target: Tensor,
     scale: Tensor,
     weight: Tensor | None = None,
-    epsilon: float = 0.1,
     limit: float = 4.0,
 ) -> Tensor:
-    """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``.
+    """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``, ε = 0.1.
 
     Parameters
     ----------
     prediction, target : Tensor
-        ``(N, C, H, W)``.
+        ``(N, C, H, W)`` radiance.
     scale : Tensor
-        ``(N,)``.
+        ``(N,)`` of the radiance.
     weight : Tensor, optional
         ``(N, C, H, W)`` factors of the errors.
-    epsilon : float
-        Floor of the denominator in squared scales: pixels darker than ``sqrt(ε) s`` count by absolute error.
     limit : float
         Relative error beyond which the square goes on as a straight line (Huber), so that one firefly in a
         target is not the whole gradient. ``inf`` for the pure, unbiased square.
@@ -91,14 +120,15 @@ def relmse(
     Notes
     -----
     ``d̄`` is the mean of the prediction over the channels, without gradient: dividing by each channel would let
-    dark channels of saturated colors rule.
+    dark channels of saturated colors rule. Pixels darker than ``sqrt(ε) s``, a third of the scale, count by absolute
+    error.
 
     References
     ----------
     Lehtinen et al. 2018, "Noise2Noise", section 3.3, arXiv:1803.04189.
     """
     level = prediction.detach().mean(1, keepdim=True)
-    relative = (prediction - target) * torch.rsqrt(level**2 + epsilon * scale.view(-1, 1, 1, 1) ** 2)
+    relative = (prediction - target) * torch.rsqrt(level**2 + RELMSE_FLOOR * scale.view(-1, 1, 1, 1) ** 2)
     size = relative.abs()
     # Quadratic inside the limit, tangent outside. The minimum keeps an infinite limit from making inf − inf.
     inside = size.clamp(max=limit)
@@ -107,6 +137,20 @@ def relmse(
 
 def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
     """Squared error of what is seen: ``mean (T(d) − T(r))²``, ``T(x) = x / (x + s)``; for clean targets.
+
+    Parameters
+    ----------
+    prediction, target : Tensor
+        ``(N, C, H, W)`` radiance.
+    scale : Tensor
+        ``(N,)`` of the radiance.
+    weight : Tensor, optional
+        ``(N, C, H, W)`` factors of the errors.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
 
     Notes
     -----
@@ -123,20 +167,53 @@ def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
     """Pairs of one frame before the centre and one after: first + fourth and second + fifth of five.
 
-    Of any odd window of 2k + 1 frames the pairs ``(i, i + k + 1)``, i < k: each side frame occurs once.
+    Parameters
+    ----------
+    frames : int
+        Length of the window, odd: 2k + 1.
+
+    Returns
+    -------
+    list of (int, int)
+        ``(i, i + k + 1)``, i < k: each side frame occurs once.
     """
     half = frames // 2
     return [(i, i + half + 1) for i in range(half)]
 
 
 def spatial_terms(frames: int) -> list[Term]:
-    """One term, the whole window: how Vogels et al. 2018 train, and what a spatial loss says to a temporal network."""
+    """One term, the whole window: how Vogels et al. 2018 train, and what a spatial loss says to a temporal network.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the window.
+
+    Returns
+    -------
+    list of Term
+        One.
+    """
     return [(tuple(range(frames)), 1.0)]
 
 
 def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
     """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with a weight of its own.
 
+    Parameters
+    ----------
+    frames : int
+        Length of the window.
+    whole : float
+        Weight of the whole window; 0 leaves its term out.
+
+    Returns
+    -------
+    list of Term
+        The centre first.
+
+    Notes
+    -----
     The paper uses the whole window's term only to train a model further, and downweighted, because on its own it
     leads away from using time.
     """
@@ -148,7 +225,18 @@ def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
 
 
 def power_terms(frames: int) -> list[Term]:
-    """The paper's equation in full: every subset of the window but the empty one; 7 for three frames, 31 for five."""
+    """The paper's equation in full: every subset of the window but the empty one; 7 for three frames, 31 for five.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the window.
+
+    Returns
+    -------
+    list of Term
+        Of equal weight.
+    """
     sizes = range(1, frames + 1)
     return [(subset, 1.0) for size in sizes for subset in combinations(range(frames), size)]
 
@@ -235,9 +323,17 @@ def temporal_loss(
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio on ``x / (1 + x)``, ``(N, C, H, W)`` radiance to ``(N,)`` dB.
+    """Peak signal-to-noise ratio on ``x / (1 + x)``, whose limit, 1, is the peak.
 
-    Negative radiance counts as 0. The peak is 1, the limit of the curve.
+    Parameters
+    ----------
+    prediction, target : Tensor
+        ``(N, C, H, W)`` radiance; negative counts as 0.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)`` dB, at most 120.
     """
     error = functional.relu(prediction) / (1 + functional.relu(prediction))
     error = error - functional.relu(target) / (1 + functional.relu(target))

@@ -204,7 +204,9 @@ class RAUNet(UNet):
         ----------
         features : Tensor
             ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
-        confidence, threshold
+        confidence : Tensor
+            ``(N, T, 1, H, W)``.
+        threshold : float, optional
             As for `KernelHead.forward`.
 
         Returns
@@ -220,7 +222,18 @@ class RAUNet(UNet):
         return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
 
     def trunk(self, features: Tensor) -> Tensor:
-        """Features of an aligned window to those that kernels are predicted from, ``(T·N, C, H, W)``, time first."""
+        """Features of an aligned window to those that kernels are predicted from.
+
+        Parameters
+        ----------
+        features : Tensor
+            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+
+        Returns
+        -------
+        Tensor
+            ``(T·N, C, H, W)``, time first.
+        """
         x = _time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype)
         return self.scales(x, self.config.kernel.frames)[0]
 
@@ -263,11 +276,42 @@ class RAResNet(nn.Module):
         return 1
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Kernels of an aligned window; see `RAUNet.forward`."""
+        """Kernels of an aligned window.
+
+        Parameters
+        ----------
+        features : Tensor
+            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+        confidence : Tensor
+            ``(N, T, 1, H, W)``.
+        threshold : float, optional
+            As for `KernelHead.forward`.
+
+        Returns
+        -------
+        Tensor
+            ``(N, taps, H, W)`` float32, sums to 1 over the taps.
+
+        Raises
+        ------
+        ValueError
+            If frames or channels are not the model's, or height or width is no multiple of `multiple`.
+        """
         return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
 
     def trunk(self, features: Tensor) -> Tensor:
-        """See `RAUNet.trunk`."""
+        """Features of an aligned window to those that kernels are predicted from.
+
+        Parameters
+        ----------
+        features : Tensor
+            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+
+        Returns
+        -------
+        Tensor
+            ``(T·N, C, H, W)``, time first.
+        """
         x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
         section, skips = x, iter(self.skip)
         for count, block in enumerate(self.blocks, start=1):
@@ -309,7 +353,27 @@ class TKPCN(nn.Module):
         return 1
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Kernels of an aligned window; see `RAUNet.forward`."""
+        """Kernels of an aligned window.
+
+        Parameters
+        ----------
+        features : Tensor
+            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+        confidence : Tensor
+            ``(N, T, 1, H, W)``.
+        threshold : float, optional
+            As for `KernelHead.forward`.
+
+        Returns
+        -------
+        Tensor
+            ``(N, taps, H, W)`` float32, sums to 1 over the taps.
+
+        Raises
+        ------
+        ValueError
+            If frames or channels are not the model's, or height or width is no multiple of `multiple`.
+        """
         x = self.stem(_time_first(features, self.config.kernel, self.multiple, self.stem.weight.dtype))
         for block in self.blocks:
             x = block(x)
@@ -352,7 +416,27 @@ class MultiScale(nn.Module):
         return max(self.base.multiple, int(2 ** (self.config.scales - 1)))
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Pyramid:
-        """Kernels of an aligned window at each resolution; the arguments are those of `RAUNet.forward`."""
+        """Kernels of an aligned window at each resolution.
+
+        Parameters
+        ----------
+        features : Tensor
+            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+        confidence : Tensor
+            ``(N, T, 1, H, W)``.
+        threshold : float, optional
+            As for `KernelHead.forward`.
+
+        Returns
+        -------
+        Pyramid
+            Of as many resolutions as configured.
+
+        Raises
+        ------
+        ValueError
+            If frames or channels are not the model's, or height or width is no multiple of `multiple`.
+        """
         for name, length in zip(("height", "width"), features.shape[3:], strict=True):
             if length % self.multiple:
                 raise ValueError(f"features: expected a {name} that is a multiple of {self.multiple}, got {length}")
@@ -370,7 +454,18 @@ Model = RAUNet | RAResNet | TKPCN | MultiScale | Stabilizer
 
 
 def window_length(model: Model) -> int:
-    """Frames that a model looks at, T."""
+    """Length of the windows that a model looks at.
+
+    Parameters
+    ----------
+    model : Model
+        Any.
+
+    Returns
+    -------
+    int
+        T, odd.
+    """
     return model.config.frames if isinstance(model, Stabilizer) else model.config.kernel.frames
 
 
@@ -380,49 +475,132 @@ def fast(frames: int = 5, seed: int = 0) -> Stabilizer:
     Parameters
     ----------
     frames : int
-        Window length, odd; so for all presets.
+        Length of the windows, odd.
     seed : int
-        Of the initial weights; so for all presets.
+        Of the initial weights.
+
+    Returns
+    -------
+    Stabilizer
+        In training layout.
     """
     with _seeded(seed):
         return Stabilizer(StabilizerConfig(frames))
 
 
 def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, wider at coarse scales, which cost little: 0.5 M parameters."""
+    """Beside per-frame estimates, wider at coarse scales, which cost little: 0.5 M parameters.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    Stabilizer
+        In training layout.
+    """
     with _seeded(seed):
         return Stabilizer(StabilizerConfig(frames, widths=(16, 48, 80)))
 
 
 def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, on cells of 2×2 pixels: 0.4 M parameters."""
+    """Beside per-frame estimates, on cells of 2×2 pixels: 0.4 M parameters.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    Stabilizer
+        In training layout.
+    """
     with _seeded(seed):
         return Stabilizer(StabilizerConfig(frames, 2, (32, 48, 64)))
 
 
 def unet(frames: int = 5, seed: int = 0) -> RAUNet:
-    """From noisy frames alone, a small U-Net: 0.24 M parameters."""
+    """From noisy frames alone, a small U-Net: 0.24 M parameters.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    RAUNet
+        In training layout.
+    """
     with _seeded(seed):
         return RAUNet(RAUNetConfig(KernelConfig(frames)))
 
 
 def multiscale(frames: int = 5, seed: int = 0) -> MultiScale:
-    """From noisy frames alone: a four-scale U-Net with RA blocks at every scale, kernels at three resolutions."""
+    """From noisy frames alone: a four-scale U-Net with RA blocks at every scale, kernels at three resolutions.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    MultiScale
+        In training layout.
+    """
     with _seeded(seed):
         base = RAUNetConfig(KernelConfig(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
         return MultiScale(MultiScaleConfig(base))
 
 
-def paper(frames: int = 5, seed: int = 0, conv_size: int = 3) -> RAResNet:
-    """The paper's network: 24 blocks of width 80; conv_size is what the paper leaves open."""
+def paper(frames: int = 5, seed: int = 0) -> RAResNet:
+    """The paper's network: 24 blocks of width 80.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    RAResNet
+        In training layout.
+    """
     with _seeded(seed):
-        return RAResNet(RAResNetConfig(KernelConfig(frames), conv_size=conv_size))
+        return RAResNet(RAResNetConfig(KernelConfig(frames)))
 
 
-def tkpcn(frames: int = 5, seed: int = 0, conv_size: int = 3) -> TKPCN:
-    """The paper's baseline at the size of `paper`: no RA blocks, the temporal module of Vogels et al. 2018 instead."""
+def tkpcn(frames: int = 5, seed: int = 0) -> TKPCN:
+    """The paper's baseline at the size of `paper`: no RA blocks, the temporal module of Vogels et al. 2018 instead.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    TKPCN
+        In training layout.
+    """
     with _seeded(seed):
-        return TKPCN(TKPCNConfig(KernelConfig(frames), conv_size=conv_size))
+        return TKPCN(TKPCNConfig(KernelConfig(frames)))
 
 
 #: What can be asked for by name.
@@ -432,10 +610,20 @@ PRESETS: dict[str, Callable[..., Model]] = {
 
 
 def for_inference(model: Model, bfloat16: bool) -> Model:
-    """Lay a model out for running: channels last, no gradients, weights in bfloat16 if asked.
+    """Lay a model out for running: channels last, no gradients.
 
-    Changes the model given. bfloat16 pays only where the processor has it (AVX-512 bf16, AMX); the head's
-    arithmetic on kernels stays float32 either way.
+    Parameters
+    ----------
+    model : Model
+        Is changed.
+    bfloat16 : bool
+        Whether its weights become bfloat16. It pays only where the processor has it (AVX-512 bf16, AMX); the arithmetic
+        on kernels and weights of frames stays float32 either way.
+
+    Returns
+    -------
+    Model
+        The same.
     """
     dtype = torch.bfloat16 if bfloat16 else torch.float32
     for parameter in model.eval().requires_grad_(False).parameters():
@@ -444,7 +632,18 @@ def for_inference(model: Model, bfloat16: bool) -> Model:
 
 
 def channels_last(model: Model) -> Model:
-    """Lay the weights of the convolutions out with the channels last, as the activations are; in place."""
+    """Lay the weights of the convolutions out with the channels last, as the activations are.
+
+    Parameters
+    ----------
+    model : Model
+        Is changed.
+
+    Returns
+    -------
+    Model
+        The same.
+    """
     for parameter in model.parameters():
         if parameter.ndim == 4:
             parameter.data = parameter.data.to(memory_format=torch.channels_last)
@@ -469,6 +668,11 @@ def filter_window(
         Instead of the model's own.
     run : callable, optional
         Stands for the model where it is wrapped.
+
+    Returns
+    -------
+    Filtered or Stabilized
+        The sums of each frame.
 
     Raises
     ------

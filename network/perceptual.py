@@ -49,7 +49,18 @@ class VGG19(nn.Module):
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """``(N, 3, H, W)`` in [0, 1], 16 pixels or more, to layer 4 of block 3 and of block 5, both after the ReLU."""
+        """Features of pictures.
+
+        Parameters
+        ----------
+        picture : Tensor
+            ``(N, 3, H, W)`` in [0, 1], 16 pixels or more.
+
+        Returns
+        -------
+        tuple of Tensor
+            Layer 4 of block 3 and of block 5, both after the ReLU.
+        """
         x = self.features[: self.after_third]((picture - self.mean) / self.std)
         return x, self.features[self.after_third :](x)
 
@@ -127,7 +138,22 @@ class Perceptual(nn.Module):
         self.vgg = vgg
 
     def forward(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-        """See `network.losses.ImageLoss`."""
+        """The loss; see the class.
+
+        Parameters
+        ----------
+        prediction, target : Tensor
+            ``(N, C, H, W)`` radiance.
+        scale : Tensor
+            ``(N,)`` of the radiance.
+        weight : Tensor, optional
+            ``(N, C, H, W)`` factors of the errors.
+
+        Returns
+        -------
+        Tensor
+            ``(N,)``.
+        """
         images = torch.cat([prediction, target]).relu() / torch.cat([scale, scale]).view(-1, 1, 1, 1)
         distance = torch.zeros_like(scale)
         for features in self.vgg(images / (1 + images)):

@@ -78,7 +78,22 @@ class Stabilized:
     shares: tuple[Tensor, ...]
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
-        """Image that these frames give together, all without; see `network.kernels.mean_of`."""
+        """Image that some frames give together.
+
+        Parameters
+        ----------
+        fallback : Tensor
+            ``(N, C, H, W)``, as for `network.kernels.mean_of`.
+        frames : sequence of int, optional
+            Which; all without.
+        epsilon : float
+            As for `network.kernels.mean_of`.
+
+        Returns
+        -------
+        Tensor
+            ``(N, C, H, W)``.
+        """
         chosen = slice(None) if frames is None else list(frames)
         estimates, residuals, weights = (
             sums[:, chosen] for sums in (self.estimates, self.residuals, self.denominators)
@@ -87,7 +102,18 @@ class Stabilized:
         return mean_of(estimates, weights, fallback, epsilon) + shrink(residual, self.shares)
 
     def apply(self, layers: Tensor) -> Tensor:
-        """Average other layers of the window, ``(N, T, C, H, W)``, with the frames' weights; ``(N, C, H, W)``."""
+        """Average other layers of the window with the frames' weights.
+
+        Parameters
+        ----------
+        layers : Tensor
+            ``(N, T, C, H, W)``.
+
+        Returns
+        -------
+        Tensor
+            ``(N, C, H, W)``.
+        """
         return mean_of(layers * self.denominators, self.denominators, layers[:, layers.shape[1] // 2])
 
     def parts(self) -> tuple[Tensor, Tensor]:
@@ -100,7 +126,20 @@ class Stabilized:
 
 
 def shrink(residual: Tensor, shares: Sequence[Tensor]) -> Tensor:
-    """Multiply the bands of a Laplacian pyramid of ``(N, C, H, W)`` by shares of their sizes, finest first."""
+    """Multiply the bands of a Laplacian pyramid by shares.
+
+    Parameters
+    ----------
+    residual : Tensor
+        ``(N, C, H, W)``.
+    shares : sequence of Tensor
+        ``(N, 1, H / 2^s, W / 2^s)``, finest first; as many as there are bands.
+
+    Returns
+    -------
+    Tensor
+        As residual.
+    """
     share, *coarser = shares
     if not coarser:
         return share * residual
@@ -178,6 +217,11 @@ class Stabilizer(UNet):
             ``(N,)``.
         threshold : float, optional
             t·T in [0, 1). Default: the configured one.
+
+        Returns
+        -------
+        Stabilized
+            Weights and shares, applied.
 
         Raises
         ------

@@ -87,7 +87,18 @@ class TrainConfig:
             raise ValueError(f"whole, slope: expected whole >= 0 and slope >= 1, got {self.whole} and {self.slope}")
 
     def loss_terms(self, frames: int) -> list[losses.Term]:
-        """Terms of the loss for a window of so many frames."""
+        """Terms of the loss.
+
+        Parameters
+        ----------
+        frames : int
+            Length of the window.
+
+        Returns
+        -------
+        list of Term
+            As `terms` says.
+        """
         if self.terms == "temporal":
             return losses.temporal_terms(frames, self.whole)
         return losses.power_terms(frames) if self.terms == "power" else losses.spatial_terms(frames)
@@ -100,7 +111,24 @@ class TrainConfig:
 def predict(
     model: Model, batch: dict[str, Tensor], bfloat16: bool = False, run: Callable[..., Any] | None = None
 ) -> Filtered | Stabilized:
-    """Filter a batch of `Samples`; `run` stands for the model where it is wrapped."""
+    """Filter a batch.
+
+    Parameters
+    ----------
+    model : Model
+        Any.
+    batch : dict of Tensor
+        As from `network.clips.Samples`, with N in front.
+    bfloat16 : bool
+        Whether the convolutions run in bfloat16.
+    run : callable, optional
+        Stands for the model where it is wrapped.
+
+    Returns
+    -------
+    Filtered or Stabilized
+        The sums of each frame.
+    """
     with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
         return filter_window(model, batch, run=run)
 
@@ -113,6 +141,24 @@ def batch_loss(
     run: Callable[..., Any] | None = None,
 ) -> Tensor:
     """Training loss of a batch: log(1 + the temporal loss of each crop, relative to that of its clip's best input).
+
+    Parameters
+    ----------
+    model : Model
+        Any.
+    batch : dict of Tensor
+        As from `network.clips.Samples`, with N in front.
+    config : TrainConfig
+        Terms, slope and precision.
+    loss : ImageLoss
+        Of images.
+    run : callable, optional
+        Stands for the model where it is wrapped.
+
+    Returns
+    -------
+    Tensor
+        ``()``, the mean over the batch.
 
     Notes
     -----

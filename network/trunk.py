@@ -112,7 +112,17 @@ class Trunk(nn.Module):
         return (module for module in self.modules() if isinstance(module, nn.Conv2d))
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(N, C, H, W)`` in [0, 1], float32, to ``(N, 3, H, W)``.
+        """Denoise a picture.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(N, C, H, W)`` in [0, 1], float32.
+
+        Returns
+        -------
+        Tensor
+            ``(N, 3, H, W)``.
 
         Raises
         ------
@@ -131,7 +141,20 @@ class Trunk(nn.Module):
         return self.decode(bottleneck, skips)
 
     def encode(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Features of the coarsest scale, and what entered each of the finer ones, finest first."""
+        """Take a picture apart.
+
+        Parameters
+        ----------
+        x : Tensor
+            ``(N, C, H, W)``.
+
+        Returns
+        -------
+        bottleneck : Tensor
+            Features of the coarsest scale.
+        skips : list of Tensor
+            What entered each of the finer scales, finest first.
+        """
         skips = []
         for stage in self.encoder[:-1]:
             skips.append(x)
@@ -139,7 +162,20 @@ class Trunk(nn.Module):
         return self.encoder[-1](x), skips
 
     def decode(self, x: Tensor, skips: Sequence[Tensor]) -> Tensor:
-        """What `encode` returns to the picture."""
+        """Put a picture together again.
+
+        Parameters
+        ----------
+        x : Tensor
+            Features of the coarsest scale, from `encode`.
+        skips : sequence of Tensor
+            What entered the finer ones, from `encode`.
+
+        Returns
+        -------
+        Tensor
+            ``(N, 3, H, W)``.
+        """
         for stage, skip in zip(self.decoder, reversed(skips), strict=True):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = stage(torch.cat([x, skip], 1))
@@ -258,6 +294,18 @@ def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
 def make_trunk(tensors: dict[str, Tensor], where: str = "TZA") -> Trunk:
     """Trunk of the size that the tensors of a TZA file have, with their values.
 
+    Parameters
+    ----------
+    tensors : dict of Tensor
+        By name, in the file's order.
+    where : str
+        What an error calls the file.
+
+    Returns
+    -------
+    Trunk
+        Float32.
+
     Raises
     ------
     ValueError
@@ -283,6 +331,11 @@ def load_oidn(name: str) -> Trunk:
     ----------
     name : str
         Of `OIDN_WEIGHTS`.
+
+    Returns
+    -------
+    Trunk
+        Float32.
 
     Raises
     ------
@@ -360,13 +413,39 @@ def denoise_picture(trunk: Trunk, color: Tensor, albedo: Tensor | None = None, n
 
 @torch.inference_mode()
 def denoise_albedo(trunk: Trunk, albedo: Tensor) -> Tensor:
-    """Denoise albedo, ``(N, 3, H, W)`` in [0, 1], by itself, as OIDN does; see `denoise_picture`."""
+    """Denoise albedo by itself, as OIDN does; see `denoise_picture`.
+
+    Parameters
+    ----------
+    trunk : Trunk
+        With OIDN's weights for albedo.
+    albedo : Tensor
+        ``(N, 3, H, W)`` in [0, 1].
+
+    Returns
+    -------
+    Tensor
+        The same, without noise.
+    """
     return srgb_inverse(_run(trunk, [srgb_forward(_clip(albedo, 0, 1))]).clamp(0, 1))
 
 
 @torch.inference_mode()
 def denoise_normal(trunk: Trunk, normal: Tensor) -> Tensor:
-    """Denoise normals, ``(N, 3, H, W)`` in [−1, 1], by themselves, as OIDN does; see `denoise_picture`."""
+    """Denoise normals by themselves, as OIDN does; see `denoise_picture`.
+
+    Parameters
+    ----------
+    trunk : Trunk
+        With OIDN's weights for normals.
+    normal : Tensor
+        ``(N, 3, H, W)`` in [−1, 1].
+
+    Returns
+    -------
+    Tensor
+        The same, without noise.
+    """
     return _run(trunk, [_clip(normal, -1, 1) * 0.5 + 0.5]).clamp(0, 1) * 2 - 1
 
 
@@ -430,23 +509,67 @@ _WHITE = _E * log(65504 + _F) + _G
 
 
 def pu_forward(y: Tensor) -> Tensor:
-    """Map radiance in [0, ∞), 0.18 being middle gray, to a perceptually uniform scale; 65504 to 1."""
+    """Map radiance to a perceptually uniform scale.
+
+    Parameters
+    ----------
+    y : Tensor
+        Radiance in [0, ∞), 0.18 being middle gray.
+
+    Returns
+    -------
+    Tensor
+        65504, the greatest half, is 1.
+    """
     x = torch.where(y <= _Y1, _B * y.clamp_min(_Y0) ** _C + _D, _E * (y + _F).log() + _G)
     return torch.where(y <= _Y0, _A * y, x) / _WHITE
 
 
 def pu_inverse(x: Tensor) -> Tensor:
-    """Inverse of `pu_forward`."""
+    """Inverse of `pu_forward`.
+
+    Parameters
+    ----------
+    x : Tensor
+        On the perceptually uniform scale.
+
+    Returns
+    -------
+    Tensor
+        Radiance.
+    """
     x = x * _WHITE
     y = torch.where(x <= _X1, ((x.clamp_min(_X0) - _D) / _B) ** (1 / _C), ((x - _G) / _E).exp() - _F)
     return torch.where(x <= _X0, x / _A, y)
 
 
 def srgb_forward(y: Tensor) -> Tensor:
-    """sRGB curve (IEC 61966-2-1) of values in [0, 1]."""
+    """sRGB curve (IEC 61966-2-1).
+
+    Parameters
+    ----------
+    y : Tensor
+        Linear, in [0, 1].
+
+    Returns
+    -------
+    Tensor
+        Encoded, in [0, 1].
+    """
     return torch.where(y <= 0.0031308, 12.92 * y, 1.055 * y.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def srgb_inverse(x: Tensor) -> Tensor:
-    """Inverse of `srgb_forward`."""
+    """Inverse of `srgb_forward`.
+
+    Parameters
+    ----------
+    x : Tensor
+        Encoded, in [0, 1].
+
+    Returns
+    -------
+    Tensor
+        Linear, in [0, 1].
+    """
     return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)

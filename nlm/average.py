@@ -173,7 +173,27 @@ def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
 
 
 def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[Floats, Floats]:
-    """Return both as contiguous float32, or raise ValueError if their shapes do not fit."""
+    """Check that an aligned window and its weights fit each other.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) array
+        Aligned frames.
+    weight : (T, H, W) array
+        One for each of their pixels.
+    name : str
+        What an error calls the weights.
+
+    Returns
+    -------
+    window, weight : float32 array
+        Contiguous.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other, or T is even.
+    """
     if window.ndim != 4 or window.shape[0] % 2 == 0:
         raise ValueError(f"window: expected (frames, height, width, channels) with odd frames, got {window.shape}")
     if weight.shape != window.shape[:3]:

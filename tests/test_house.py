@@ -1,6 +1,7 @@
 """The walls of the house: who may import whom, and what starts without torch."""
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -74,6 +75,28 @@ def test_compiled_loops_leave_the_order_of_arithmetic_alone():
                 loops += 1
                 assert "fastmath" not in {keyword.arg for keyword in node.keywords}, f"{path.name}:{node.lineno}"
     assert loops > 10
+
+
+def public_functions(package: str) -> list[tuple[str, ast.FunctionDef]]:
+    """Functions that others may call, methods left out."""
+    paths = sorted((ROOT / package).rglob("*.py"))
+    nodes = [(path.name, node) for path in paths for node in ast.parse(path.read_text(encoding="utf-8")).body]
+    return [(name, node) for name, node in nodes if isinstance(node, ast.FunctionDef) and node.name[0] != "_"]
+
+
+@pytest.mark.parametrize("package", ["flow", "nlm", "network"])
+def test_docstrings_name_the_parameters_that_there_are(package):
+    """All of them, in order, wherever there is more than one, and no others."""
+    functions = public_functions(package)
+    assert len(functions) > 5
+    for name, node in functions:
+        wanted = [item.arg for item in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+        found = re.search(r"Parameters\n-+\n(.*?)(?=\n\n\w+\n-|\Z)", ast.get_docstring(node) or "", re.DOTALL)
+        if found is None:
+            assert len(wanted) < 2, f"{name}: {node.name} has no section of its parameters"
+            continue
+        heads = [line.partition(" : ")[0] for line in found[1].splitlines() if line and not line.startswith(" ")]
+        assert ", ".join(heads).split(", ") == wanted, f"{name}: {node.name}"
 
 
 def test_the_core_imports_no_peer_at_start():

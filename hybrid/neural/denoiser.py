@@ -1,6 +1,6 @@
-"""The boundary to torch: layout, tiles, precision; kernels go in, images come out.
+"""Running a network: an aligned window becomes tensors, tiles go through the network, a picture comes out.
 
-The only module outside `network` that imports torch. Here HWC becomes NCHW, and nowhere else at run time.
+HWC becomes NCHW here, for running, and for training alike.
 """
 
 from __future__ import annotations

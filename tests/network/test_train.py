@@ -210,7 +210,7 @@ def test_two_processes_train_as_one_does_on_the_whole_batch(tmp_path: Path) -> N
     ):
         # Means of two means, in float32, three steps of Adam; weights are stored as halves. They have moved by more.
         torch.testing.assert_close(p, q, rtol=2e-3, atol=2e-4, msg=name)
-        moved = max(moved, float((q - first).abs().max()))
+        moved = max(moved, float((q - first).abs().max().detach()))
     assert moved > 2e-3
 
 
@@ -328,15 +328,14 @@ def test_configurations_say_what_is_wrong(change: dict[str, object], message: st
 # Weights
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-def test_weights_come_back(tmp_path: Path, dtype: torch.dtype) -> None:
+def test_weights_come_back(tmp_path: Path) -> None:
     path, model = tmp_path / "w.safetensors", make_model()
-    save_model(path, model, {"hours": 0.5}, dtype)
+    save_model(path, model, {"hours": 0.5})
     loaded = load_model(path)
     assert loaded.config == model.config
     for (name, value), other in zip(model.named_parameters(), loaded.parameters(), strict=True):
         assert other.dtype == torch.float32, name
-        assert torch.equal(other, value.to(dtype).float())
+        assert torch.equal(other, value.half().float())
     assert load_notes(path) == {"hours": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["w.safetensors"]
 
