@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from copy import copy
 from dataclasses import dataclass, replace
 
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frames import Frame, Frames, MappedShot, Shot
 from hybrid.pipeline import DenoiseWindow
 from hybrid.plan import Rules
 
@@ -85,7 +84,7 @@ def measure_presets(
     reading = time.perf_counter() - start
     for preset in reversed(MODE_OF):
         denoise, radius = load(preset)
-        source = choose_estimate(estimate, part, mode=MODE_OF[preset])
+        source = choose_estimate(estimate, shot, mode=MODE_OF[preset])
         # A sequence's pictures are whole; what is measured is a part.
         given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
         aligner = Aligner(part, rules, radius=radius, estimates=given)
@@ -96,17 +95,14 @@ def measure_presets(
         yield Measured(preset, reading + max(seconds - reading, 0) / share)
 
 
-def cut_out(shot: Shot, side: int) -> Shot:
+def cut_out(shot: Frames, side: int) -> MappedShot:
     """The same shot, of each frame only the middle, at most `side` pixels wide and high."""
     height, width = shot.shape
     top, left = max(0, height - side) // 2, max(0, width - side) // 2
     here = slice(top, top + side), slice(left, left + side)
 
-    def read(number: int) -> Frame:
-        frame = shot.read(number)
+    def cut(frame: Frame) -> Frame:
         layers = {name: value[here] for name, value in vars(frame).items() if hasattr(value, "shape")}
         return replace(frame, **layers, aovs={name: layer[here] for name, layer in frame.aovs.items()})
 
-    part = copy(shot)
-    part.read = read  # type: ignore[method-assign]
-    return part
+    return MappedShot(shot, cut, shape=(min(side, height), min(side, width)))

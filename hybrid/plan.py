@@ -13,7 +13,7 @@ import numpy as np
 
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import FrameFacts, PairFacts
-from hybrid.files.frames import Shot
+from hybrid.files.frames import Frames
 from hybrid.files.sequences import format_frames
 
 STAGES = {
@@ -193,13 +193,13 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
 
 
 def plan_shot(
-    shot: Shot, rules: Rules | None = None, *, radius: int = RADIUS, advance: Callable[[], object] = lambda: None
+    shot: Frames, rules: Rules | None = None, *, radius: int = RADIUS, advance: Callable[[], object] = lambda: None
 ) -> Plan:
     """Plan every frame of a shot, and say on which frames each stage runs.
 
     Parameters
     ----------
-    shot : Shot
+    shot : Frames
         All of its frames are read.
     rules : Rules, optional
         What was forced.

@@ -24,7 +24,7 @@ from flow.warp import warp
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
 from hybrid.alignment.prepare import ALPHA, PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.transfer import measure_exposure, remodulate
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frames import Frame, Frames
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.fireflies import find_fireflies, recurring, replace_fireflies
@@ -195,7 +195,7 @@ class Aligner:
 
     Parameters
     ----------
-    shot : Shot
+    shot : Frames
         Read lazily.
     stages : collection of str, or callable
         Which stages run, on all frames; or what decides it for a window by what its frames show (`hybrid.plan.Rules`).
@@ -211,7 +211,7 @@ class Aligner:
 
     def __init__(
         self,
-        shot: Shot,
+        shot: Frames,
         stages: Collection[str] | Decide,
         *,
         radius: int = 2,

@@ -255,17 +255,16 @@ def denoise(
         radius=denoiser.radius,
         neural=True,
     )
+    counted = Breakdown()
     with _last_pass(job, passes) as last:
-        if breakdown is not None:
-            denoiser.breakdown = Breakdown()
-        _run(last)
+        _run(last if breakdown is None else replace(last, denoise=denoiser.counting(counted)))
     _look(opened, output, preview, fps, contact)
-    if breakdown is not None and denoiser.breakdown is not None:
+    if breakdown is not None:
         write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
-        if denoiser.breakdown.pixels:
+        if counted.pixels:
             title = "Weights in the frames made by this run"
             table = Table("frame", "average weight", "minimum", "maximum", title=title, title_justify="left")
-            for row in denoiser.breakdown.rows():
+            for row in counted.rows():
                 table.add_row(*row)
             Console().print(table)
         else:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.align import AlignedWindow, Aligner
 from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Plan, Rules, plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from hybrid.neural import Denoiser
 
 Array = NDArray[np.float32]
-Frames = Callable[[Shot], Iterator[tuple[int, Array]]]
+Run = Callable[[Shot], Iterator[tuple[int, Array]]]
 Maps = Callable[[Shot], Iterator[tuple[int, dict[str, Array]]]]
 DenoiseWindow = Callable[[AlignedWindow], Array]
 
@@ -54,7 +53,7 @@ class Method:
     sweep, base : what is varied, and the method that is varied.
     """
 
-    run: Frames
+    run: Run
     family: str
     maps: Maps | None = None
     cost: float | None = math.nan
@@ -95,7 +94,7 @@ def external(other: Shot) -> Method:
 
 
 @lru_cache(maxsize=1)
-def _plan(shot: Shot) -> Plan:
+def _plan(shot: Shot | MappedShot) -> Plan:
     """The shot's plan, made once, whoever asks: which way round a stage is."""
     return plan_shot(shot)
 
@@ -120,7 +119,7 @@ def _windows(
         runs = flip in _plan(seen).stages
         rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
     refine = partial(refine_flow, **(solver or {}))
-    aligner = Aligner(seen, rules, radius=radius, estimates=choose_estimate(source, seen).estimates, refine=refine)
+    aligner = Aligner(seen, rules, radius=radius, estimates=choose_estimate(source, shot).estimates, refine=refine)
     for number in shot.numbers:
         yield aligner.align(number)
 
@@ -217,7 +216,7 @@ def oidn(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> I
 
 def oidn_then_average(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
     """OIDN on each frame, then the aligned robust average of what it gave."""
-    aligner = Aligner(_changed(shot, partial(_denoised, quality=quality, prefilter=prefilter)), Rules())
+    aligner = Aligner(MappedShot(shot, partial(_denoised, quality=quality, prefilter=prefilter)), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(aligner.align(number))
 
@@ -274,16 +273,9 @@ def _finite(image: Array) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _blind(shot: Shot) -> Shot:
+def _blind(shot: Shot) -> MappedShot:
     """The shot without its vectors."""
-    return _changed(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
-
-
-def _changed(shot: Shot, change: Callable[[Frame], Frame]) -> Shot:
-    """The same shot, every frame changed as it is read."""
-    other = copy(shot)
-    other.read = lambda number: change(shot.read(number))  # type: ignore[method-assign]
-    return other
+    return MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
 
 
 def _aligned(family: str, denoise: DenoiseWindow, *, radius: int = 2, source: str = "none", **told: object) -> Method:

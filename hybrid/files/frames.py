@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -87,6 +88,56 @@ class Frame:
         if self.motion is None or self.motion_convention is None:
             return None
         return normalize_motion(self.motion, self.motion_convention, resolution=self.resolution)
+
+
+class Frames(Protocol):
+    """Numbered frames, read one by one: a `Shot`, a `MappedShot`, or frames in memory.
+
+    Attributes
+    ----------
+    numbers : tuple of int
+        The frames that were asked for, ascending.
+    step : int
+        Distance between neighbouring frames.
+    shape : (int, int)
+        Height and width of every frame.
+    """
+
+    numbers: tuple[int, ...]
+    step: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of every frame."""
+
+    def has(self, number: int) -> bool:
+        """Whether there is such a frame, asked for or not."""
+
+    def read(self, number: int) -> Frame:
+        """A frame."""
+
+
+class MappedShot:
+    """The frames of a shot, each changed as it is read.
+
+    Parameters
+    ----------
+    shot : Frames
+        Where they come from.
+    change : callable
+        From a frame to what it is to be; all of one size.
+    shape : (int, int), optional
+        Height and width of what it gives; those of the shot without.
+    """
+
+    def __init__(self, shot: Frames, change: Callable[[Frame], Frame], *, shape: tuple[int, int] | None = None) -> None:
+        self.numbers, self.step, self.shape = shot.numbers, shot.step, shape or shot.shape
+        self.has = shot.has
+        self._shot, self._change = shot, change
+
+    def read(self, number: int) -> Frame:
+        """A frame, changed."""
+        return self._change(self._shot.read(number))
 
 
 class Shot:

@@ -6,8 +6,10 @@ HWC becomes NCHW here, for running, and for training alike.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -30,6 +32,8 @@ HALO, HALO_OF_SHARES = 48, 128
 # Sides of a tile: halos take half as much again at 1920×1080 with the first, and the second needs half of the memory.
 TILE, SMALL_TILE = 640, 384
 PRECISIONS = ("auto", "float32", "bfloat16")
+
+Block = tuple[slice, slice]
 
 
 def shipped_weights(preset: str) -> Path:
@@ -122,10 +126,24 @@ class Denoiser:
         with self.timings.stage("network"):
             return self._run(aligned)
 
+    def counting(self, breakdown: Breakdown) -> Denoiser:
+        """Return the same denoiser, which counts the weights of the frames and adds what each contributes as layers."""
+        other = copy(self)
+        other.breakdown = breakdown
+        return other
+
     def _run(self, aligned: AlignedWindow) -> Denoised:
-        color = aligned.mixed(aligned.color)
-        height, width = color.shape[1:3]
-        layers = {"color": color, "confidence": aligned.confidence[..., None]}
+        layers = self._layers(aligned)
+        irradiance, aovs, parts = self._run_tiles(aligned, layers)
+        extra = {}
+        if parts is not None and self.breakdown is not None:
+            self.breakdown.add(parts[..., 3])
+            extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3])
+        return Denoised(irradiance * aligned.modulation, _modulated(aovs, aligned), extra)
+
+    def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
+        """What the network is given of a window, and all AOVs side by side."""
+        layers = {"color": aligned.mixed(aligned.color), "confidence": aligned.confidence[..., None]}
         if aligned.albedo is not None:
             layers["albedo"] = aligned.mixed(aligned.albedo)
         if aligned.normal is not None:
@@ -134,49 +152,59 @@ class Denoiser:
             layers["estimate"] = aligned.estimate
         if aligned.aovs:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
+        return layers
+
+    def _run_tiles(self, aligned: AlignedWindow, layers: dict[str, Array]) -> tuple[Array, Array, Array | None]:
+        """Irradiance (H, W, 3), AOVs side by side (H, W, C), and with a breakdown the frames' parts (T, H, W, 4)."""
+        color, centre = layers["color"], aligned.centre
+        frames, height, width = color.shape[:3]
+        others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
+        given = {name: layer for name, layer in layers.items() if name != "aovs"}
         exposure = torch.tensor([aligned.exposure], dtype=torch.float32)
-        irradiance = np.empty(color.shape[1:], np.float32)
-        channels = sum(layer.shape[-1] for layer in aligned.aovs.values())
-        filtered = np.empty((height, width, channels), np.float32)
-        parts = np.zeros((*color.shape[:3], 4), np.float32) if self.breakdown is not None else None
+        irradiance, filtered = np.empty_like(color[centre]), np.empty_like(others[centre])
+        parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in _tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if "skip" in aligned.stages and not aligned.variance[outer].any():
-                irradiance[inner] = color[aligned.centre][inner]
-                if filtered.size:
-                    filtered[inner] = layers["aovs"][aligned.centre][inner]
+                irradiance[inner], filtered[inner] = color[centre][inner], others[centre][inner]
                 if parts is not None:
-                    parts[aligned.centre][inner] = np.dstack(
-                        [irradiance[inner], np.ones_like(irradiance[inner][..., :1])]
-                    )
+                    parts[centre][inner] = np.dstack([irradiance[inner], np.ones_like(irradiance[inner][..., :1])])
                 continue
-            cut = {name: tensor_of(_pad(layer[:, *outer], self.model.multiple)) for name, layer in layers.items()}
-            others = cut.pop("aovs", None)
-            out, sums, aovs = denoise_tile(
-                self.model, {**cut, "exposure": exposure}, threshold=self.threshold, aovs=others
-            )
+            window = {name: self._cut(layer, outer) for name, layer in given.items()} | {"exposure": exposure}
+            aovs = self._cut(others, outer) if others.size else None
+            out, sums, through = denoise_tile(self.model, window, threshold=self.threshold, aovs=aovs)
             irradiance[inner] = image_of(out)[offset]
-            if aovs is not None:
-                filtered[inner] = image_of(aovs)[offset]
+            if through is not None:
+                filtered[inner] = image_of(through)[offset]
             if parts is not None:
                 tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).numpy()
                 parts[:, *inner] = tile[:, *offset]
-        aovs_out, start = {}, 0
-        for name, layer in aligned.aovs.items():
-            stop = start + layer.shape[-1]
-            light = filtered[..., start:stop]
-            if name == ALPHA:
-                aovs_out[name] = light
-            elif stop - start == 3:
-                aovs_out[name] = light * aligned.modulation
-            else:
-                aovs_out[name] = light * aligned.modulation.mean(axis=-1, keepdims=True)
-            start = stop
-        extra = {}
-        if parts is not None and self.breakdown is not None:
-            self.breakdown.add(parts[..., 3])
-            extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3])
-        return Denoised(irradiance * aligned.modulation, aovs_out, extra)
+        return irradiance, filtered, parts
+
+    def _cut(self, layer: Array, outer: Block) -> torch.Tensor:
+        return tensor_of(_pad(layer[:, *outer], self.model.multiple))
+
+
+def _modulated(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
+    """The AOVs of a window apart again, light times the albedo it was divided by."""
+    aovs, start = {}, 0
+    for name, layer in aligned.aovs.items():
+        stop = start + layer.shape[-1]
+        light, start = filtered[..., start:stop], stop
+        if name == ALPHA:
+            aovs[name] = np.where(_solid(layer[aligned.centre]), layer[aligned.centre], light)
+        elif light.shape[-1] == 3:
+            aovs[name] = light * aligned.modulation
+        else:
+            aovs[name] = light * aligned.modulation.mean(axis=-1, keepdims=True)
+    return aovs
+
+
+def _solid(alpha: Array) -> NDArray[np.bool_]:
+    """Where a pixel and all around it are wholly covered, or not at all: there is nothing to filter (H, W, 1)."""
+    box = np.ones((3, 3), np.uint8)
+    covered, empty = (cv2.erode((alpha[..., 0] == value).astype(np.uint8), box) > 0 for value in (1, 0))
+    return np.logical_or(covered, empty)[..., None]
 
 
 def tensor_of(window: Array) -> torch.Tensor:
@@ -193,9 +221,6 @@ def _pad(window: Array, multiple: int) -> Array:
     """Repeat the last row and column until height and width are what the network needs."""
     bottom, right = (-window.shape[1] % multiple, -window.shape[2] % multiple)
     return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
-
-
-Block = tuple[slice, slice]
 
 
 def _tiles(

@@ -31,6 +31,7 @@ class Reel:
 
     def __init__(self, frames: Iterable[Frame]) -> None:
         self._frames = {frame.number: frame for frame in frames}
+        self.numbers = tuple(self._frames)
 
     @property
     def shape(self) -> tuple[int, int]:

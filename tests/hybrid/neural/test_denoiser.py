@@ -1,6 +1,7 @@
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -109,6 +110,26 @@ def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
     assert alpha.shape == (SCENE.height, SCENE.width, 1)
     assert 0.4 <= alpha.min() <= alpha.max() <= 0.6  # kernels are convex
     assert alpha.std() < 0.5 * window.aovs["alpha"][2].std()
+
+
+def test_what_is_opaque_stays_opaque(tmp_path, weights):
+    """Interpolated outlines of neighbours used to leave 0.99 where the frame itself covers all."""
+
+    def disc(index, layers):
+        y, x = np.mgrid[: SCENE.height, : SCENE.width]
+        alpha = ((y - 15) ** 2 + (x - 20 - 1.4 * index) ** 2 < 90).astype(np.float32)[..., None]
+        layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
+
+    window = Aligner(open_shot(SCENE.write(tmp_path, edit=disc)), STAGES | {"alpha"}, estimates=OfWindows(DRAFT)).align(
+        SCENE.first + 2
+    )
+    given = window.aovs["alpha"][2][..., 0]
+    alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"][..., 0]
+    for value in (0, 1):
+        inside = cv2.erode((given == value).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        assert inside.any()
+        assert (alpha[inside] == value).all()
+    assert (alpha != given).any()  # outlines are filtered
 
 
 def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
