@@ -54,6 +54,30 @@ def modules_of_hybrid() -> dict[str, set[str]]:
     return graph
 
 
+def room_of(module: str) -> str:
+    """The room of a module: a package of arrays, or what stands directly in `hybrid`."""
+    return module.split(".")[0] if not module.startswith("hybrid.") else ".".join(module.split(".")[:2])
+
+
+def test_the_map_shows_who_imports_whom():
+    rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", (ROOT / "docs" / "architecture.md").read_text(), re.M)
+    drawn = {room: set() if names == "–" else set(names.split(", ")) for room, names in rows}
+    built: dict[str, set[str]] = {name: set() for name in ("flow", "nlm", "network")}
+    for path in (ROOT / "hybrid").rglob("*.py"):
+        own = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
+        if own == "hybrid":
+            continue
+        found = built.setdefault(own, set())
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:
+                full = [f"hybrid.{a.name}" for a in node.names] if node.module == "hybrid" else [node.module]
+                found |= {room_of(name) for name in full}
+            elif isinstance(node, ast.Import):
+                found |= {room_of(a.name) for a in node.names if a.name.split(".")[0] in OURS}
+        found.discard(own)
+    assert drawn == built
+
+
 def test_no_module_imports_in_a_circle():
     graph = modules_of_hybrid()
     assert graph["hybrid.cli"]

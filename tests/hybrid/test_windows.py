@@ -9,6 +9,7 @@ from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.estimates import OfFrames
+from hybrid.files import frames as frames_module
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import open_shot
 from hybrid.pipeline import Denoised, denoise_shot
@@ -107,6 +108,22 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
         assert one.parts[0].header["ravg/stages"] == other.parts[0].header["ravg/stages"]
         for name in one.channel_names:
             np.testing.assert_array_equal(one.channel(name), other.channel(name), err_msg=f"{path.name} {name}")
+
+
+def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_over(tmp_path, monkeypatch):
+    shot, read = open_shot(replace(CALM, frames=8).write(tmp_path / "in", edit=burnt)), []
+    whole = frames_module.read_exr
+
+    def counted(path, *, pixels=True, **options):
+        if pixels:
+            read.append(path.name)
+        return whole(path, pixels=pixels, **options)
+
+    monkeypatch.setattr(frames_module, "read_exr", counted)
+    for _ in denoise_shot(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
+        pass
+    assert len(read) == 16
+    assert {read.count(name) for name in read} == {2}
 
 
 def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
