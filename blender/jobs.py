@@ -41,7 +41,7 @@ class Job:
         if not there:
             raise FileNotFoundError(f"no frames {pattern}: render the animation first")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
-        frames = f"{scene.frame_start}-{scene.frame_end}x{scene.frame_step}"
+        frames = ",".join(map(str, sorted(there)))
         network = ["denoise", f"--preset={chosen.preset}"]
         how = ["pseudoref", "--estimate=auto"] if chosen.preset == "average" else network
         arguments = [self.executable, *how, pattern, f"--output={folder}", f"--frames={frames}"]

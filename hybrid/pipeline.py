@@ -42,6 +42,14 @@ DenoiseWindow = Callable[[AlignedWindow], Denoised]
 
 
 @dataclass(frozen=True)
+class Failed:
+    """A frame that could not be made, and why."""
+
+    number: int
+    error: Exception
+
+
+@dataclass(frozen=True)
 class Finished:
     """A frame that has been written, and what there is to say of it."""
 
@@ -68,8 +76,9 @@ def denoise_shot(
     attributes: Mapping[str, str] | None = None,
     rows: int | None = None,
     resume: bool = False,
+    keep_going: bool = False,
     timings: Timings | None = None,
-) -> Iterator[Finished]:
+) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
 
     Parameters
@@ -92,13 +101,15 @@ def denoise_shot(
         How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); all without. The result is the same.
     resume : bool
         Leave frames alone that are there, whole, with these attributes, and no older than what they are made from.
+    keep_going : bool
+        Where a frame cannot be made, or read, or written, go on with those after it.
     timings : Timings, optional
         Where to count the stages.
 
     Yields
     ------
-    Finished
-        After each frame has been written as a whole.
+    Finished or Failed
+        After each frame has been written as a whole; or with `keep_going`, when it is given up.
 
     Raises
     ------
@@ -122,25 +133,31 @@ def denoise_shot(
         if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
             yield Finished(number, path, resumed=True)
             continue
-        denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
-        plan = rules.plan(*aligner.facts_of(aligner.around(number, radius)))
-        with timings.stage("write"):
-            images = {"color": denoised.color, **denoised.aovs}
-            stages = {"ravg/stages": " ".join(sorted(plan.stages))}
-            clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages})
-        finished = Finished(
-            number=number,
-            path=path,
-            pixels=denoised.color[..., 0].size,
-            repaired=aligned.repaired,
-            fireflies=aligned.fireflies,
-            removed=aligned.removed,
-            outliers=aligned.outliers,
-            clamped=clamped,
-            plan=plan,
-        )
-        del denoised, aligned  # or they would still be there while the next window is made
-        yield finished
+        try:
+            denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
+            plan = rules.plan(*aligner.facts_of(aligner.around(number, radius)))
+            with timings.stage("write"):
+                images = {"color": denoised.color, **denoised.aovs}
+                stages = {"ravg/stages": " ".join(sorted(plan.stages))}
+                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages})
+            finished = Finished(
+                number=number,
+                path=path,
+                pixels=denoised.color[..., 0].size,
+                repaired=aligned.repaired,
+                fireflies=aligned.fireflies,
+                removed=aligned.removed,
+                outliers=aligned.outliers,
+                clamped=clamped,
+                plan=plan,
+            )
+            del denoised, aligned  # or they would still be there while the next window is made
+        except (ValueError, OSError) as error:
+            if not keep_going:
+                raise
+            yield Failed(number, error)
+        else:
+            yield finished
 
 
 @dataclass(frozen=True)

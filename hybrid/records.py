@@ -81,6 +81,11 @@ class Record:
         """The frames that this run has made."""
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "made"]
 
+    @property
+    def failed(self) -> list[int]:
+        """The frames that could not be made."""
+        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "failed"]
+
     def add(self, number: int, state: str, **facts: object) -> None:
         """Count a frame: its state is "made", "there" (an earlier run had made it) or "failed"."""
         self._document["frames"][str(number)] = {"state": state, **facts}

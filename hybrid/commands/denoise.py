@@ -22,6 +22,7 @@ from hybrid.commands.options import (
     AovOption,
     EstimateOption,
     FramesOption,
+    KeepGoingOption,
     KeepOption,
     LayerOption,
     MemoryOption,
@@ -70,6 +71,7 @@ def pseudoref(
     stages: OnOption = None,
     no_stages: OffOption = None,
     resume: ResumeOption = False,
+    keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
     max_pixels: PixelsOption = None,
 ) -> None:
@@ -90,6 +92,7 @@ def pseudoref(
     rules = replace(rules, off=rules.off | NEURAL_STAGES)
     chosen = CLASSICAL_PRESETS[preset]
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
+    _expect_all(opened, keep_going)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     _spare_input(opened, output, source.files, preview=preview, contact=contact)
@@ -110,6 +113,7 @@ def pseudoref(
             settings={"layer": layer, "profile": profile, "motion": motion, "estimate": estimate},
             rules=rules,
             resume=resume,
+            keep_going=keep_going,
             max_memory=max_memory,
         )
     )
@@ -191,6 +195,7 @@ def denoise(
         Literal["auto", "float32", "bfloat16"], typer.Option(help="of the network", rich_help_panel=RESOURCES)
     ] = "auto",
     resume: ResumeOption = False,
+    keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
     max_pixels: PixelsOption = None,
 ) -> None:
@@ -206,6 +211,7 @@ def denoise(
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
+    _expect_all(opened, keep_going)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -251,6 +257,7 @@ def denoise(
         settings=settings,
         rules=rules_of(stages, no_stages),
         resume=resume,
+        keep_going=keep_going,
         max_memory=max_memory,
         radius=denoiser.radius,
         neural=True,
@@ -289,6 +296,15 @@ def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictu
             check_preview(preview)
         if (contact := pictures.get("contact")) is not None:
             check_sheet(contact)
+
+
+def _expect_all(shot: Shot, keep_going: bool) -> None:
+    """Refuse to begin where a frame that was asked for is not there."""
+    from hybrid.files.sequences import format_frames
+
+    if shot.missing and not keep_going:
+        missing = format_frames(shot.missing)
+        raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
 
 
 def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str) -> str:
@@ -330,6 +346,7 @@ class Job:
     settings: Mapping[str, object]  # all options that the pixels depend on
     rules: Rules
     resume: bool
+    keep_going: bool
     max_memory: str | None
     radius: int = 2
     neural: bool = False
@@ -348,7 +365,8 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
         for number in range(1, passes):
             folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
             made = job.shot.around(job.radius * (passes - number))  # what the windows of later passes reach
-            _run(replace(job, shot=made, output=str(folder), command=f"{command}, pass {number} of {passes}"))
+            early = replace(job, shot=made, output=str(folder), keep_going=False)
+            _run(replace(early, command=f"{command}, pass {number} of {passes}"))
             job = replace(
                 job,
                 shot=job.shot.remade({n: output_path(folder, made, n) for n in made.numbers}),
@@ -361,13 +379,14 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
 def _run(job: Job) -> None:
     """Denoise the shot; leave a record beside the frames however it ends; stopped by Ctrl-C, say what is finished."""
     from hybrid.files.frames import output_path
+    from hybrid.files.sequences import format_frames
     from hybrid.records import Record, sequence_name
 
     first = output_path(job.output, job.shot, job.shot.numbers[0])
     record = Record(
         first.parent,
         sequence_name(first),
-        job.shot.numbers,
+        sorted((*job.shot.numbers, *job.shot.missing)),
         command=job.command,
         input=job.input,
         output=job.output,
@@ -375,6 +394,8 @@ def _run(job: Job) -> None:
         options=job.settings,
         estimate=job.source.name,
     )
+    for number in job.shot.missing:
+        record.add(number, "failed", error="there is no such frame")
 
     def report() -> None:
         count = f"{len(record.done)} of {len(job.shot)} frames are finished"
@@ -396,6 +417,9 @@ def _run(job: Job) -> None:
     if there := len(record.done) - len(record.made):
         LOG.info(f"{there} of {len(job.shot)} frames were finished already")
     LOG.info(f"wrote {len(record.made)} frames to {first.parent} and a record of them to {record.path}")
+    if record.failed:
+        LOG.error(f"{len(record.failed)} frames could not be made: {format_frames(record.failed)}")
+        raise typer.Exit(1)
 
 
 def _denoise(job: Job, record: Record) -> None:
@@ -404,7 +428,7 @@ def _denoise(job: Job, record: Record) -> None:
 
     from hybrid.files.layers import summarize_layers
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
-    from hybrid.pipeline import denoise_shot
+    from hybrid.pipeline import Failed, denoise_shot
     from hybrid.plan import NEURAL_STAGES, Plan, merge
 
     shot, source, timings = job.shot, job.source, job.timings
@@ -442,10 +466,19 @@ def _denoise(job: Job, record: Record) -> None:
         attributes=attributes,
         rows=rows,
         resume=job.resume,
+        keep_going=job.keep_going,
         timings=timings,
     )
     started = time.perf_counter()
     for finished in frames:
+        if isinstance(finished, Failed):
+            words = one_line(finished.error)
+            LOG.error(f"frame {finished.number}: {words}")
+            record.add(finished.number, "failed", error=words)
+            record.write(timings)
+            progress.advance(message=f"frame {finished.number} failed", frame=finished.number)
+            started = time.perf_counter()
+            continue
         pixels += finished.pixels
         outliers += finished.outliers
         if finished.plan is not None:

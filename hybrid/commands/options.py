@@ -108,6 +108,15 @@ ResumeOption = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+KeepGoingOption = Annotated[
+    bool,
+    typer.Option(
+        "--keep-going",
+        envvar="RAVG_KEEP_GOING",
+        help="make all frames that can be made, and end with 1 where one could not; else end at the first such frame",
+        rich_help_panel=OUTPUT,
+    ),
+]
 MemoryOption = Annotated[
     str | None,
     typer.Option(

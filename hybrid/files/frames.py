@@ -150,6 +150,8 @@ class Shot:
     step
         Distance between neighbouring frames: 1, or 2 where only every second frame was rendered. A renderer's
         motion vectors usually span one frame, whatever the step.
+    missing
+        The frames that were asked for and are not there.
     warnings
         One line each.
 
@@ -186,7 +188,7 @@ class Shot:
         if not self.numbers:
             folder = next(iter(files.values())).parent
             raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
-        asked = [number for number in wanted if number not in files]
+        self.missing = tuple(asked := [number for number in wanted if number not in files])
         if missing := format_frames(asked) if asked else name_holes(files, self.step) if frames is None else "":
             self.warnings.append(f"missing frames {missing}: the windows beside them are narrower")
         self._files = dict(files)
@@ -254,6 +256,7 @@ class Shot:
             keep=self._keep,
             max_pixels=self._max_pixels,
         )
+        made.missing = self.missing
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
         return made

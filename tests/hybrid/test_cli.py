@@ -107,14 +107,43 @@ def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
     assert "not run: warp (forced" in " ".join(err.split())
 
 
-def test_a_hole_is_a_warning(shot_folder, tmp_path, capsys):
-    (shot_folder / "shot.1002.exr").unlink()
-    # Frames 1001 and 1003 alone would be every second frame; the range says that 1002 was expected.
-    code, _, err = run(
-        capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--frames", "1001-1003"
-    )
+def test_a_hole_is_a_warning_where_nobody_asked_for_it(shot_folder, tmp_path, capsys):
+    (shot_folder / "shot.1003.exr").rename(shot_folder / "shot.1004.exr")
+    code, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft")
     assert code == 0
-    assert "warning: missing frames 1002" in err
+    assert "warning: missing frames 1003" in err
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_a_frame_that_was_asked_for_and_is_not_there_is_an_error(shot_folder, tmp_path, capsys, keep_going):
+    (shot_folder / "shot.1002.exr").unlink()
+    words = ["pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--frames", "1001-1003"]
+    code, _, err = run(capsys, *words, *(["--keep-going"] if keep_going else []))
+    assert code == 1
+    made = {path.name for path in (tmp_path / "o").glob("*.exr")}
+    if keep_going:
+        assert made == {"shot.1001.exr", "shot.1003.exr"}
+        assert err.splitlines()[-1] == "error: 1 frames could not be made: 1002"
+    else:
+        assert made == set()
+        assert "frames 1002 were asked for and are not there" in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_frames_that_cannot_be_made_are_told_by_the_exit_code(tmp_path, capsys, keep_going):
+    folder, out = Scene(frames=9).write(tmp_path / "in"), tmp_path / "out"
+    victim = folder / "shot.1004.exr"
+    victim.write_bytes(victim.read_bytes()[:-2000])
+    options = ["--preset", "draft", *(["--keep-going"] if keep_going else [])]
+    assert run(capsys, "pseudoref", folder, "-o", out, *options)[0] == 1
+    made = {int(path.name.split(".")[1]) for path in out.glob("*.exr")}
+    code, text, _ = run(capsys, "status", out, "--json")
+    document = json.loads(text)
+    assert code == 1
+    assert set(document["finished"]) == made
+    assert {int(number) for number in document["failed"]} == set(range(1001, 1010)) - made
+    # Whatever window the damaged frame is in cannot be made; those beyond can.
+    assert made == ({1001, 1007, 1008, 1009} if keep_going else {1001})
 
 
 def one_line_error(capsys, *arguments):
