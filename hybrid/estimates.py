@@ -7,9 +7,10 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,12 +140,15 @@ class EstimateSource:
         Why this one.
     files : Shot or None
         The finished sequence it is read from, if it is one.
+    kept : tuple of Path
+        Where pictures are kept, if they are.
     """
 
     name: str
     estimates: Estimates | None
     reason: str
     files: Shot | None = None
+    kept: tuple[Path, ...] = ()
 
 
 def choose_estimate(
@@ -189,7 +193,7 @@ def _choose(spec: str, shot: Shot, own: ClassicalPreset, kept: str | None, mode:
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if _has_oidn():
-            return EstimateSource(mode, _oidn(mode, shot, kept), "OIDN is installed")
+            return _oidn(mode, shot, kept, "OIDN is installed")
         return EstimateSource("nlm", OfWindows(own), "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
@@ -198,7 +202,7 @@ def _choose(spec: str, shot: Shot, own: ClassicalPreset, kept: str | None, mode:
     if spec in OIDN_MODES:
         if not _has_oidn():
             raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
-        return EstimateSource(spec, _oidn(spec, shot, kept), "asked for")
+        return _oidn(spec, shot, kept, "asked for")
     sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
@@ -210,12 +214,15 @@ def _has_oidn() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
-def _oidn(mode: str, shot: Shot, kept: str | None) -> Estimates:
+def _oidn(mode: str, shot: Shot, kept: str | None, reason: str) -> EstimateSource:
     run: Callable[[Frame], Array] = partial(estimate_oidn, **OIDN_MODES[mode])
+    places: dict[int, Path] = {}
     if kept is not None:
-        output_path(kept, shot, shot.numbers[0], beside=True)  # refuses one name for several frames before any is made
-        run = partial(_run_or_read, run=run, shot=shot, kept=kept)
-    return OfCleanGuides(run, HOLDS) if OIDN_MODES[mode].get("clean") else OfFrames(run, HOLDS)
+        # Of neighbours too that were not asked for.
+        places = {number: output_path(kept, shot, number, beside=True) for number in shot.files}
+        run = partial(_run_or_read, run=run, shot=shot, places=places)
+    estimates = OfCleanGuides(run, HOLDS) if OIDN_MODES[mode].get("clean") else OfFrames(run, HOLDS)
+    return EstimateSource(mode, estimates, reason, kept=tuple(places.values()))
 
 
 def _checked(found: Array | None, frame: Frame) -> Array | None:
@@ -249,9 +256,9 @@ def _denoised(sequence: Shot, number: int) -> Array:
     return found.color if found.estimate is None else found.estimate
 
 
-def _run_or_read(frame: Frame, *, run: Callable[[Frame], Array], shot: Shot, kept: str) -> Array:
+def _run_or_read(frame: Frame, *, run: Callable[[Frame], Array], shot: Shot, places: Mapping[int, Path]) -> Array:
     """What an earlier run has left on disk, or what is left there now."""
-    path = output_path(kept, shot, frame.number)
+    path = places[frame.number]
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         shot.write(path, frame.number, {"color": run(frame)})

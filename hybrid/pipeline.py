@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
+from hybrid.estimates import EstimateSource
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.frames import Shot, output_path
-from hybrid.files.replace import remove_leftovers
+from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.plan import Plan, Rules
 from hybrid.timing import Timings
 
@@ -63,6 +64,40 @@ class Finished:
     clamped: int = 0
     plan: Plan | None = None  # which stages ran, and why
     resumed: bool = False  # it was there already
+
+
+def check_written(
+    shot: Shot,
+    output: str | Path,
+    source: EstimateSource,
+    inputs: Mapping[str, str | Path | None],
+    others: Mapping[str, Path | None],
+) -> None:
+    """Refuse a run that would write over anything it reads, or over a file that is somebody else's.
+
+    Parameters
+    ----------
+    shot : Shot
+        What is denoised.
+    output : str or Path
+        As for `denoise_shot`.
+    source : EstimateSource
+        Whose files are read, or kept.
+    inputs, others : mapping of str to Path or None
+        What else is read, and what else is written: what it is called → where.
+
+    Raises
+    ------
+    ValueError, OSError
+        As `hybrid.files.replace.check_outputs`.
+    """
+    written = [("output", output_path(output, shot, number)) for number in shot.numbers]
+    written += [("keep-estimates", path) for path in source.kept]
+    written += [(what, path) for what, path in others.items() if path is not None]
+    read = [("frame", path) for path in shot.files.values()]
+    read += [("estimate", path) for path in (source.files.files.values() if source.files else ())]
+    read += [(what, Path(path)) for what, path in inputs.items() if path is not None]
+    check_outputs(written, read)
 
 
 def denoise_shot(

@@ -18,7 +18,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from hybrid.files.replace import remove_leftovers, replace_file
+from hybrid.files.replace import remove_leftovers, write_file
 from hybrid.files.sequences import format_frames
 from hybrid.timing import Timings, peak_memory
 
@@ -48,10 +48,12 @@ class Record:
     Raises
     ------
     ValueError
-        If another file has the record's name.
+        If another file has the record's name, or the folder for records is a link.
     """
 
     def __init__(self, folder: Path, name: str, numbers: Sequence[int], **facts: object) -> None:
+        if (folder / FOLDER).is_symlink():
+            raise ValueError(f"{folder / FOLDER} is a link, expected a folder for records, or none yet")
         self.path = folder / FOLDER / f"{name or NAMELESS}.{_range(numbers)}.json"
         if self.path.exists() and _read(self.path) is None:
             raise ValueError(f"{self.path} is there and no record of ravg, expected a name of its own")
@@ -106,8 +108,7 @@ class Record:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(self.path.parent)
             self._written = True
-        with replace_file(self.path) as temporary:
-            temporary.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+        write_file(self.path, json.dumps(document, indent=1, default=str) + "\n")
 
 
 @dataclass

@@ -136,12 +136,30 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
         "notes": json.dumps(dict(notes or {})),
     }
     path = Path(path)
-    partial = path.with_name(path.name + ".part")
+    partial = new_partial(path)
     try:
         save_file(tensors, partial, metadata)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def new_partial(path: Path) -> Path:
+    """An empty file beside `path` to write to, to be renamed to it; what an earlier process has left there is gone.
+
+    It is made anew, so that nothing is written through a link that somebody has put there.
+
+    Raises
+    ------
+    OSError
+        If `path` is there and no file, or the folder cannot be written to.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path} is there and no file, expected a file or a new name")
+    partial = path.with_name(path.name + ".part")
+    partial.unlink(missing_ok=True)
+    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+    return partial
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from network import losses
+from network.checkpoint import new_partial
 from network.kernels import mean_of
 from network.losses import ImageLoss
 
@@ -259,7 +260,7 @@ def write_shards(
     waiting: list[dict[str, Tensor]] = []
 
     def flush() -> None:
-        path = folder / f"{shot}.{len(partial):04d}.safetensors.part"
+        path = new_partial(folder / f"{shot}.{len(partial):04d}.safetensors")
         metadata = {"format": FORMAT, "version": VERSION, "shot": shot, "samples": json.dumps(list(samples))}
         save_file({name: torch.stack([clip[name] for clip in waiting]) for name in waiting[0]}, path, metadata)
         partial.append(path)

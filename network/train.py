@@ -26,7 +26,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from network import losses
-from network.checkpoint import describe, save_model
+from network.checkpoint import describe, new_partial, save_model
 from network.clips import Clips, SamplerConfig, Samples, whole_frames
 from network.kernels import Filtered, mean_of
 from network.models import Model, channels_last, filter_window
@@ -407,7 +407,7 @@ def _write_state(
     progress: dict[str, Any],
 ) -> None:
     """Everything the next step depends on; replaces the last state whole."""
-    partial = path.with_name(path.name + ".part")
+    partial = new_partial(path)
     state = {
         "identity": identity,
         "model": model.state_dict(),

@@ -108,8 +108,11 @@ def compare(
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]
-    if output is not None:
-        _need_page()  # before anything runs
+    if output is not None:  # before anything runs
+        _need_page()
+        from hybrid.comparison.report import check_report
+
+        check_report(output, [folder / "results.json" for folder in beside or ()])
     others = [read_comparison(folder / "results.json") for folder in beside or ()]
     if shot is None or not reference:
         if not others or shot is not None or reference:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hybrid.commands.log import LOG, Progress, one_line, print_table, printable
+from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable
 from hybrid.commands.options import (
     OUTPUT,
     RESOURCES,
@@ -95,7 +95,7 @@ def pseudoref(
     _expect_all(opened, keep_going)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
-    _spare_input(opened, output, source.files, preview=preview, contact=contact)
+    _spare_inputs(opened, output, source, {"profile": profile}, preview=preview, contact=contact)
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -232,7 +232,8 @@ def denoise(
         source = EstimateSource("none", None, "this network takes none")
     else:
         raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
-    _spare_input(opened, output, source.files, preview=preview, contact=contact, breakdown=breakdown)
+    inputs = {"weights": path, "profile": profile}
+    _spare_inputs(opened, output, source, inputs, preview=preview, contact=contact, breakdown=breakdown)
     settings = {
         "layer": layer,
         "profile": profile,
@@ -279,18 +280,14 @@ def denoise(
         LOG.info(f"wrote {breakdown}")
 
 
-def _spare_input(shot: Shot, output: str, estimates: Shot | None = None, **pictures: Path | None) -> None:
-    """Refuse, before anything is made, to write over a frame of the shot or of estimates, and what is no preview."""
-    from hybrid.files.frames import output_path
+def _spare_inputs(
+    shot: Shot, output: str, source: EstimateSource, inputs: Mapping[str, str | Path | None], **pictures: Path | None
+) -> None:
+    """Refuse, before anything is made, to write over anything that is read, and what is no preview."""
+    from hybrid.pipeline import check_written
     from hybrid.preview import check_preview, check_sheet
 
-    for number in shot.numbers:
-        frame = output_path(output, shot, number)
-        if estimates is not None and estimates.reads(frame):
-            raise ValueError(f"output {str(frame)!r} would overwrite a frame of the estimate")
-    for option, path in pictures.items():
-        if path is not None and shot.reads(path):
-            raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
+    check_written(shot, output, source, inputs, {**pictures, "log-file": log_file()})
     with usage():
         if (preview := pictures.get("preview")) is not None:
             check_preview(preview)

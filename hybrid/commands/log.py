@@ -127,6 +127,12 @@ def start_log(
         LOG.addHandler(handler)
 
 
+def log_file() -> Path | None:
+    """The file that records go into, if any."""
+    names = [handler.stream.name for handler in LOG.handlers if isinstance(handler, _Lines) and handler.own]
+    return Path(names[0]) if names else None
+
+
 def end_log() -> None:
     """Take the handlers away; the bar of a terminal goes with them."""
     for handler in tuple(LOG.handlers):
@@ -175,7 +181,7 @@ class _Lines(logging.StreamHandler[Any]):
 
     def __init__(self, stream: Any, *, own: bool = False) -> None:
         super().__init__(stream)
-        self._own = own
+        self.own = own
         self._percent = -1
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -190,7 +196,7 @@ class _Lines(logging.StreamHandler[Any]):
         """A log that cannot be written any more does not end the work."""
 
     def close(self) -> None:
-        if self._own:
+        if self.own:
             self.stream.close()
         super().close()
 

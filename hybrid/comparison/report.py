@@ -34,6 +34,7 @@ from hybrid.comparison.results import (
     format_seconds,
     format_value,
     format_worth,
+    is_comparison,
     join,
     markdown_table,
     pareto_front,
@@ -44,6 +45,7 @@ from hybrid.comparison.results import (
     to_json,
     to_plain_numbers,
 )
+from hybrid.files.replace import check_outputs, write_file
 
 Array = NDArray[np.float32]
 
@@ -112,13 +114,14 @@ def write_report(
         "stages": [asdict(s) for s in stage_values(results)],
     }
     folder = Path(folder)
+    check_report(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "results.json").write_text(to_json(document, indent=1), encoding="utf-8")
-    (folder / "results.csv").write_text(to_csv(results, metrics), encoding="utf-8")
-    (folder / "results.md").write_text(markdown_table([comparison, *others], cost), encoding="utf-8")
+    write_file(folder / "results.json", to_json(document, indent=1))
+    write_file(folder / "results.csv", to_csv(results, metrics))
+    write_file(folder / "results.md", markdown_table([comparison, *others], cost))
     layout = chart.lay_out(results, charted[0], cost) if charted else None
     if layout is not None:
-        cv2.imwrite(str(folder / "chart.png"), chart.to_pixels(layout))
+        write_file(folder / "chart.png", cv2.imencode(".png", chart.to_pixels(layout))[1].tobytes())
     present = [r for r in results if r.absent_reason is None]
     text = page.render(
         "report.html",
@@ -150,8 +153,29 @@ def write_report(
         ),
     )
     path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
+    write_file(path, text)
     return path
+
+
+def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
+    """Refuse a folder where a report would be written over something that is none.
+
+    Parameters
+    ----------
+    folder : Path
+        As for `write_report`.
+    inputs : sequence of Path
+        Files that are read meanwhile.
+
+    Raises
+    ------
+    ValueError, OSError
+        If the folder has a file that a report would replace and that no comparison has left there, or that is read.
+    """
+    check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
+    there = [folder / name for name in FILES if (folder / name).exists()]
+    if there and not is_comparison(folder / "results.json"):
+        raise ValueError(f"{there[0]} is there, and of no earlier comparison: expected another folder")
 
 
 def report_images(
@@ -208,6 +232,9 @@ def _check(
 
 
 # What the templates ask for
+
+# What a report consists of.
+FILES = ("report.html", "results.json", "results.csv", "results.md", "chart.png")
 
 
 @dataclass(frozen=True)

@@ -439,6 +439,15 @@ def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
     return out.getvalue()
 
 
+def is_comparison(path: Path) -> bool:
+    """Whether a file is there that `read_comparison` can read."""
+    try:
+        read_comparison(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def read_comparison(path: Path) -> Comparison:
     """Read the ``results.json`` that `hybrid.comparison.report.write_report` has left.
 

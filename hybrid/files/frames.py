@@ -19,6 +19,7 @@ from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
+from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
 from nlm.variance import variance_from_halves
 
@@ -223,12 +224,14 @@ class Shot:
         left, top, right, bottom = self._canvas
         return bottom - top + 1, right - left + 1
 
+    @property
+    def files(self) -> Mapping[int, Path]:
+        """Frame number → file, of all there are, asked for or not."""
+        return self._files
+
     def reads(self, path: Path) -> bool:
         """Whether this is one of the shot's files, asked for or not, by whatever name."""
-        if path.resolve() in self._resolved:
-            return True
-        # Another name for the same file: a hard link, or another case where the disk takes no notice of it.
-        return _identity(path) in self._identities
+        return not self._identities.isdisjoint(identities(path))
 
     def around(self, reach: int) -> Shot:
         """The same shot, asked also for the frames up to `reach` steps before and after, where they are there."""
@@ -413,12 +416,8 @@ class Shot:
         return read_exr(path, pixels=pixels, max_pixels=self._max_pixels)
 
     @cached_property
-    def _identities(self) -> frozenset[tuple[int, int]]:
-        return frozenset(known for file in self._files.values() if (known := _identity(file)) is not None)
-
-    @cached_property
-    def _resolved(self) -> frozenset[Path]:
-        return frozenset(file.resolve() for file in self._files.values())
+    def _identities(self) -> frozenset[object]:
+        return frozenset(known for file in self.files.values() for known in identities(file))
 
     @cached_property
     def _size(self) -> tuple[int, int]:
@@ -543,15 +542,6 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
     if shot.reads(path):
         raise ValueError(f"output {str(path)!r} would overwrite an input frame")
     return path
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """What the operating system knows a file by; None where there is none."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
 
 
 def _size(part: Part) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.files.replace import replace_file
+from hybrid.files.replace import write_file
 
 Array = NDArray[np.float32]
 
@@ -24,5 +24,4 @@ def write_png(path: Path, picture: NDArray[Any]) -> None:
     """Write (H, W, 3), encoded, in [0, 1], with 8 bits; as a whole or not at all, and make the folder."""
     _, data = cv2.imencode(".png", np.round(picture[..., ::-1] * 255).astype(np.uint8))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    write_file(path, data.tobytes())

@@ -1,18 +1,78 @@
-"""Files that are whole or not there at all."""
+"""Files that are whole or not there at all, and never somebody else's.
+
+Whatever a command writes goes through here: `check_outputs` before anything is made, `replace_file` when it is.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
-import platform
 import re
+import secrets
 import shutil
-import threading
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # What this process is writing to just now.
 _unfinished: set[Path] = set()
+# Of a file's name so much is kept in its temporary name that folders which take 255 bytes take that too.
+_KEPT = 24
+_TEMPORARY = re.compile(r"\..+\.ravg-[0-9a-f]{16}\.tmp", re.DOTALL)
+_LOCK = ".lock"
+
+
+def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[str, Path]]) -> None:
+    """Refuse to write over anything that is read, over what is no file, or to one place twice.
+
+    Parameters
+    ----------
+    outputs : iterable of (str, Path)
+        What is to be written: what to call it (``output``, ``preview``), and where.
+    inputs : iterable of (str, Path)
+        What is read, whether or not in this very run: what to call it, and where.
+
+    Raises
+    ------
+    ValueError
+        If an output is an input by whatever name (links, another spelling), or another output.
+    OSError
+        If an output is a folder, a device, a pipe or a socket.
+    """
+    names: dict[object, str] = {}
+    for what, path in inputs:
+        names |= dict.fromkeys(identities(path), f"{what} {str(path)!r}")
+    written: dict[object, tuple[str, Path]] = {}
+    for what, path in outputs:
+        _refuse_other_kinds(path)
+        for name in identities(path):
+            if name in names:
+                raise ValueError(f"{what} {str(path)!r} would overwrite an input: {names[name]}")
+            other = written.setdefault(name, (what, path))
+            if other != (what, path):
+                raise ValueError(f"{what} {str(path)!r} would overwrite {other[0]} {str(other[1])!r}")
+
+
+def identities(path: Path) -> Iterator[object]:
+    """All that a file may be recognized by: its path without links, and what the operating system knows it by."""
+    # Not Path.resolve, which raises RuntimeError for a loop of links.
+    yield os.path.realpath(path)
+    yield os.path.join(os.path.realpath(path.parent), path.name)  # a link itself, which would be replaced
+    with suppress(OSError):
+        status = path.stat()
+        yield status.st_dev, status.st_ino
+
+
+def _refuse_other_kinds(path: Path) -> None:
+    """Raise OSError for what is there and no file."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # nothing there, or a link to nothing, which is replaced
+        return
+    if not stat.S_ISREG(mode):
+        kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
+        raise OSError(f"{path} is a {kinds.get(stat.S_IFMT(mode), 'device')}, expected a file or a new name")
 
 
 @contextmanager
@@ -22,35 +82,44 @@ def replace_file(path: Path) -> Iterator[Path]:
     Parameters
     ----------
     path : Path
-        The file to be written, in a folder that exists.
+        The file to be written, in a folder that exists. If it is a link, the link is replaced, not what it leads to.
 
     Yields
     ------
     Path
-        An empty file. It is removed where the block raises, a keyboard interrupt included.
+        An empty file, which only this process knows of. It is removed where the block raises, a keyboard interrupt
+        included.
 
     Raises
     ------
     OSError
-        If the folder cannot be written to; it names `path`, not the temporary file.
+        If the folder cannot be written to, `path` is there and no file, or somebody has put another file in the
+        place of the temporary one. It names `path`, not the temporary file.
     """
-    temporary = _temporary(path)
-    _unfinished.add(temporary)
+    _refuse_other_kinds(path)
+    temporary, descriptor = _create(path)
     try:
-        with temporary.open("wb"):
-            pass
         yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
+        os.fsync(descriptor)
+        if not _is(temporary, descriptor):
+            raise OSError(f"{path}: cannot write: its temporary file was exchanged")
         os.replace(temporary, path)
     except BaseException as error:
         with suppress(OSError):
-            temporary.unlink()
+            if _is(temporary, descriptor):
+                temporary.unlink()
         if isinstance(error, OSError) and error.filename == str(temporary):
             raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
         raise
     finally:
         _unfinished.discard(temporary)
+        os.close(descriptor)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file as a whole or not at all, text as UTF-8; errors are those of `replace_file`."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextmanager
@@ -69,14 +138,19 @@ def temporary_folder(path: Path) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
-    folder = _temporary(path)
+    # Folders cannot be locked everywhere (NFS), so the lock is a file beside it, which is there for longer.
+    lock, descriptor = _create(path, _LOCK)
+    folder = lock.with_name(lock.name.removesuffix(_LOCK))
     _unfinished.add(folder)
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(mode=0o777)
         yield folder
     finally:
         _remove(folder)
         _unfinished.discard(folder)
+        _remove(lock)
+        _unfinished.discard(lock)
+        os.close(descriptor)
 
 
 def remove_unfinished() -> None:
@@ -86,35 +160,85 @@ def remove_unfinished() -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of processes that were killed: those of this host whose process is no more."""
-    pattern = re.compile(rf"\..*\.{re.escape(_host())}-(\d+)-\d+\.tmp")
+    """Remove temporary files and folders of processes that are no more.
+
+    Each is locked by who writes it, and the kernel drops the lock with the process. That holds across containers,
+    which may give two processes one number, and where the folder's file system locks for all its clients (NFS), across
+    machines. Where it does not lock at all, nothing is removed.
+    """
     for path in folder.iterdir():
-        if (match := pattern.fullmatch(path.name)) and not _runs(int(match[1])):
-            _remove(path)
+        if not _TEMPORARY.fullmatch(path.name.removesuffix(_LOCK)):
+            continue
+        lock = path.with_name(path.name + _LOCK) if path.is_dir() and not path.is_symlink() else path
+        with _abandoned(lock) as abandoned:
+            if abandoned:
+                _remove(path)
+                _remove(lock)
 
 
-def _temporary(path: Path) -> Path:
-    # Host, process and thread: whoever else writes the same frame at the same time has a file of its own.
-    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{threading.get_ident()}.tmp")
+def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
+    """A new file with a name beside `path` that nobody can guess, open and locked."""
+    while True:
+        # Unguessable, and never opened where something is: nobody can have put a link there to be written through.
+        name = f".{path.name[:_KEPT]}.ravg-{secrets.token_hex(8)}.tmp{suffix}"
+        temporary = path.with_name(name)
+        _unfinished.add(temporary)
+        try:
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+            descriptor = os.open(temporary, flags, 0o666)
+        except OSError as error:
+            _unfinished.discard(temporary)
+            if isinstance(error, FileExistsError):
+                continue
+            raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
+        locked = True
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:  # somebody who clears up was faster
+            locked = False
+        except OSError:  # this file system has no locks: then nobody clears up
+            pass
+        if locked and _is(temporary, descriptor):
+            return temporary, descriptor
+        _unfinished.discard(temporary)
+        os.close(descriptor)
+        _remove(temporary)
+
+
+def _is(path: Path, descriptor: int) -> bool:
+    """Whether a path still leads to an open file."""
+    try:
+        here = path.lstat()
+    except FileNotFoundError:
+        return False
+    return os.path.samestat(here, os.fstat(descriptor))
+
+
+@contextmanager
+def _abandoned(lock: Path) -> Iterator[bool]:
+    """Tell whether nobody holds the lock on a file, or the file is gone; nobody can take it within the block."""
+    try:
+        descriptor = os.open(lock, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        yield True
+        return
+    except OSError:  # a link, or not ours
+        yield False
+        return
+    free = True
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            free = False
+        yield free
+    finally:
+        os.close(descriptor)
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         with suppress(OSError):
             path.unlink()
-
-
-def _host() -> str:
-    return re.sub(r"\W", "_", platform.node()) or "host"
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # it runs, and is somebody else's
-        pass
-    return True

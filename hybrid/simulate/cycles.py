@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import secrets
 import sys
 import tempfile
 import time
@@ -189,7 +190,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
 
 def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
     """Render the current frame to `path`, with half buffers and an unblurred guide pass where called for."""
-    partial = path.with_name(f".{os.getpid()}-{path.name}")
+    partial = _new_partial(path)
     try:
         if shot.halves:
             first = samples - samples // 2
@@ -222,13 +223,20 @@ def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, see
         partial.unlink(missing_ok=True)
 
 
+def _new_partial(path: Path) -> Path:
+    """A new file to render to, by a name that nobody can guess, so that Blender writes through nobody's link."""
+    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}-{path.name}")
+    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+    return partial
+
+
 def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -> None:
     """Render two independent halves of the reference, and their mean; of all only the colour is kept."""
     halves, half = [], max(shot.reference // 2, 1)
     for name in ("reference_a", "reference_b"):
         path = folder / f"{name}.{frame:04d}.exr"
         if not path.exists():
-            partial = path.with_name(f".{os.getpid()}-{path.name}")
+            partial = _new_partial(path)
             render_frame(scene, partial, half, frame_seed(shot.seed, name, frame))
             header, channels = read_channels(partial)
             color = {key: values for key, values in channels.items() if ".Combined." in key}
@@ -237,7 +245,7 @@ def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -
         halves.append(read_channels(path))
     (header, a), (_, b) = halves
     path = folder / f"reference.{frame:04d}.exr"
-    partial = path.with_name(f".{os.getpid()}-{path.name}")
+    partial = _new_partial(path)
     mean = {name: ((a[name].astype(np.float32) + b[name]) / 2).astype(np.float16) for name in a}
     OpenEXR.File({**header, SAMPLES: str(2 * half)}, mean).write(str(partial))
     partial.rename(path)

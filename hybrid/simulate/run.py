@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hybrid.files.replace import write_file
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, spp_of
 
 NO_BLENDER = (
@@ -136,9 +137,7 @@ def _read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
 
 
 def _write_meta(meta: dict[str, Any], out: Path) -> None:
-    partial = out / ".meta.json"
-    partial.write_text(json.dumps(meta, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    partial.replace(out / "meta.json")
+    write_file(out / "meta.json", json.dumps(meta, indent=1, ensure_ascii=False) + "\n")
 
 
 class _Worker:

@@ -121,21 +121,43 @@ def test_a_stop_is_heard_in_the_midst_of_compiled_code(tmp_path, number):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_process_has_left_is_removed_and_nothing_else(tmp_path):
-    host = platform.node().replace("-", "_").replace(".", "_")
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    leftover = tmp_path / f".shot.0001.exr.{host}-{gone.pid}-1.tmp"
-    others = [
-        tmp_path / f".shot.0001.exr.{host}-{os.getpid()}-1.tmp",  # is being written
-        tmp_path / f".shot.0001.exr.elsewhere-{gone.pid}-1.tmp",  # perhaps, on another machine
-        tmp_path / ".tmp",
-        tmp_path / "shot.0001.exr",
-    ]
-    for path in (leftover, *others):
+WRITING = """
+import pathlib, sys, time
+from hybrid.files.replace import replace_file
+with replace_file(pathlib.Path(sys.argv[1])) as temporary:
+    temporary.write_bytes(b"half")
+    print("begun", flush=True)
+    time.sleep(600)
+"""
+
+
+def begin(script, path):
+    """A process that is in the midst of writing."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    child = subprocess.Popen(
+        [sys.executable, "-c", script, str(path)], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout.readline() == "begun\n"
+    return child
+
+
+def test_what_a_killed_process_has_left_is_removed_and_nothing_else(tmp_path, monkeypatch):
+    """Ownership was told by host name and process number: two containers cleared each other's live files."""
+    child = begin(WRITING, tmp_path / "shot.0001.exr")
+    others = [tmp_path / name for name in (".tmp", "shot.0002.exr", ".shot.0001.exr.ravg-0.tmp")]
+    for path in others:
         path.touch()
+    link = tmp_path / f".shot.0001.exr.ravg-{16 * '0'}.tmp"
+    link.symlink_to(others[1])
+    # Another container: no process here has that number, and the host is called the same.
+    monkeypatch.setattr(os, "kill", lambda *_: (_ for _ in ()).throw(ProcessLookupError()))
     remove_leftovers(tmp_path)
-    assert sorted(tmp_path.iterdir()) == sorted(others)
+    assert len(list(tmp_path.iterdir())) == 5
+    monkeypatch.undo()
+    child.kill()
+    child.communicate()
+    remove_leftovers(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted([*others, link])
 
 
 LONG = """
@@ -150,16 +172,14 @@ with temporary_folder(pathlib.Path(sys.argv[1])) as folder:
 
 def test_the_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
     """Folders between passes used to bear names that no later run knew."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    words = [sys.executable, "-c", LONG, str(tmp_path / "pass1")]
-    child = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
-    assert child.stdout.readline() == "begun\n"
+    child = begin(LONG, tmp_path / "pass1")
     with temporary_folder(tmp_path / "pass1") as ours:
-        assert len(list(tmp_path.iterdir())) == 2
+        assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
         child.kill()
         child.communicate()
         remove_leftovers(tmp_path)
-        assert list(tmp_path.iterdir()) == [ours]
+        assert [path for path in tmp_path.iterdir() if path.is_dir()] == [ours]
+        assert len(list(tmp_path.iterdir())) == 2  # and its lock
         (ours / "shot.0001.exr").touch()
         remove_unfinished()  # as Ctrl-C does where Python does not hear it
         assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -186,3 +187,44 @@ def test_tiled_files_stay_tiled(tmp_path):
     header = read_exr(tmp_path / "out" / "a.exr", pixels=False).parts[0].header
     assert header["type"] == OpenEXR.tiledimage
     assert header["tiles"].xSize == 8
+
+
+def test_side_outputs_spare_all_that_is_read_and_all_that_is_made(tmp_path, capsys):
+    """Previews and breakdowns went over frames of estimates, over weights, over each other and over devices."""
+    folder, estimates = (
+        Scene(frames=2).write(tmp_path / "in"),
+        Scene(frames=2).write(tmp_path / "estimates", clean=True),
+    )
+    out = tmp_path / "out"
+    profile = tmp_path / "mine.toml"
+    profile.write_text('[layers]\ncolor = ["Combined"]\n')
+    (tmp_path / "soft.png").symlink_to(estimates / "shot.1001.exr")
+    os.link(profile, tmp_path / "hard.png")
+    (tmp_path / "null.png").symlink_to("/dev/null")
+    (tmp_path / "folder.png").mkdir()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "null.png"}
+    words = ["pseudoref", str(folder), "-o", str(out), "--preset", "draft", "--estimate", str(estimates)]
+    words += ["--profile", str(profile)]
+    same = str(tmp_path / "same.png")
+    for more, said in [
+        (["--preview", str(tmp_path / "soft.png")], "preview .* would overwrite an input: estimate"),
+        (["--contact", str(tmp_path / "hard.png")], "contact .* would overwrite an input: profile"),
+        (["--preview", str(tmp_path / "null.png")], "null.png is a device"),
+        (["--preview", str(tmp_path / "folder.png")], "folder.png is a folder"),
+        (["--preview", same, "--contact", same], "contact .* would overwrite preview"),
+        (["-o", str(estimates)], "output .* would overwrite an input: estimate"),
+    ]:
+        assert main([*words, *more]) == 1
+        assert re.search(said, capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in before} == before
+    assert not out.exists()
+
+
+def test_a_folder_for_records_that_leads_elsewhere_is_refused(tmp_path, capsys):
+    folder, out = Scene(frames=1).write(tmp_path / "in"), tmp_path / "out"
+    for path in (out, tmp_path / "elsewhere"):
+        path.mkdir()
+    (out / "ravg").symlink_to(tmp_path / "elsewhere")
+    assert main(["pseudoref", str(folder), "-o", str(out), "--preset", "draft"]) == 1
+    assert "is a link, expected a folder for records" in capsys.readouterr().err
+    assert list((tmp_path / "elsewhere").iterdir()) == []

@@ -399,3 +399,16 @@ def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
     save_file(tensors, bad, metadata)
     with pytest.raises(ValueError, match=r"stem\.bias: expected shape \(8,\), got None"):
         load_model(bad)
+
+
+def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path) -> None:
+    """The name to write to first is known to everybody; a link of that name led elsewhere."""
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    path = tmp_path / "w.safetensors"
+    path.with_name("w.safetensors.part").symlink_to(precious)
+    save_model(path, make_model())
+    assert precious.read_text() == "precious"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["precious", "w.safetensors"]
+    with pytest.raises(OSError, match="is there and no file"):
+        save_model(tmp_path, make_model())

@@ -21,7 +21,7 @@ import pytest
 
 from hybrid.comparison import chart, embedding
 from hybrid.comparison.embedding import ReportImages
-from hybrid.comparison.report import write_report
+from hybrid.comparison.report import check_report, write_report
 from hybrid.comparison.results import (
     COSTS,
     METRICS,
@@ -657,3 +657,16 @@ def test_text_is_readable_on_light_and_dark(page: Any, scheme: str) -> None:
         low, high = sorted((luminance(ink), luminance(paper)))
         assert (high + 0.05) / (low + 0.05) >= 4.5, selector  # WCAG 2 AA
     assert (luminance(pairs[0][2]) < 0.1) == (scheme == "dark")
+
+
+def test_what_no_comparison_has_left_is_not_written_over(tmp_path: Path) -> None:
+    comparison = Comparison("Hall", RESULTS)
+    (tmp_path / "results.csv").write_text("mine")
+    with pytest.raises(ValueError, match=r"results\.csv is there, and of no earlier comparison"):
+        write_report(tmp_path, comparison)
+    assert [path.name for path in tmp_path.iterdir()] == ["results.csv"]
+    (tmp_path / "results.csv").unlink()
+    write_report(tmp_path, comparison)
+    write_report(tmp_path, comparison)  # over its own
+    with pytest.raises(ValueError, match=r"report .* would overwrite an input: results"):
+        check_report(tmp_path, [tmp_path / "results.json"])
