@@ -178,7 +178,7 @@ def lens(rng: Rng, frames: range) -> None:
 def closeup(rng: Rng, frames: range) -> None:
     """Build a close-up: a furry animal that turns its head, cut glass, and the wheels of a clockwork."""
     sky("courtyard", 0.35, 2.2)
-    leather = two_tone("leather", (0.05, 0.02, 0.012), (0.13, 0.05, 0.028), scale=350, detail=3, bump=0.0004,
+    leather = two_tone("leather", (0.05, 0.02, 0.012), (0.13, 0.05, 0.028), scale=300, detail=1, bump=0.0004,
                        roughness=(0.35, 0.6))  # fmt: skip
     add_box((0, 0.3, -0.01), (1.6, 1.4, 0.02), leather)
     velvet = plain("velvet", (0.05, 0.012, 0.02), Roughness=0.9, Sheen_Weight=0.6)
@@ -202,11 +202,14 @@ def closeup(rng: Rng, frames: range) -> None:
         place(turned(outline, black, 28, "eye"), where).parent = head
     place(head, (-0.032, 0.012, 0), (0, 0, 0.35))
     move(head, frames, spin=(0, 0, 0.028))
-    # The clockwork: three wheels in mesh, a plate behind them, a spring barrel.
-    brass = two_tone("brass", (0.55, 0.32, 0.1), (0.88, 0.6, 0.24), scale=900, stretch=(10, 1, 1), Metallic=1.0,
-                     roughness=(0.16, 0.34), bump=0.00002)  # fmt: skip
-    steel = two_tone("steel", (0.42, 0.43, 0.45), (0.7, 0.7, 0.72), scale=1200, stretch=(1, 14, 1), Metallic=1.0,
-                     roughness=(0.1, 0.26), bump=0.00002)  # fmt: skip
+    # The clockwork: three wheels in mesh before a plate, brushed no finer than a pixel, or it would glitter.
+    brushed: dict[str, Any] = {"scale": 700, "detail": 2, "bump": 0.00002, "Metallic": 1.0}
+    brass = two_tone(
+        "brass", (0.55, 0.32, 0.1), (0.88, 0.6, 0.24), stretch=(10, 1, 1), roughness=(0.2, 0.38), **brushed
+    )
+    steel = two_tone(
+        "steel", (0.42, 0.43, 0.45), (0.7, 0.7, 0.72), stretch=(1, 14, 1), roughness=(0.15, 0.3), **brushed
+    )
     plate = bevelled((0.03, 0.052, 0.03), (0.075, 0.004, 0.06), steel, 0.001, "plate")
     plate.rotation_euler.z = -0.12
     frame = add_object("clockwork", None, None)
@@ -246,9 +249,8 @@ def closeup(rng: Rng, frames: range) -> None:
     place(turned(tumbler, clear, name="tumbler"), (0.04, -0.018, 0))
     drink = [(0, 0.0028), (0.01075, 0.0031), (0.0117, 0.0145), (0, 0.0145)]
     place(turned(drink, amber, name="drink"), (0.04, -0.018, 0))
-    add_lamp("AREA", (-0.35, -0.28, 0.42), 6, 0.22, (0, 0, 0.02), (1, 0.93, 0.84))
-    add_lamp("AREA", (0.32, 0.2, 0.22), 3.2, 0.06, (-0.01, 0, 0.03), (0.8, 0.9, 1.0))
-    add_lamp("POINT", (-0.13, 0.16, 0.12), 1.0, 0.006, (0, 0, 0), (1, 0.7, 0.4))
+    add_lamp("AREA", (-0.35, -0.28, 0.42), 6.5, 0.3, (0, 0, 0.02), (1, 0.93, 0.84))
+    add_lamp("AREA", (0.3, 0.2, 0.22), 4.5, 0.2, (-0.01, 0, 0.03), (0.8, 0.9, 1.0))
     camera = look((0.012, -0.62, 0.17), (0.003, 0, 0.0255), 31)
     camera.data.clip_start = 0.01
     move(camera, frames, velocity=(0.0002, 0, 0))
