@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from itertools import product
 
 import cv2
 import numpy as np
 from numba import njit
 
-from flow.guide import estimate_noise, make_guide, median_luminance, pair_guides, tone_map
+from flow.guide import estimate_noise, median_luminance, pair_guides, smooth_tones, tone_map
 from flow.motion import UNITS, VERTICAL, MotionConvention, normalize_motion
 from flow.tvl1 import dense_flow
 from flow.warp import locate
@@ -42,6 +41,8 @@ EXACT = 0.05
 OVERRULES = 0.5
 # Vectors explain at least this share of what a flow found in the pictures does, where that explains as much.
 WORTH = 0.5
+# Neighbours that differ in more of the picture than this may be two shots.
+CUT = 0.5
 # The flow is found in pictures of at most so many pixels.
 FOUND_PIXELS = 2**17
 # Vectors may span half a frame (a shutter of 180 degrees) or two, and point either way.
@@ -104,6 +105,8 @@ class Choice:
         Parts that nobody has stated and these pictures do not settle: they are as was assumed.
     trials : tuple of Trial
         What was tried on all patches, best first.
+    unrelated : tuple of int
+        Indices of pairs that show something else in each frame, as at a cut. They are not asked, unless all are such.
     """
 
     convention: MotionConvention | None
@@ -112,17 +115,18 @@ class Choice:
     found: float | None
     open: tuple[str, ...]
     trials: tuple[Trial, ...]
+    unrelated: tuple[int, ...] = ()
 
 
 def choose_convention(
-    pairs: Sequence[FramePair], assumed: MotionConvention, settled: Collection[str] = PARTS
+    pairs: Iterable[FramePair], assumed: MotionConvention, settled: Collection[str] = PARTS
 ) -> Choice:
     """Find the reading of motion vectors that explains the pictures.
 
     Parameters
     ----------
-    pairs : sequence of FramePair
-        At least one.
+    pairs : iterable of FramePair
+        At least one, all of one size. Of each no more is kept than its luminance and the patches' vectors.
     assumed : MotionConvention
         What is taken where the pictures cannot tell.
     settled : collection of str
@@ -146,9 +150,12 @@ def choose_convention(
     less what noise alone gives; patches that leave the picture say nothing. One reading is clearly better than another
     if the mean difference, patch by patch, is three times its standard error.
     """
-    if not pairs:
+    patches = [_Patches(pair) for pair in pairs]
+    if not patches:
         raise ValueError("pairs is empty, expected at least one")
-    trials, settled = _Trials(pairs), frozenset(settled)
+    unrelated = tuple(index for index, pair in enumerate(patches) if pair.unrelated())
+    related = [pair for index, pair in enumerate(patches) if index not in unrelated]
+    trials, settled = _Trials(related or patches), frozenset(settled)
     chosen = trials.best(assumed, settled)
     harms = trials.clearly_better(None, chosen)
     if settled and (harms or not trials.good(chosen)):
@@ -170,6 +177,7 @@ def choose_convention(
         found=found,
         open=trials.open_parts(chosen, settled) if believed else (),
         trials=trials.table(),
+        unrelated=unrelated,
     )
 
 
@@ -177,7 +185,7 @@ class _Patches:
     """A pair of frames, seen through patches at the same places of both."""
 
     def __init__(self, pair: FramePair) -> None:
-        self.pair = pair
+        self.resolution, self.frames = pair.resolution, pair.frames
         exposure = median_luminance(pair.earlier)
         self.pictures = tuple(tone_map(color, exposure) for color in (pair.earlier, pair.later))
         height, width = self.pictures[0].shape
@@ -195,23 +203,18 @@ class _Patches:
         self.all = np.arange(len(self.rows))
         self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all)
         self.few = _informative(self.still, SCREENED)
-
-    @cached_property
-    def _vectors(self) -> list[np.ndarray]:
-        return [self.gather(layer, self.all) for layer in (self.pair.earlier_vectors, self.pair.later_vectors)]
-
-    @cached_property
-    def _few_vectors(self) -> list[np.ndarray]:
-        return [self.gather(layer, self.few) for layer in (self.pair.earlier_vectors, self.pair.later_vectors)]
+        layers = pair.earlier_vectors, pair.later_vectors
+        self.vectors = [self.gather(layer, self.all) for layer in layers]
+        self.few_vectors = [self.gather(layer, self.few) for layer in layers]
 
     def costs(self, convention: MotionConvention, *, few: bool = False) -> np.ndarray:
         """What a reading leaves of each patch, or of the `few` that tell most, in [0, 1]; NaN outside."""
         sides = []
-        for centre, vectors in enumerate(self._few_vectors if few else self._vectors):
-            motion = normalize_motion(vectors, convention, resolution=self.pair.resolution)
+        for centre, vectors in enumerate(self.few_vectors if few else self.vectors):
+            motion = normalize_motion(vectors, convention, resolution=self.resolution)
             toward = motion.to_previous if centre else motion.to_next
             if toward is not None:
-                flow = toward.flow * np.float32(self.pair.frames)
+                flow = toward.flow * np.float32(self.frames)
                 flow[~toward.valid] = np.inf  # leaves the picture
                 sides.append(self._costs(centre, flow, self.few if few else self.all))
         if len(sides) == 1:
@@ -222,11 +225,19 @@ class _Patches:
         """What a flow (H, W, 2) from the later frame to the earlier leaves of each patch."""
         return self._costs(1, self.gather(flow, self.all), self.all)
 
+    def unrelated(self) -> bool:
+        """Whether hardly anything of one frame is found in the other."""
+        changes = float(np.mean(self.still - self.expected))
+        if changes <= CUT:
+            return False
+        left = _mean(self.costs_along(_found(*self.pictures)), self.still) - float(np.mean(self.expected))
+        return left > (1 - WORTH) * changes
+
     def length(self, convention: MotionConvention) -> float:
         """Ninth decile of the lengths of the vectors, pixels; 0 without any."""
         lengths = []
-        for vectors in self._few_vectors:
-            motion = normalize_motion(vectors, convention, resolution=self.pair.resolution)
+        for vectors in self.few_vectors:
+            motion = normalize_motion(vectors, convention, resolution=self.resolution)
             lengths += [np.hypot(v.flow[..., 0], v.flow[..., 1])[v.valid] for v in motion if v is not None]
         every = np.concatenate(lengths)
         return float(np.quantile(every, 0.9)) if every.size else 0.0
@@ -285,8 +296,8 @@ def _compare(
 class _Trials:
     """What readings leave of some pairs; each is tried once."""
 
-    def __init__(self, pairs: Sequence[FramePair]) -> None:
-        self.pairs = [_Patches(pair) for pair in pairs]
+    def __init__(self, pairs: Sequence[_Patches]) -> None:
+        self.pairs = pairs
         self.expected = float(np.mean(np.concatenate([pair.expected for pair in self.pairs])))
         # The pair that tells most.
         self.screen = max(self.pairs, key=lambda pair: float(np.mean(pair.still - pair.expected)))
@@ -339,16 +350,15 @@ class _Trials:
         """The readings that agree with what is settled and lead to plausible places, the preferred ones first."""
         if settled >= set(PARTS):
             return [assumed]
-        pair = self.screen.pair
-        width = pair.resolution[1]
+        resolution = self.screen.resolution
         lengths: dict[tuple[str, str], float] = {}
         readings: dict[object, MotionConvention] = {}
-        for reading in _agreeing(assumed, settled, (pair.earlier_vectors, pair.later_vectors)):
+        for reading in _agreeing(assumed, settled, self.screen.few_vectors):
             kind = reading.direction, reading.encoding
             if kind not in lengths:
                 lengths[kind] = self.screen.length(replace(reading, unit="pixels", scale=1.0))
-            x, y = reading.factors(pair.resolution)
-            if reading == assumed or SHORTEST <= lengths[kind] * abs(x) <= LONGEST * width:
+            x, y = reading.factors(resolution)
+            if reading == assumed or SHORTEST <= lengths[kind] * abs(x) <= LONGEST * resolution[1]:
                 # Half NDC twice as long is NDC.
                 readings.setdefault((kind, reading.offset, x, y), reading)
         # As many vectors as are assumed; forward rather than backward turned round; then what changes least.
@@ -357,9 +367,8 @@ class _Trials:
 
     def _fit_length(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
         """Of vectors of about any length, those that leave least."""
-        pair = self.screen.pair
         fits: dict[MotionConvention, float] = {assumed: np.inf}
-        for reading in _agreeing(assumed, settled, (pair.earlier_vectors, pair.later_vectors)):
+        for reading in _agreeing(assumed, settled, self.screen.few_vectors):
             # Units differ in their length, which is free here, and in the aspect of the picture.
             alike = reading.unit in {"screen", "half-ndc"} - {assumed.unit} or abs(reading.scale) != 1
             length = 0.0 if alike or reading.pair != assumed.pair else self.screen.length(reading)
@@ -381,7 +390,7 @@ class _Trials:
 
     def search(self) -> float:
         """Share of the picture that flows found in the pictures leave unexplained; 0 to 1."""
-        costs = np.concatenate([pair.costs_along(_found(pair.pair)) for pair in self.pairs])
+        costs = np.concatenate([pair.costs_along(_found(*pair.pictures)) for pair in self.pairs])
         return max(_mean(costs, self.costs(None)) - self.expected, 0.0)
 
     def open_parts(self, chosen: MotionConvention, settled: frozenset[str]) -> tuple[str, ...]:
@@ -446,7 +455,7 @@ def _agreeing(
 
 def _encodings(vectors: Sequence[np.ndarray]) -> list[str]:
     """How vectors with such values may be encoded."""
-    sample = np.concatenate([layer[::16, ::16].reshape(-1, layer.shape[2]) for layer in vectors])
+    sample = np.concatenate([layer.reshape(-1, layer.shape[-1])[::16] for layer in vectors])
     sample = sample[np.isfinite(sample).all(axis=1)]
     if not sample.size or not sample[:, :2].any() or sample[:, :2].min() < 0 or sample[:, :2].max() > 1:
         return ["plain"]
@@ -459,17 +468,16 @@ def _encodings(vectors: Sequence[np.ndarray]) -> list[str]:
     return ["plain", "gray"]
 
 
-def _found(pair: FramePair) -> np.ndarray:
-    """A flow (H, W, 2) from the later frame to the earlier, found in the pictures."""
-    height, width = pair.later.shape[:2]
+def _found(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
+    """A flow (H, W, 2) from the later picture (H, W) to the earlier, found in them."""
+    height, width = later.shape
     factor = min(1.0, float(np.sqrt(FOUND_PIXELS / (height * width))))
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    exposure = median_luminance(pair.earlier)
-    later, earlier = (
-        color if factor == 1 else cv2.resize(np.nan_to_num(color), size, interpolation=cv2.INTER_AREA)
-        for color in (pair.later, pair.earlier)
+    pictures = (
+        picture if factor == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        for picture in (later, earlier)
     )
-    flow = dense_flow(pair_guides(make_guide(later, exposure=exposure), make_guide(earlier, exposure=exposure)))
+    flow = dense_flow(pair_guides(*(smooth_tones(picture) for picture in pictures)))
     if factor == 1:
         return flow
     return cv2.resize(flow, (width, height)) * np.array([width / size[0], height / size[1]], np.float32)

@@ -206,15 +206,30 @@ def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure:
         raise ValueError(f"albedo has shape {albedo.shape}, expected that of color, {color.shape}")
     tone = tone_map(color, exposure)
     if albedo is None:
-        # Contrasts of the steering image below the root of the last number are smoothed over. Its own noise is strong.
-        smooth = cv2.ximgproc.guidedFilter(tone, tone, _RADIUS, 1e-2)
-    else:
-        reflectance = _luminance(albedo)
-        reflectance /= 1 + reflectance
-        smooth = cv2.ximgproc.guidedFilter(reflectance[..., None], tone, _RADIUS, 1e-3)
-    luminance = np.clip(smooth, 0, 1)
-    planes, noise = [luminance], [estimate_noise(luminance, spacing=2 * _RADIUS)]
-    if albedo is not None:
-        planes.append(reflectance)
-        noise.append(estimate_noise(reflectance))
+        return smooth_tones(tone)
+    reflectance = _luminance(albedo)
+    reflectance /= 1 + reflectance
+    luminance = smooth_tones(tone, reflectance[..., None])
+    planes, noise = (luminance.planes, reflectance), (luminance.noise, estimate_noise(reflectance))
     return Guide(np.dstack(planes), np.dstack(noise))
+
+
+def smooth_tones(tone: np.ndarray, steer: np.ndarray | None = None) -> Guide:
+    """Smooth tone-mapped luminance within the surfaces of an image that steers, or of itself.
+
+    Parameters
+    ----------
+    tone : (H, W) float32 array
+        In [0, 1].
+    steer : (H, W, up to 3) float32 array, optional
+        Of a range of about 1.
+
+    Returns
+    -------
+    Guide
+        Of one plane.
+    """
+    # Contrasts of the steering image below the root of this are smoothed over. A picture's own noise is strong.
+    tolerance = 1e-2 if steer is None else 1e-3
+    smooth = np.clip(cv2.ximgproc.guidedFilter(tone if steer is None else steer, tone, _RADIUS, tolerance), 0, 1)
+    return Guide(smooth[..., None], estimate_noise(smooth, spacing=2 * _RADIUS)[..., None])

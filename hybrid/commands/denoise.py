@@ -37,7 +37,9 @@ from hybrid.commands.options import (
     ResumeOption,
     SheetOption,
     ShotArgument,
+    StrictOption,
     import_neural,
+    judge_input,
     open_input,
     rules_of,
     usage,
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from hybrid.files.frames import Shot
     from hybrid.pipeline import DenoiseWindow
     from hybrid.plan import Rules
+    from hybrid.plausibility import Judgement
     from hybrid.records import Record
     from hybrid.timing import Timings
 
@@ -60,6 +63,7 @@ def pseudoref(
     layer: LayerOption = None,
     profile: ProfileOption = None,
     motion: MotionOption = None,
+    strict: StrictOption = False,
     preset: Annotated[
         Literal["draft", "standard", "final"], typer.Option(help="of our own estimate", rich_help_panel=WHAT)
     ] = "standard",
@@ -93,6 +97,7 @@ def pseudoref(
     chosen = CLASSICAL_PRESETS[preset]
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
+    opened, judgement = judge_input(opened, strict=strict)
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
     _spare_inputs(opened, output, source, {"profile": profile}, preview=preview, contact=contact)
@@ -115,6 +120,7 @@ def pseudoref(
             resume=resume,
             keep_going=keep_going,
             max_memory=max_memory,
+            judgement=judgement,
         )
     )
     _look(opened, output, preview, fps, contact)
@@ -127,6 +133,7 @@ def denoise(
     layer: LayerOption = None,
     profile: ProfileOption = None,
     motion: MotionOption = None,
+    strict: StrictOption = False,
     preset: Annotated[
         Literal["fast", "balanced", "quality", "tkpcn", "auto"],
         typer.Option(
@@ -212,6 +219,7 @@ def denoise(
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
+    opened, judgement = judge_input(opened, strict=strict)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -260,6 +268,7 @@ def denoise(
         resume=resume,
         keep_going=keep_going,
         max_memory=max_memory,
+        judgement=judgement,
         radius=denoiser.radius,
         neural=True,
     )
@@ -345,6 +354,7 @@ class Job:
     resume: bool
     keep_going: bool
     max_memory: str | None
+    judgement: Judgement
     radius: int = 2
     neural: bool = False
 
@@ -439,7 +449,8 @@ def _denoise(job: Job, record: Record) -> None:
         rows = plan_rows(limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural)
     taken = shot.layers(shot.numbers[0])
     layers = summarize_layers(taken)
-    for words in (f"layers: {layers}", *taken.notes):
+    said = [finding.message for finding in job.judgement.findings if not finding.warning]
+    for words in (f"layers: {layers}", *taken.notes, *said):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
     attributes = {
@@ -447,9 +458,10 @@ def _denoise(job: Job, record: Record) -> None:
         "ravg/preset": job.preset,
         "ravg/estimate": source.name,
         "ravg/forced": " ".join([f"+{name}" for name in sorted(rules.on)] + [f"-{name}" for name in sorted(rules.off)]),
+        "ravg/layers": layers,
         "ravg/settings": json.dumps(job.settings, sort_keys=True),
     }
-    record.write(timings, layers=layers)
+    record.write(timings, layers=layers, judged=[vars(finding) for finding in job.judgement.findings])
     pixels, outliers = 0, 0
     plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))

@@ -19,12 +19,19 @@ from hybrid.commands.options import (
     PixelsOption,
     ProfileOption,
     ShotArgument,
+    StrictOption,
+    judge_input,
     open_input,
     rules_of,
 )
 
 if TYPE_CHECKING:
+    from flow.convention import Choice
     from hybrid.plan import Decision
+
+
+# How many readings of the vectors are shown, the best first.
+READINGS = 6
 
 
 def inspect(
@@ -33,6 +40,7 @@ def inspect(
     layer: LayerOption = None,
     profile: ProfileOption = None,
     motion: MotionOption = None,
+    strict: StrictOption = False,
     stages: OnOption = None,
     no_stages: OffOption = None,
     as_json: Annotated[
@@ -54,6 +62,7 @@ def inspect(
     height, width = opened.shape
     layers = opened.layers(first)
     rows = describe_layers(layers)
+    opened, judgement = judge_input(opened, strict=strict)
     rules = rules_of(stages, no_stages)
     progress = Progress("look", len(opened))
     plan = plan_shot(opened, rules, advance=progress.advance)
@@ -66,6 +75,8 @@ def inspect(
             "profile": layers.profile,
             "reason": layers.reason,
             "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in rows],
+            "judged": [asdict(finding) for finding in judgement.findings],
+            "motion": None if judgement.motion is None else _readings(judgement.motion),
             "plan": [asdict(decision) for decision in plan.decisions],
         }
         typer.echo(json.dumps(document, indent=1))
@@ -77,11 +88,31 @@ def inspect(
     for row in rows:
         table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
     console.print(table)
+    for finding in judgement.findings:
+        if not finding.warning:
+            console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
+    if judgement.motion is not None:
+        title = "Motion: what the vectors leave unexplained"
+        table = Table(
+            "", "read as", "of the picture", title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False
+        )
+        for row in _readings(judgement.motion):
+            table.add_row(*row)
+        console.print(table)
     table = Table("", "stage", "measured", "why", title="Plan", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for decision in plan.decisions:
         why = f"{decision.reason} ({STAGES[decision.stage]})"
         table.add_row("on" if decision.on else "off", decision.stage, _measured(decision), Text(printable(why)))
     console.print(table)
+
+
+def _readings(choice: Choice) -> list[tuple[str, str, str]]:
+    """What was tried for the motion: whether it is taken, how vectors are read, and what that leaves."""
+    rows = [(t.convention == choice.convention, str(t.convention), t.unexplained) for t in choice.trials[:READINGS]]
+    rows.append((False, "no motion", choice.still))
+    if choice.found is not None:
+        rows.append((choice.convention is None, "found in the pictures", choice.found))
+    return [("taken" if taken else "", reading, f"{share:.2%}") for taken, reading, share in rows]
 
 
 def _measured(decision: Decision) -> str:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
-from hybrid.commands.log import LOG
+from hybrid.commands.log import LOG, printable
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
     from hybrid.files.frames import Shot
     from hybrid.plan import Rules
+    from hybrid.plausibility import Judgement
 
 Thing = TypeVar("Thing")
 
@@ -53,6 +54,14 @@ MotionOption = Annotated[
         metavar="WORDS",
         help="what vectors mean, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: measured, none: not used; "
         "else as the renderer writes them",
+        rich_help_panel=INPUT,
+    ),
+]
+StrictOption = Annotated[
+    bool,
+    typer.Option(
+        "--strict",
+        help="stop with an error where a layer makes no sense, instead of leaving it out",
         rich_help_panel=INPUT,
     ),
 ]
@@ -206,6 +215,18 @@ def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
             raise typer.BadParameter(f"--layer names {role} twice, expected once")
         overrides[role] = name
     return overrides
+
+
+def judge_input(shot: Shot, *, strict: bool) -> tuple[Shot, Judgement]:
+    """The shot without the layers that make no sense, each of which is said in a line; an error if `strict`."""
+    from hybrid.plausibility import judge_layers
+
+    judgement = judge_layers(shot)
+    if strict and (warnings := [*shot.warnings, *judgement.warnings]):
+        raise ValueError("; ".join(warnings))
+    for warning in judgement.warnings:
+        LOG.warning(printable(warning))
+    return judgement.apply(shot), judgement
 
 
 def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:

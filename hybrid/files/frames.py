@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -196,6 +196,9 @@ class Shot:
         self._overrides = dict(layers or {})
         self._profile = profile
         self._motion = motion
+        self._left_out: frozenset[str] = frozenset({"motion"} if motion == "none" else ())
+        self._convention: MotionConvention | None = None
+        self._variance_scale: float | None = None
         self._aovs = tuple(aovs)
         self._keep = keep
         self._max_pixels = max_pixels
@@ -212,6 +215,11 @@ class Shot:
     def aovs(self) -> tuple[str, ...]:
         """Names of the further layers that are loaded."""
         return self._aovs
+
+    @property
+    def available(self) -> tuple[int, ...]:
+        """Numbers of all the files there are, asked for or not, ascending."""
+        return tuple(sorted(self._files))
 
     @property
     def count(self) -> int:
@@ -254,7 +262,6 @@ class Shot:
             files,
             layers={**self._overrides, "color": self._first_layers.target},
             profile=self.profile,
-            motion="none" if self._motion == "none" else None,
             aovs=self._aovs if aovs is None else aovs,
             keep=self._keep,
             max_pixels=self._max_pixels,
@@ -262,7 +269,28 @@ class Shot:
         made.missing = self.missing
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
-        return made
+        return made.judged(self._left_out, self._convention, self._variance_scale)
+
+    def judged(
+        self, left_out: Collection[str], convention: MotionConvention | None, variance_scale: float | None
+    ) -> Shot:
+        """The same shot, read otherwise than its files and their profile say (`hybrid.plausibility`).
+
+        Parameters
+        ----------
+        left_out
+            Roles of layers that are not read.
+        convention
+            What the motion vectors mean; None: as the profile says.
+        variance_scale
+            What the variance is multiplied by; None: as the profile says.
+        """
+        other = copy(self)
+        other._held = OrderedDict()
+        other.__dict__.pop("_first_layers", None)
+        other._left_out = self._left_out | set(left_out)
+        other._convention, other._variance_scale = convention, variance_scale
+        return other
 
     def path(self, number: int) -> Path:
         """The file of a frame.
@@ -306,8 +334,10 @@ class Shot:
         return layers
 
     def _find_alone(self, image: ExrImage) -> Layers:
-        found = find_layers(image, self._overrides, self.profile, self._aovs)
-        return found.without({"motion"}) if self._motion == "none" else found
+        found = find_layers(image, self._overrides, self.profile, self._aovs).without(self._left_out)
+        if found.motion is not None and self._convention is not None:
+            found = replace(found, motion_convention=self._convention)
+        return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)
 
     @cached_property
     def _first_layers(self) -> Layers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,8 +28,8 @@ class Layers:
     there the color is ``Noisy Image``, which stays, and ``Combined`` is replaced.
 
     `profile` says whose names and conventions were taken, `reason` why. Of `motion_convention`, its parts `settled` are
-    documented, the others assumed. `variance_scale` is what the variance is multiplied by to be that of a pixel; None
-    where nobody has said what it is.
+    documented, the others assumed. `variance_of` says of what the variance is, "mean" or "sample", `variance_scale`
+    what it is multiplied by to be that of a pixel, `samples` how many samples a pixel has; None where nobody has said.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
 
@@ -52,15 +53,19 @@ class Layers:
     reason: str = ""
     motion_convention: MotionConvention | None = None
     settled: frozenset[str] = frozenset()
+    variance_of: str | None = None
     variance_scale: float | None = None
+    samples: float | None = None
     view: str | None = None
     views: tuple[str, ...] = ()
     aovs: Mapping[str, Layer] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def without(self, roles: Collection[str]) -> Layers:
-        """The same with some roles left out; motion goes as a whole."""
-        gone = {*roles, "motion_next"} if "motion" in roles else {*roles}
+        """The same with some roles left out, and what they are made from."""
+        gone = {*roles}
+        gone |= {"motion_next"} if "motion" in gone else set()
+        gone |= {"half_a", "half_b"} if "variance" in gone else set()
         kept = None if "motion" in gone else self.motion_convention
         return replace(self, **dict.fromkeys(gone), motion_convention=kept)  # type: ignore[arg-type]
 
@@ -138,14 +143,16 @@ def find_layers(
     view = color.view or (image.views[0] if image.views else None)
     if len(image.views) > 1:
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
-    convention = _convention(found, taken)
+    convention, samples = _convention(found, taken), _samples(image, taken)
     return Layers(
         **found,  # type: ignore[arg-type]
         profile=taken.name,
         reason=taken.why,
         motion_convention=convention,
         settled=taken.settled,
-        variance_scale=_variance_scale(image, taken),
+        variance_of=taken.variance,
+        variance_scale={"mean": 1.0, "sample": None if samples is None else 1 / samples}.get(taken.variance or ""),
+        samples=samples,
         view=view,
         views=image.views,
         aovs=_find_aovs(image, aovs, [layer for layer in (found["target"], found["alpha"]) if layer is not None]),
@@ -233,17 +240,17 @@ def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConve
     return replace(convention, direction="previous") if profile.layers.get("motion_next") else convention
 
 
-def _variance_scale(image: ExrImage, profile: Profile) -> float | None:
-    if profile.variance == "mean":
-        return 1.0
-    headers = [part.header for part in image.parts]
-    named = profile.samples or ""
-    samples = next((header[named] for header in headers if named in header), None)
-    try:
-        count = float(samples)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        return None
-    return 1 / count if profile.variance == "sample" and count >= 1 else None
+def _samples(image: ExrImage, profile: Profile) -> float | None:
+    """Samples of a pixel, where the header tells them."""
+    for part in image.parts:
+        for name in fnmatch.filter(part.header, profile.samples or ""):
+            try:
+                count = float(part.header[name])
+            except (TypeError, ValueError):
+                continue
+            if 1 <= count < float("inf"):
+                return count
+    return None
 
 
 def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:

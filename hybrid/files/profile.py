@@ -64,7 +64,7 @@ class Profile:
     variance : str or None
         "mean": the variance of a pixel; "sample": of its samples; None where that is not known.
     samples : str or None
-        The header attribute that holds the samples of a pixel.
+        The header attribute that holds the samples of a pixel; ``*`` stands for anything.
     why : str
         Why it was taken.
     """

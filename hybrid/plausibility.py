@@ -1,0 +1,333 @@
+"""Which layers of a shot make sense: each is judged on a few pairs of frames before anything runs.
+
+Files say what they hold, and are sometimes wrong: a pass that was switched on and never filled, vectors of another
+convention, guides of another frame. What does not make sense is left out, and a line says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.convention import Choice, FramePair, choose_convention
+from flow.guide import median_luminance, tone_map
+from hybrid.files.frames import Frame, Shot
+from hybrid.files.layers import Layers
+from hybrid.files.profile import ROLES
+
+Array = NDArray[np.float32]
+
+# Pairs that are looked at, spread over all files of the shot and not over the frames that were asked for: what is
+# decided must not depend on the chunk that a frame comes in.
+PAIRS = 2
+# A layer whose values lie within this of each other, relative to the largest, is the same everywhere: half floats
+# round by 5e-4.
+SAME = 1e-3
+# Share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges.
+STRAY = 0.01
+# Reflectance is below 1; emitters and skies are written as brighter albedos by some, but not as half of a picture.
+BRIGHT = 2.0
+# Averages over a pixel are shorter than 1, rounding makes them longer by less than this.
+LENGTH = 1.1
+# Correlation of edges, of a guide with the colors of two frames: on the bundled shot an albedo has 0.61 with its own
+# frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35.
+EDGES = 0.05
+# The variance may differ from what the picture shows by this factor: the third quartile of their ratio was 1.3 to 1.7.
+VARIANCE = 4.0
+# Two pictures of which so many pixels are equal are one.
+EQUAL = 0.99
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found about a layer.
+
+    Attributes
+    ----------
+    role : str
+        What the layer is to a denoiser.
+    message : str
+        One line.
+    warning : bool
+        False for what is as good as could be expected.
+    left_out : bool
+        Whether the layer is not used.
+    """
+
+    role: str
+    message: str
+    warning: bool = True
+    left_out: bool = True
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What was found about a shot's layers.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        In the order of the roles.
+    motion : Choice or None
+        The readings of the vectors that were tried; None where there are no vectors, or no pair of frames.
+    variance_scale : float or None
+        What the variance is multiplied by, where that was measured.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    motion: Choice | None = None
+    variance_scale: float | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line for each thing that does not make sense."""
+        return tuple(finding.message for finding in self.findings if finding.warning)
+
+    def apply(self, shot: Shot) -> Shot:
+        """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""
+        left_out = {finding.role for finding in self.findings if finding.left_out}
+        convention = None if self.motion is None else self.motion.convention
+        return shot.judged(left_out, convention, self.variance_scale)
+
+
+def judge_layers(shot: Shot) -> Judgement:
+    """Judge every layer of a shot on pairs of neighbouring frames.
+
+    Parameters
+    ----------
+    shot : Shot
+        Up to `PAIRS` pairs are read, of all its files; of a shot without neighbours one frame.
+
+    Returns
+    -------
+    Judgement
+        Depends on the files and on the options that the shot was opened with, not on the frames asked for.
+    """
+    layers = shot.layers(shot.available[0])
+    evidence = _Evidence(layers)
+    pairs = _pair_numbers(shot)
+    choice = None
+    if layers.motion_convention is not None and pairs:
+        vectors = _vector_pairs(shot, pairs, evidence.add)
+        choice = choose_convention(vectors, layers.motion_convention, layers.settled)
+    else:
+        for a, b in pairs:
+            evidence.add(shot.read(a), shot.read(b))
+    if not pairs:
+        evidence.add(shot.read(shot.available[0]))
+    variance_scale, judged = evidence.judge_variance()
+    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice, pairs))]
+    return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
+
+
+def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
+    """Neighbours, spread over all files of the shot."""
+    pairs = [(a, a + shot.step) for a in shot.available if shot.has(a + shot.step)]
+    count = min(PAIRS, len(pairs))
+    return [pairs[(2 * i + 1) * len(pairs) // (2 * count)] for i in range(count)]
+
+
+def _vector_pairs(
+    shot: Shot, pairs: Sequence[tuple[int, int]], look: Callable[[Frame, Frame], None]
+) -> Iterator[FramePair]:
+    """Pairs with their vectors, one at a time; `look` sees their frames."""
+    for a, b in pairs:
+        earlier, later = shot.read(a), shot.read(b)
+        look(earlier, later)
+        if earlier.motion is not None and later.motion is not None:
+            resolution = earlier.resolution or earlier.motion.shape[:2]
+            yield FramePair(earlier.color, later.color, earlier.motion, later.motion, resolution, shot.step)
+
+
+class _Evidence:
+    """What frames show of each layer but motion; they need not be kept."""
+
+    def __init__(self, layers: Layers) -> None:
+        self.layers = layers
+        # Of each frame: what is wrong with a layer, in words; of a layer that makes sense nothing.
+        self.wrong: dict[str, list[str | None]] = {}
+        self.edges: dict[str, list[tuple[float, float, float]]] = {}
+        self.variances: list[Array] = []
+
+    def add(self, *frames: Frame) -> None:
+        """Look at one frame, or at two neighbours."""
+        for frame in frames:
+            for role, judge in _JUDGES.items():
+                if getattr(frame, role) is not None:
+                    self.wrong.setdefault(role, []).append(judge(frame))
+            if frame.variance is not None:
+                self.variances.append(_variance_ratios(frame))
+        if len(frames) == 2:
+            exposure = median_luminance(frames[0].color)
+            # Of noise the correlation knows less where neighbours are averaged.
+            tones = [tone_map(frame.color, exposure)[..., None] for frame in frames]
+            shown = [_slope(np.asarray(cv2.blur(tone, (3, 3)), np.float32).reshape(tone.shape)) for tone in tones]
+            for role in ("albedo", "normal"):
+                guides = [getattr(frame, role) for frame in frames]
+                if all(guide is not None for guide in guides):
+                    slopes = [_slope(guide) for guide in guides]
+                    own = (_correlate(slopes[0], shown[0]) + _correlate(slopes[1], shown[1])) / 2
+                    late, early = _correlate(slopes[1], shown[0]), _correlate(slopes[0], shown[1])
+                    self.edges.setdefault(role, []).append((own, late, early))
+
+    def findings(self) -> Iterator[Finding]:
+        """What is wrong in every frame that was looked at."""
+        for role, words in self.wrong.items():
+            if all(words):
+                yield self._leave(role, str(words[0]))
+            elif role in self.edges:
+                own, late, early = np.mean(self.edges[role], axis=0)
+                if max(late, early) > own + EDGES:
+                    other = "previous" if late > early else "next"
+                    figures = f"their edges correlate {max(late, early):.2f}, with its own frame's {own:.2f}"
+                    yield self._leave(role, f"belongs to the {other} frame ({figures})")
+
+    def judge_variance(self) -> tuple[float | None, list[Finding]]:
+        """What the variance is multiplied by where nobody has said so, and what there is to say of it."""
+        if not self.variances or all(self.wrong["variance"]):
+            return None, []
+        ratio = float(np.quantile(np.concatenate(self.variances), 0.75))
+        said = f"is {ratio:.3g} times what the picture shows"
+        if 1 / VARIANCE <= ratio <= VARIANCE:
+            return None, []
+        samples, known = self.layers.samples, self.layers.variance_scale is not None
+        if self.layers.variance_of == "sample" and not known and ratio > 1:
+            words = f"{self._name('variance')} {said}, as that of samples is: divided by that"
+            return 1 / ratio, [Finding("variance", words, warning=False, left_out=False)]
+        if self.layers.variance_of is None and samples and 1 / VARIANCE <= ratio / samples <= VARIANCE:
+            words = f"{self._name('variance')} {said}: taken as that of {samples:g} samples"
+            return 1 / samples, [Finding("variance", words, left_out=False)]
+        return None, [self._leave("variance", said)]
+
+    def _leave(self, role: str, words: str) -> Finding:
+        return Finding(role, f"{self._name(role)} {words}: left out")
+
+    def _name(self, role: str) -> str:
+        return f"{role} ({getattr(self.layers, role) or 'of two halves'})"
+
+
+def _judge_guide(layer: Array) -> str | None:
+    finite = layer[np.isfinite(layer).all(axis=-1)]
+    if not finite.size:
+        return "has no finite value"
+    if np.ptp(finite, axis=0).max() <= SAME * np.abs(finite).max():
+        return "is black" if not finite.any() else "is the same everywhere"
+    return None
+
+
+def _judge_albedo(frame: Frame) -> str | None:
+    layer = frame.albedo
+    if layer is None or (words := _judge_guide(layer)) is not None:
+        return None if layer is None else words
+    if (below := float(np.mean(layer.min(axis=-1) < -SAME))) > STRAY:
+        return f"is negative in {below:.1%} of the picture"
+    if (above := float(np.mean(layer.max(axis=-1) > BRIGHT))) > 0.5:
+        return f"is above {BRIGHT:g} in {above:.1%} of the picture"
+    return None
+
+
+def _judge_normal(frame: Frame) -> str | None:
+    layer = frame.normal
+    if layer is None or (words := _judge_guide(layer)) is not None:
+        return None if layer is None else words
+    long = float(np.mean(np.einsum("yxc,yxc->yx", layer, layer) > LENGTH**2))
+    return f"is longer than 1 in {long:.1%} of the picture" if long > STRAY else None
+
+
+def _judge_depth(frame: Frame) -> str | None:
+    return None if frame.depth is None else _judge_guide(frame.depth[..., None])
+
+
+def _judge_alpha(frame: Frame) -> str | None:
+    layer = frame.alpha
+    if layer is None or layer.min() == layer.max():
+        return None  # opaque everywhere, or empty
+    if any(np.mean(layer == frame.color[..., c]) > EQUAL for c in range(3)):
+        return "is the color"
+    outside = float(np.mean((layer < -STRAY) | (layer > 1 + STRAY)))
+    return f"is not between 0 and 1 in {outside:.1%} of the picture" if outside > STRAY else None
+
+
+def _judge_variance(frame: Frame) -> str | None:
+    layer = frame.variance
+    if layer is None:
+        return None
+    if not np.nan_to_num(layer).any():
+        return "is 0 everywhere"
+    below = float(np.mean(layer.min(axis=-1) < 0))
+    return f"is negative in {below:.1%} of the picture" if below > STRAY else None
+
+
+def _judge_estimate(frame: Frame) -> str | None:
+    if frame.estimate is None:
+        return None
+    # Half floats differ from what they were by 5e-4 of it.
+    same = np.isclose(frame.estimate, frame.color, rtol=SAME, atol=0).all(axis=-1)
+    return "is the noisy picture" if float(np.mean(same)) > EQUAL else None
+
+
+_JUDGES: dict[str, Callable[[Frame], str | None]] = {
+    "albedo": _judge_albedo,
+    "normal": _judge_normal,
+    "depth": _judge_depth,
+    "variance": _judge_variance,
+    "alpha": _judge_alpha,
+    "estimate": _judge_estimate,
+}
+
+
+def _slope(layer: Array) -> Array:
+    """Length of the gradient of (H, W, C), over all channels."""
+    clean = np.nan_to_num(layer, posinf=0.0, neginf=0.0)
+    across, down = cv2.Sobel(clean, -1, 1, 0), cv2.Sobel(clean, -1, 0, 1)
+    square = (across**2 + down**2).reshape(*layer.shape[:2], -1).sum(axis=-1)
+    return np.asarray(np.sqrt(square), np.float32)
+
+
+def _correlate(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    power = float(np.sqrt(np.mean(a**2) * np.mean(b**2)))
+    return float(np.mean(a * b)) / power if power > 0 else 0.0
+
+
+def _variance_ratios(frame: Frame) -> Array:
+    """Variance as given, over that which the picture shows, of patches of 9 x 9 pixels.
+
+    The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, has the noise's own variance
+    (Immerkær 1996); texture makes it larger, so that flat patches tell most. Green stands for all.
+    """
+    kernel = np.array([1, -2, 1], np.float32)
+    green = np.nan_to_num(frame.color[..., 1], posinf=0.0, neginf=0.0)
+    shown = cv2.blur((cv2.sepFilter2D(green, -1, kernel, kernel) / 6) ** 2, (9, 9))[4::9, 4::9]
+    variance = np.zeros_like(green) if frame.variance is None else np.nan_to_num(frame.variance[..., 1])
+    given = cv2.blur(np.maximum(variance, 0), (9, 9))[4::9, 4::9]
+    lit = shown > 0
+    return np.asarray(given[lit] / shown[lit], np.float32).ravel()
+
+
+def _judge_motion(layers: Layers, choice: Choice, pairs: Sequence[tuple[int, int]]) -> Iterator[Finding]:
+    """What there is to say of the vectors, and of frames that they cannot connect."""
+    for index in choice.unrelated:
+        a, b = pairs[index]
+        yield Finding("color", f"frames {a} and {b} show something else: a cut, or another light?", left_out=False)
+    name = f"motion ({layers.motion})"
+    left, still = f"{choice.unexplained:.1%}", f"{choice.still:.1%}"
+    if choice.convention is None:
+        found = "" if choice.found is None else f", what is found in the pictures {choice.found:.1%}"
+        words = f"{name}: no reading of the vectors explains the pictures (it leaves {left}, none {still}{found})"
+        yield Finding("motion", f"{words}: left out, found in the pictures")
+    elif choice.convention != layers.motion_convention:
+        contradicts = any(
+            getattr(choice.convention, part) != getattr(layers.motion_convention, part) for part in layers.settled
+        )
+        as_stated = next((t.unexplained for t in choice.trials if t.convention == layers.motion_convention), None)
+        stated = "" if as_stated is None else f"{layers.motion_convention} {as_stated:.1%}, "
+        words = f"{name}: taken as {choice.convention}, which leaves {left} unexplained ({stated}no motion {still})"
+        yield Finding("motion", words, warning=contradicts, left_out=False)
+    elif choice.open:
+        words = f"{name}: the pictures do not tell {', '.join(choice.open)}: taken as {choice.convention}"
+        yield Finding("motion", words, warning=False, left_out=False)

@@ -1,0 +1,248 @@
+"""Layers that make no sense are left out, with one line; they cost nothing but that line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.cli import main
+from hybrid.comparison.metrics import psnr
+from hybrid.files.exr import read_exr
+from hybrid.files.frames import open_shot
+from hybrid.plausibility import judge_layers
+from tests.hybrid.test_renderers import denoised
+from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
+
+FRAMES = truths()
+REFERENCE = open_shot(SHOT / "reference.0010.exr").read(10).color
+LIGHT = "ViewLayer.Combined"
+
+
+def cycles(truth: Truth) -> Channels:
+    return RENDERERS["cycles"].files(truth)["shot.####.exr"]
+
+
+def write(folder: Path, edit: Callable[[int, Channels], None] = lambda index, channels: None) -> Path:
+    """The shot as Cycles wrote it, but for what is edited."""
+    for index, truth in enumerate(FRAMES):
+        channels = cycles(truth)
+        edit(index, channels)
+        save(folder / f"shot.{truth.number:04d}.exr", channels, RENDERERS["cycles"].attributes)
+    return folder / "shot.####.exr"
+
+
+def without(*layers: str) -> Callable[[int, Channels], None]:
+    def edit(index: int, channels: Channels) -> None:
+        for name in [
+            name for name in channels if name.rpartition(".")[0] in {f"ViewLayer.{known}" for known in layers}
+        ]:
+            del channels[name]
+
+    return edit
+
+
+def quality(spec: Path, out: Path, *options: str) -> tuple[float, str]:
+    """PSNR of a frame with neighbours on either side, and what was said."""
+    made, said = denoised(spec, out, "--frames", "10", *(options or ("--preset", "draft")))
+    return psnr(made[10], REFERENCE), said
+
+
+def stops(spec: Path) -> bool:
+    """Whether --strict does."""
+    return main(["pseudoref", str(spec), "-o", str(spec.parent / "strict"), "--strict"]) == 1
+
+
+def warnings(said: str) -> list[str]:
+    return [line for line in said.splitlines() if line.startswith("warning:")]
+
+
+def vector(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[int, Channels], None]:
+    def edit(index: int, channels: Channels) -> None:
+        wrong = np.float32(change(cycles_vector(FRAMES[index])))
+        channels.update(layer("ViewLayer.Vector", "XYZW", wrong))
+
+    return edit
+
+
+@pytest.fixture(scope="module")
+def found_in_pictures(tmp_path_factory) -> float:
+    folder = tmp_path_factory.mktemp("without")
+    return quality(write(folder, without("Vector")), folder / "out")[0]
+
+
+NOISE = np.random.default_rng(0)
+WRONG = {
+    "sign": lambda v: -v,
+    "y": lambda v: v * [1, -1, 1, -1],
+    "x": lambda v: v * [-1, 1, -1, 1],
+    "transposed": lambda v: v[..., [1, 0, 3, 2]],
+    "half": lambda v: 0.5 * v,
+    "double": lambda v: 2 * v,
+    "black": lambda v: 0 * v,
+    "constant": lambda v: 0 * v + 3,
+    "noise": lambda v: NOISE.normal(0, 5, v.shape),
+    "NDC": lambda v: v / [144, 88, 144, 88],
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG)
+def test_wrong_vectors_are_as_good_as_none(change, tmp_path, found_in_pictures) -> None:
+    spec = write(tmp_path, vector(change))
+    wrong, said = quality(spec, tmp_path / "out")
+    # Where the right reading is found it is better; half a hundredth of a decibel is chance.
+    assert wrong > found_in_pictures - 0.005
+    assert len(warnings(said)) == 1
+    assert "motion (ViewLayer.Vector.XYZW)" in said
+    assert stops(spec)
+
+
+def test_right_vectors_are_better_than_found_ones_and_need_no_warning(tmp_path, found_in_pictures) -> None:
+    right, said = quality(write(tmp_path), tmp_path / "out")
+    assert warnings(said) == []
+    assert right > found_in_pictures
+
+
+def fill(name: str, components: str, make: Callable[[Truth, int], np.ndarray]) -> Callable[[int, Channels], None]:
+    def edit(index: int, channels: Channels) -> None:
+        array = np.broadcast_to(
+            np.float32(make(FRAMES[index], index)), (*FRAMES[index].color.shape[:2], len(components))
+        )
+        channels.update(layer(f"ViewLayer.{name}", components, array))
+
+    return edit
+
+
+ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
+IMPLAUSIBLE = {
+    "black albedo": (fill(*ALBEDO, lambda t, i: 0), ALBEDO[0], "is black: left out"),
+    "albedo of one color": (fill(*ALBEDO, lambda t, i: 0.5), ALBEDO[0], "is the same everywhere: left out"),
+    "negative albedo": (fill(*ALBEDO, lambda t, i: t.normal), ALBEDO[0], "is negative in"),
+    "light as albedo": (fill(*ALBEDO, lambda t, i: 50 * t.color), ALBEDO[0], "is above 2 in"),
+    "albedo of the previous frame": (
+        fill(*ALBEDO, lambda t, i: FRAMES[max(i - 1, 0)].albedo), ALBEDO[0], "belongs to the previous frame"
+    ),
+    "albedo of the next frame": (
+        fill(*ALBEDO, lambda t, i: FRAMES[min(i + 1, 3)].albedo), ALBEDO[0], "belongs to the next frame"
+    ),
+    "constant normal": (fill(*NORMAL, lambda t, i: [0, 0, 1]), NORMAL[0], "is the same everywhere: left out"),
+    "position as normal": (fill(*NORMAL, lambda t, i: t.normal * t.depth[..., None]), NORMAL[0], "is longer than 1 in"),
+    "normal of the previous frame": (
+        fill(*NORMAL, lambda t, i: FRAMES[max(i - 1, 0)].normal), NORMAL[0], "belongs to the previous frame"
+    ),
+    "constant depth": (fill("Depth", "Z", lambda t, i: 7), "Depth", "depth (ViewLayer.Depth.Z) is the same everywhere"),
+    "no variance": (fill("variance", "RGB", lambda t, i: 0), "variance", "is 0 everywhere: left out"),
+    "negative variance": (fill("variance", "RGB", lambda t, i: t.normal), "variance", "is negative in"),
+    "variance times 500": (fill("variance", "RGB", lambda t, i: 500 * t.variance), "variance", "times what"),
+    "variance over 20": (fill("variance", "RGB", lambda t, i: t.variance / 20), "variance", "times what"),
+}  # fmt: skip
+
+
+# Only non-local means look at the variance.
+PRESET = {"variance": ("--preset", "standard")}
+
+
+@pytest.fixture(scope="module")
+def absence(tmp_path_factory) -> Callable[[str], float]:
+    """What is reached without a layer."""
+    folder, kept = tmp_path_factory.mktemp("absent"), {}
+
+    def measure(name: str) -> float:
+        if name not in kept:
+            spec = write(folder / name, without(name))
+            kept[name] = quality(spec, folder / f"{name} out", *PRESET.get(name, ()))[0]
+        return kept[name]
+
+    return measure
+
+
+@pytest.mark.parametrize(("edit", "absent", "message"), IMPLAUSIBLE.values(), ids=IMPLAUSIBLE)
+def test_an_implausible_layer_is_as_good_as_none(edit, absent, message, absence, tmp_path) -> None:
+    spec = write(tmp_path, edit)
+    wrong, said = quality(spec, tmp_path / "out", *PRESET.get(absent, ()))
+    assert wrong > absence(absent) - 0.05
+    assert len(warnings(said)) == 1
+    assert message in " ".join(said.split())
+    assert stops(spec)
+
+
+def test_an_alpha_that_is_the_color_is_not_filtered(tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        channels[f"{LIGHT}.A"] = channels[f"{LIGHT}.R"]
+
+    spec = write(tmp_path, edit)
+    _, said = quality(spec, tmp_path / "out")
+    assert [line for line in warnings(said) if "alpha (ViewLayer.Combined.A) is the color: left out" in line]
+    assert "alpha" not in next(line for line in said.splitlines() if line.startswith("layers:"))
+    before, after = (
+        read_exr(path).channel(f"{LIGHT}.A")
+        for path in (tmp_path / "shot.0010.exr", tmp_path / "out" / "shot.0010.exr")
+    )
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_denoised_picture_that_is_the_noisy_one_is_no_estimate(tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        channels.update({f"ViewLayer.Noisy Image.{c}": channels[f"{LIGHT}.{c}"] for c in "RGBA"})
+
+    shot = open_shot(write(tmp_path, edit))
+    judgement = judge_layers(shot)
+    assert judgement.warnings == ("estimate (ViewLayer.Combined.RGB) is the noisy picture: left out",)
+    layers = judgement.apply(shot).layers(10)
+    assert layers.estimate is None
+    assert str(layers.target) == "ViewLayer.Combined.RGB"  # which the denoised picture replaces all the same
+
+
+def test_what_makes_sense_gives_no_finding() -> None:
+    judgement = judge_layers(open_shot(SHOT / "noisy.####.exr"))
+    assert judgement.findings == ()
+    assert judgement.motion is not None
+    assert judgement.variance_scale is None
+
+
+def test_the_judgement_is_of_the_shot_and_not_of_the_frames_asked_for(tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        if index != 0:
+            channels.update(layer("ViewLayer.Vector", "XYZW", 0 * cycles_vector(FRAMES[index])))
+
+    spec = write(tmp_path, edit)
+    judged = [judge_layers(open_shot(spec, frames=frames)) for frames in (None, "9", "11-12")]
+    assert judged[0] == judged[1] == judged[2]
+
+
+def test_variance_of_samples_is_divided_by_their_number_or_by_what_the_picture_shows(tmp_path) -> None:
+    spec = write(tmp_path / "told", fill("variance", "RGB", lambda t, i: SAMPLES * t.variance))
+    judgement = judge_layers(open_shot(spec))
+    assert judgement.variance_scale == 1 / SAMPLES  # Cycles' header says how many
+    assert len(judgement.warnings) == 1  # but not that the variance is theirs
+    frame = judgement.apply(open_shot(spec)).read(10)
+    np.testing.assert_allclose(frame.variance, FRAMES[1].variance, rtol=1e-5)
+
+    # MoonRay's is documented as that of samples, whose number nothing tells.
+    moonray = replace(RENDERERS["moonray"], files=lambda t: {
+        "shot.####.exr": RENDERERS["moonray"].files(t)["shot.####.exr"] | layer("variance", "Y", 9 * t.variance[..., 1])
+    })  # fmt: skip
+    judgement = judge_layers(open_shot(moonray.write(tmp_path / "measured", FRAMES)))
+    assert judgement.warnings == ()
+    assert judgement.variance_scale == pytest.approx(1 / 9, rel=0.5)
+
+
+def test_a_shot_of_one_frame_is_judged_too(tmp_path) -> None:
+    save(tmp_path / "still.exr", cycles(FRAMES[0]) | layer("ViewLayer.Denoising Albedo", "RGB", 0 * FRAMES[0].albedo))
+    judgement = judge_layers(open_shot(tmp_path / "still.exr"))
+    assert [finding.role for finding in judgement.findings] == ["albedo"]
+    assert judgement.motion is None
+
+
+def test_a_cut_is_noticed(tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        if index >= 1:
+            channels.update({name: np.ascontiguousarray(plane[::-1, ::-1]) for name, plane in channels.items()})
+            channels.update({name: -plane for name, plane in channels.items() if ".Vector." in name})
+
+    judgement = judge_layers(open_shot(write(tmp_path, edit)))
+    assert judgement.warnings == ("frames 9 and 10 show something else: a cut, or another light?",)
+    assert not judgement.findings[0].left_out  # the vectors are as good as they were

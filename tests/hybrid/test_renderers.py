@@ -1,0 +1,82 @@
+"""Files of any renderer: one shot, rewritten as each would have written it, gives one picture."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.cli import main
+from hybrid.comparison.metrics import psnr
+from hybrid.files.frames import open_shot
+from tests.renderers import RENDERERS, Renderer, truths
+
+FRAMES = truths()
+
+
+def run(command: str, spec: Path, out: Path | None, *options: str) -> str:
+    """What the command says."""
+    said = io.StringIO()
+    arguments = [command, str(spec), *([] if out is None else ["-o", str(out)]), *options]
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        assert main(arguments) == 0, said.getvalue()
+    return said.getvalue()
+
+
+def pictures(folder: Path) -> dict[int, np.ndarray]:
+    shot = open_shot(folder)
+    return {number: shot.read(number).color for number in shot.numbers}
+
+
+def denoised(spec: Path, out: Path, *options: str) -> tuple[dict[int, np.ndarray], str]:
+    said = run("pseudoref", spec, out, *options)
+    return pictures(out), said
+
+
+def options(renderer: Renderer) -> list[str]:
+    """What is asked for: only non-local means look at the variance, and they take time."""
+    return ["--frames", "10", "--preset", "standard" if "variance" in renderer.roles else "draft"]
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Renderer], np.ndarray]:
+    """The picture of the same layers by plain names, with all said that is to say of the motion."""
+    folder, kept = tmp_path_factory.mktemp("told"), {}
+
+    def make(renderer: Renderer) -> np.ndarray:
+        key = renderer.roles, renderer.direction
+        if key not in kept:
+            spec = renderer.write_plain(folder / str(len(kept)), FRAMES)
+            out = folder / f"out{len(kept)}"
+            kept[key] = denoised(spec, out, *options(renderer), "--motion", str(renderer.convention))[0][10]
+        return kept[key]
+
+    return make
+
+
+@pytest.mark.parametrize("renderer", RENDERERS.values(), ids=RENDERERS)
+def test_the_same_command_gives_the_same_picture(renderer: Renderer, told, tmp_path: Path) -> None:
+    found, said = denoised(renderer.write(tmp_path / "theirs", FRAMES), tmp_path / "found", *options(renderer))
+    assert "warning" not in said
+    assert f"layers: {renderer.profile} (" in said
+    # Vectors are rounded otherwise in other units.
+    assert psnr(found[10], told(renderer)) > 100
+
+
+def test_without_vectors_or_with_wrong_ones_the_picture_is_another(told) -> None:
+    """Or the test above would show nothing."""
+    assert psnr(told(RENDERERS["mitsuba"]), told(RENDERERS["redshift"])) < 50
+    assert psnr(told(RENDERERS["nuke"]), told(RENDERERS["redshift"])) < 70
+
+
+@pytest.mark.parametrize("name", ["arnold", "appleseed"])
+def test_inspect_says_which_profile_and_why_and_what_was_tried(name: str, tmp_path: Path) -> None:
+    said = run("inspect", RENDERERS[name].write(tmp_path, FRAMES), None)
+    why = {"arnold": "header attribute arnold/version", "appleseed": "layer screen_space_velocity"}[name]
+    assert f"profile: {RENDERERS[name].profile} ({why})" in said
+    assert "taken" in said
+    assert "no motion" in said
