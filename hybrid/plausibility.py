@@ -38,6 +38,8 @@ LENGTH = 1.1
 EDGES = 0.05
 # The variance may differ from what the picture shows by this factor: the third quartile of their ratio was 1.3 to 1.7.
 VARIANCE = 4.0
+# So many readings of the vectors are shown.
+SHOWN = 6
 # Two pictures of which so many pixels are equal are one.
 EQUAL = 0.99
 
@@ -86,6 +88,17 @@ class Judgement:
     def warnings(self) -> tuple[str, ...]:
         """One line for each thing that does not make sense."""
         return tuple(finding.message for finding in self.findings if finding.warning)
+
+    def readings(self) -> list[tuple[str, str, str]]:
+        """What was tried for the motion, the best first: "taken" or "", how vectors are read, and what that leaves."""
+        if self.motion is None:
+            return []
+        tried = [(trial.convention, str(trial.convention), trial.unexplained) for trial in self.motion.trials[:SHOWN]]
+        rows = [(convention == self.motion.convention, said, share) for convention, said, share in tried]
+        rows.append((False, "no motion", self.motion.still))
+        if self.motion.found is not None:
+            rows.append((self.motion.convention is None, "found in the pictures", self.motion.found))
+        return [("taken" if taken else "", said, f"{share:.2%}") for taken, said, share in rows]
 
     def apply(self, shot: Shot) -> Shot:
         """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""

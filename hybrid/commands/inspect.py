@@ -26,12 +26,7 @@ from hybrid.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from flow.convention import Choice
     from hybrid.plan import Decision
-
-
-# How many readings of the vectors are shown, the best first.
-READINGS = 6
 
 
 def inspect(
@@ -76,7 +71,7 @@ def inspect(
             "reason": layers.reason,
             "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in rows],
             "judged": [asdict(finding) for finding in judgement.findings],
-            "motion": None if judgement.motion is None else _readings(judgement.motion),
+            "motion": judgement.readings(),
             "plan": [asdict(decision) for decision in plan.decisions],
         }
         typer.echo(json.dumps(document, indent=1))
@@ -91,12 +86,12 @@ def inspect(
     for finding in judgement.findings:
         if not finding.warning:
             console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
-    if judgement.motion is not None:
+    if readings := judgement.readings():
         title = "Motion: what the vectors leave unexplained"
         table = Table(
             "", "read as", "of the picture", title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False
         )
-        for row in _readings(judgement.motion):
+        for row in readings:
             table.add_row(*row)
         console.print(table)
     table = Table("", "stage", "measured", "why", title="Plan", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
@@ -104,15 +99,6 @@ def inspect(
         why = f"{decision.reason} ({STAGES[decision.stage]})"
         table.add_row("on" if decision.on else "off", decision.stage, _measured(decision), Text(printable(why)))
     console.print(table)
-
-
-def _readings(choice: Choice) -> list[tuple[str, str, str]]:
-    """What was tried for the motion: whether it is taken, how vectors are read, and what that leaves."""
-    rows = [(t.convention == choice.convention, str(t.convention), t.unexplained) for t in choice.trials[:READINGS]]
-    rows.append((False, "no motion", choice.still))
-    if choice.found is not None:
-        rows.append((choice.convention is None, "found in the pictures", choice.found))
-    return [("taken" if taken else "", reading, f"{share:.2%}") for taken, reading, share in rows]
 
 
 def _measured(decision: Decision) -> str:
