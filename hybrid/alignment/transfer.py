@@ -82,3 +82,32 @@ def measure_exposure(radiance: Array) -> float:
     bright = np.partition(level, -1 - level.size // 100)[-1 - level.size // 100]
     mean = float(np.minimum(level, bright).mean(dtype=np.float64))
     return mean if mean > NO_LIGHT else 1.0
+
+
+def autoexposure(radiance: Array) -> float:
+    """Factor that OIDN multiplies an image by, so that all of its parts can be given that of the whole.
+
+    Parameters
+    ----------
+    radiance : (H, W, 3) array
+        Linear radiance, finite; what is negative counts as 0.
+
+    Returns
+    -------
+    float
+        Positive; ``autoexposure(a·x) = autoexposure(x) / a``. 1 for an image without light.
+
+    Notes
+    -----
+    ``0.18 / 2^mean(log2 L)``, L the mean luminances above 1e-8 of bins of at most 16×16 pixels, as in OIDN's
+    ``training/color.py``; `network.trunk.autoexposure` is the same in torch.
+    """
+    luminance = np.maximum(radiance, 0) @ np.array([0.212671, 0.715160, 0.072169])  # float64: no sum overflows
+    for axis in (0, 1):
+        length = luminance.shape[axis]
+        bins = -(-length // 16)
+        edges = np.arange(bins + 1) * length // bins
+        luminance = np.add.reduceat(luminance, edges[:-1], axis=axis)
+        luminance /= np.diff(edges).reshape((-1, 1) if axis == 0 else (1, -1))
+    lit = luminance[luminance > 1e-8]
+    return float(0.18 / np.exp2(np.log2(lit).mean())) if lit.size else 1.0

@@ -208,20 +208,22 @@ def window_maps(aligned: AlignedWindow, denoise: DenoiseWindow) -> dict[str, Arr
 # Peers
 
 
-def oidn(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
+def oidn(shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:
     """OIDN on each frame by itself."""
     for number in shot.numbers:
         yield number, estimate_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 
 
-def oidn_then_average(shot: Shot, *, quality: Quality = "high", prefilter: bool = False) -> Iterator[tuple[int, Array]]:
+def oidn_then_average(
+    shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = None
+) -> Iterator[tuple[int, Array]]:
     """OIDN on each frame, then the aligned robust average of what it gave."""
     aligner = Aligner(MappedShot(shot, partial(_denoised, quality=quality, prefilter=prefilter)), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(aligner.align(number))
 
 
-def _denoised(frame: Frame, quality: Quality, prefilter: bool) -> Frame:
+def _denoised(frame: Frame, quality: Quality, prefilter: Quality | None) -> Frame:
     return replace(frame, color=estimate_oidn(frame, quality=quality, prefilter=prefilter), variance=None)
 
 
@@ -298,7 +300,7 @@ def _network(preset: str, source: str) -> Method:
     return Method(run, "Networks", maps, settings={"weights": preset, "estimates": source})
 
 
-def _oidn(quality: Quality, prefilter: bool) -> Method:
+def _oidn(quality: Quality, prefilter: Quality | None = None) -> Method:
     guides = "prefiltered, cleanAux" if prefilter else "as given"
     run = partial(oidn, quality=quality, prefilter=prefilter)
     return Method(run, "OIDN", settings={"quality": quality, "guides": guides})
@@ -320,12 +322,12 @@ METHODS: dict[str, Method] = {
     "network without OIDN": _network("quality", "nlm"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
     "tKPCN": _network("tkpcn", "none"),
-    "OIDN fast": _oidn("fast", prefilter=False),
-    "OIDN high": _oidn("high", prefilter=False),
-    "OIDN balanced": _oidn("balanced", prefilter=False),
-    "OIDN best": _oidn("high", prefilter=True),
-    "OIDN balanced + clean guides": _oidn("balanced", prefilter=True),
-    "OIDN best + robust average": Method(partial(oidn_then_average, prefilter=True), "OIDN"),
+    "OIDN fast": _oidn("fast"),
+    "OIDN high": _oidn("high"),
+    "OIDN balanced": _oidn("balanced"),
+    "OIDN best": _oidn("high", prefilter="high"),
+    "OIDN balanced + clean guides": _oidn("balanced", prefilter="balanced"),
+    "OIDN best + robust average": Method(partial(oidn_then_average, prefilter="high"), "OIDN"),
     "scikit-image NLM": Method(skimage_nlm, "Libraries"),
     "OpenCV temporal NLM": Method(opencv_nlm, "Libraries"),
 }

@@ -11,7 +11,7 @@ from hybrid import estimates
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OfCleanGuides, OfFrames, OfWindows, choose_estimate
+from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
 from hybrid.files.frames import open_shot
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
@@ -52,42 +52,53 @@ def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_f
     np.testing.assert_array_equal(gated_average(windows[2]), gated_average(alone))
 
 
-def noisy_albedo(index, layers):
-    """What depth of field makes of an albedo."""
-    noise = np.random.default_rng(100 + index).standard_normal((SCENE.height, SCENE.width, 3))
-    name = "ViewLayer.Denoising Albedo"
-    layers[name] = np.clip(layers[name] + 0.05 * noise, 0, 1).astype(np.float32)
+def lost_pixels(index, layers):
+    """What a denoiser must not be given."""
+    layers["ViewLayer.Combined"][10, 20] = np.inf
+    layers["ViewLayer.Denoising Albedo"][5, 6] = np.nan
+    layers["ViewLayer.Denoising Normal"] = layers["ViewLayer.Denoising Normal"].copy()
+    layers["ViewLayer.Denoising Normal"][7, 8] = np.nan
 
 
-def test_guides_are_prefiltered_for_those_who_rely_on_them(tmp_path):
-    shot = open_shot(SCENE.write(tmp_path, edit=noisy_albedo))
+@pytest.mark.parametrize("stages", [STAGES, STAGES | {"prefilter"}])
+def test_a_denoiser_is_told_whether_guides_hold_noise(tmp_path, stages):
+    shot = open_shot(SCENE.write(tmp_path, edit=lost_pixels))
     seen = {}
 
-    def denoise(frame):
+    def denoise(frame, noisy_guides):
         assert frame.number not in seen
+        assert noisy_guides == ("prefilter" in stages)
         seen[frame.number] = frame
         return frame.color
 
-    aligner = Aligner(shot, STAGES | {"prefilter"}, estimates=OfCleanGuides(denoise))
+    aligner = Aligner(shot, stages, estimates=OfGuidedFrames(denoise))
     for number in shot.numbers:
         aligner.align(number)
     assert sorted(seen) == list(shot.numbers)
     given = shot.read(MIDDLE)
-    truth = SCENE.clean(2)["ViewLayer.Denoising Albedo"]
-    error, before = (np.abs(albedo - truth).mean() for albedo in (seen[MIDDLE].albedo, given.albedo))
-    # The mean of three frames alone would leave 0.58 of it; noise hides which pixels are alike, so 0.67.
-    assert error < 0.8 * before
-    np.testing.assert_allclose(seen[MIDDLE].color, given.color, rtol=1e-5)
+    for name in ("color", "albedo", "normal"):
+        before, after = getattr(given, name), getattr(seen[MIDDLE], name)
+        assert np.isfinite(after).all()
+        known = np.isfinite(before).all(axis=-1) & np.isfinite(given.albedo).all(axis=-1)
+        np.testing.assert_allclose(after[known], before[known], rtol=1e-5)
 
 
-def test_guides_without_noise_are_left_as_they_are(tmp_path):
+def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: calls.append(mode) or color)
     shot = open_shot(SCENE.write(tmp_path))
-    seen = []
-    aligner = Aligner(shot, STAGES, radius=0, estimates=OfCleanGuides(lambda frame: seen.append(frame) or frame.color))
-    aligner.align(MIDDLE)
-    (frame,) = seen
-    np.testing.assert_array_equal(frame.albedo, shot.read(MIDDLE).albedo)
-    np.testing.assert_array_equal(frame.normal, shot.read(MIDDLE).normal)
+    best = {"quality": "high", "prefilter": "high"}
+    for mode, noisy, clean in (
+        ("oidn", {"quality": "high"}, {"quality": "high"}),
+        ("oidn-fast", {"quality": "fast"}, {"quality": "fast"}),
+        ("oidn-clean", {**best, "prefilter": "balanced"}, {**best, "prefilter": None, "clean": True}),
+        ("oidn-best", best, best),
+    ):
+        for stages, expected in ((STAGES | {"prefilter"}, noisy), (STAGES, clean)):
+            calls.clear()
+            Aligner(shot, stages, radius=0, estimates=choose_estimate(mode, shot).estimates).align(MIDDLE)
+            assert calls == [expected]
 
 
 def test_frames_needed_are_those_that_are_read(tmp_path):
@@ -98,7 +109,7 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
     def same(frame):
         return frame.color
 
-    for source in (None, OfFrames(same), OfCleanGuides(same), OfWindows(DRAFT)):
+    for source in (None, OfFrames(same), OfGuidedFrames(lambda frame, _: frame.color), OfWindows(DRAFT)):
         aligner, read = Aligner(shot, stages, estimates=source), []
         aligner.shot.read = lambda number, read=read: read.append(number) or type(shot).read(shot, number)
         aligner.align(scene.first + 7)

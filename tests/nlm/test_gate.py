@@ -19,7 +19,7 @@ def test_matches_the_formula_in_a_flat_picture():
     q = 0.3 * (tone(1.1) - tone(1)) + 0.004
     d = tone(1.02) - tone(1)
     weight = color_gate(estimates, noisy, 1.0)
-    np.testing.assert_allclose(weight[0], np.exp(-((d / q) ** 2) * (1 + 1 / 16)), rtol=1e-4)  # 1 - 1/x in float32
+    np.testing.assert_allclose(weight[0], np.exp(-((d / q) ** 2)), rtol=1e-4)  # 1 - 1/x in float32
     np.testing.assert_array_equal(weight[1:], 1)
 
 
@@ -33,6 +33,15 @@ def test_shuts_on_moving_light_and_stays_open_on_noise(rng):
     assert weight[0, :, 28:].min() > 0.8
     assert weight[2].min() > 0.8
     assert weight.max() <= 1
+
+
+def test_stays_open_on_errors_of_single_pixels(rng):
+    """The weight must not choose the frames whose errors are the centre's."""
+    estimates = np.full((3, 40, 40, 3), 0.5, np.float32)
+    estimates += rng.choice([-0.08, 0.08], estimates.shape)
+    noisy = estimates[1] + rng.normal(0, 0.1, estimates.shape[1:]).astype(np.float32)
+    # Means of 9×9 pixels differ by 0.006 in tone-mapped units, a third of the gate's scale; pixels by twice the scale.
+    assert color_gate(estimates, noisy, 0.5).mean() > 0.8
 
 
 def test_does_not_depend_on_the_exposure(rng):

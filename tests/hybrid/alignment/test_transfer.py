@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from hybrid.alignment.transfer import ALBEDO_FLOOR, compress, demodulate, expand, measure_exposure, remodulate
+from hybrid.alignment.transfer import (
+    ALBEDO_FLOOR,
+    autoexposure,
+    compress,
+    demodulate,
+    expand,
+    measure_exposure,
+    remodulate,
+)
 
 
 @pytest.fixture
@@ -54,3 +62,20 @@ def test_exposure_ignores_fireflies_and_what_is_not_finite(radiance):
 @pytest.mark.parametrize("image", [np.zeros((4, 5, 3)), np.full((4, 5, 3), np.nan), np.zeros((0, 5, 3))])
 def test_exposure_of_an_image_without_light_is_one(image):
     assert measure_exposure(image.astype(np.float32)) == 1.0
+
+
+def test_autoexposure_is_that_of_bins():
+    radiance = np.random.default_rng(4).gamma(0.3, 1, (33, 50, 3)).astype(np.float32)
+    radiance[:11, :13] = 0  # a bin without light counts for nothing
+    logs = []
+    for i in range(3):
+        for j in range(4):
+            block = radiance[i * 33 // 3 : (i + 1) * 33 // 3, j * 50 // 4 : (j + 1) * 50 // 4]
+            luminance = (block @ [0.212671, 0.715160, 0.072169]).mean()
+            if luminance > 1e-8:
+                logs.append(np.log2(luminance))
+    assert len(logs) == 11
+    assert autoexposure(radiance) == pytest.approx(0.18 / 2 ** np.mean(logs), rel=1e-6)
+    assert autoexposure(64 * radiance) == pytest.approx(autoexposure(radiance) / 64, rel=1e-6)
+    assert autoexposure(np.full((3, 3, 3), 3e38, np.float32)) > 0
+    assert autoexposure(np.zeros((20, 20, 3), np.float32)) == 1
