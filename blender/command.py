@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -113,6 +114,12 @@ class Run:
         """What it has warned of."""
         marked = (line.partition("warning: ") for line in self.log.splitlines())
         return [text for before, mark, text in marked if mark and not before.strip()]
+
+    @property
+    def remaining(self) -> str:
+        """How long it says that it will still take, such as ``7 min``; empty where it has not said so yet."""
+        said = re.findall(r"% *, about (.+) left$", self.log, re.MULTILINE)
+        return said[-1] if said else ""
 
     @property
     def error(self) -> str:

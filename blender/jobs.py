@@ -61,7 +61,8 @@ class Job:
         """What is being done, in a few words."""
         if self.run is None:
             return "Rendering"
-        return f"Denoising: {self.run.finished} of {self.run.total} frames"
+        text = f"Denoising: {self.run.finished} of {self.run.total} frames"
+        return f"{text}, {self.run.remaining} left" if self.run.remaining else text
 
     def cancel(self) -> None:
         """Ask `ravg` to stop, or do not start it."""

@@ -92,6 +92,21 @@ def test_warnings_are_collected(tmp_path):
     assert warned.warnings == ["one seed", "frame 3 is missing"]
 
 
+def test_what_is_left_is_what_it_has_said_last(tmp_path):
+    """As `ravg` writes where there is no terminal; `test_extension.py` sees it do so."""
+    lines = [
+        "denoise: 0 of 3 frames, 0 %",
+        "frame 1 9.0 s: 1 of 3 frames, 33 %, about 18 s left",
+        "frame 2: 1 fireflies",
+    ]
+    told = run(f"print({lines[0]!r})", tmp_path)
+    told.wait()
+    assert told.remaining == ""
+    told = run(f"print({chr(10).join(lines)!r})", tmp_path)
+    told.wait()
+    assert told.remaining == "18 s"
+
+
 def test_letters_of_all_kinds_reach_the_log(tmp_path, monkeypatch):
     monkeypatch.setenv("LC_ALL", "C")
     spoken = run("print('1920×1080 – ≈')", tmp_path)
