@@ -22,8 +22,8 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frames import open_shot
-from network.inputs import window_exposure
 from network.losses import ImageLoss, l1, relmse, smape
 from network.perceptual import Perceptual, load_vgg19
 
@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
                 torch.from_numpy(shot.read(number).color).permute(2, 0, 1)[None].contiguous()
                 for shot in (noisy, reference)
             )
-            scale = window_exposure(mean[None])
+            scale = torch.tensor([measure_exposure(reference.read(number).color)])
             gains.setdefault("mean of the noisy frame", []).append(float(target.mean() / mean.mean()))
             for name, loss in losses(options.vgg).items():
                 gains.setdefault(name, []).append(favourite_mean(loss, mean, target, scale))

@@ -52,7 +52,7 @@ class Clip:
     noisy, pseudo_reference : Tensor
         ``(L, 3, H, W)`` radiance of the centre, as rendered and as estimated from the level's own window.
     exposure : Tensor
-        ``(L,)``, of the windows of whole frames.
+        ``(L,)``, of the windows of whole frames: what the network is told when it runs.
     reference : Tensor, optional
         ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
 

@@ -11,33 +11,6 @@ CHANNELS = 10
 ESTIMATE_CHANNELS = 6
 
 
-def window_exposure(color: Tensor) -> Tensor:
-    """Scale of a window's radiance: a mean that fireflies cannot move.
-
-    Parameters
-    ----------
-    color : Tensor
-        ``(N, T, C, H, W)``, finite, linear.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``, positive; 1 for a black window. ``window_exposure(a·x) = a·window_exposure(x)``.
-
-    Notes
-    -----
-    The mean m of the pixels, then three times the mean of ``min(x, 4 m)``. One pixel of 1e6 in a million of 0.2
-    moves the first mean to 1.2 and the last by less than 1e-6. Take it of whole frames, never of tiles: tiles
-    of different exposure would show their seams.
-    """
-    brightness = color.mean(2).clamp_min(0).flatten(1)
-    mean = brightness.mean(1, keepdim=True)
-    for _ in range(3):
-        mean = torch.minimum(brightness, 4 * mean).mean(1, keepdim=True)
-    # 1e-30: next to no light; the reciprocal of a denormal would be infinite.
-    return torch.where(mean > 1e-30, mean, torch.ones_like(mean)).squeeze(1)
-
-
 def network_inputs(
     color: Tensor,
     albedo: Tensor | None,
@@ -57,7 +30,8 @@ def network_inputs(
     confidence : Tensor
         ``(N, T, 1, H, W)`` in [0, 1].
     exposure : Tensor
-        ``(N,)`` from `window_exposure`.
+        ``(N,)``, positive: the brightness of each window as a whole, proportional to its radiance. Of whole frames and
+        never of tiles: tiles of different exposure would show their seams.
     estimate : Tensor, optional
         ``(N, T, 3, H, W)`` aligned estimates, irradiance, for a model that takes them.
 

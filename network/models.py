@@ -706,8 +706,8 @@ def denoise_tile(
         In the precision of `for_inference`.
     window : mapping
         ``color``, ``(N, T, 3, H, W)`` aligned irradiance, float32, finite; ``albedo``, ``normal`` and ``estimate``
-        likewise, or None; ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, from
-        `network.inputs.window_exposure`.
+        likewise, or None; ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, as for
+        `network.inputs.network_inputs`.
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.
     aovs : Tensor, optional

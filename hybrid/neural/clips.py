@@ -12,11 +12,10 @@ import torch
 from hybrid.alignment.align import Aligner
 from hybrid.estimates import choose_estimate
 from hybrid.files.frames import Shot
-from hybrid.neural.denoiser import tensor_of
+from hybrid.neural.denoiser import exposure_of, tensor_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average
 from network.clips import Clip, importance, important_places, write_shards
-from network.inputs import window_exposure
 from nlm.average import replace_nonfinite
 
 
@@ -129,7 +128,7 @@ def _level(shot: Shot, aligner: Aligner, number: int) -> dict[str, torch.Tensor]
         "modulation": tensor_of(aligned.modulation[None])[:, 0],
         "noisy": tensor_of(noisy[None])[:, 0],
         "pseudo_reference": tensor_of(gated_average(aligned)[None])[:, 0],
-        "exposure": window_exposure(tensor_of(color)),
+        "exposure": exposure_of(aligned),
     }
 
 

@@ -160,7 +160,7 @@ class Denoiser:
         frames, height, width = color.shape[:3]
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
         given = {name: layer for name, layer in layers.items() if name != "aovs"}
-        exposure = torch.tensor([aligned.exposure], dtype=torch.float32)
+        exposure = exposure_of(aligned)
         irradiance, filtered = np.empty_like(color[centre]), np.empty_like(others[centre])
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in _tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
@@ -205,6 +205,11 @@ def _solid(alpha: Array) -> NDArray[np.bool_]:
     box = np.ones((3, 3), np.uint8)
     covered, empty = (cv2.erode((alpha[..., 0] == value).astype(np.uint8), box) > 0 for value in (1, 0))
     return np.logical_or(covered, empty)[..., None]
+
+
+def exposure_of(aligned: AlignedWindow) -> torch.Tensor:
+    """Brightness that a network is told a window has, (1,): in training and in running."""
+    return torch.tensor([aligned.exposure], dtype=torch.float32)
 
 
 def tensor_of(window: Array) -> torch.Tensor:

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch")
 
+from hybrid.alignment.transfer import measure_exposure  # noqa: E402
 from hybrid.comparison import metrics  # noqa: E402
 from hybrid.estimates import MODE_OF  # noqa: E402
 from hybrid.neural.denoiser import shipped_weights  # noqa: E402
 from network import losses  # noqa: E402
 from network.blocks import ravg  # noqa: E402
 from network.checkpoint import load_model  # noqa: E402
-from network.inputs import window_exposure  # noqa: E402
 from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
 from network.models import denoise_tile, fast, filter_window, for_inference, unet  # noqa: E402
 from network.perceptual import VGG19, Perceptual  # noqa: E402
@@ -122,7 +122,8 @@ def hard_window(level: float) -> dict[str, torch.Tensor]:
     estimate = color.mean((-2, -1), keepdim=True).expand_as(color)
     color[0, 2, :, 5, 5] = 1e6
     confidence = torch.randint(0, 2, (1, 5, 1, 32, 32)).float()
-    return {"color": color, "estimate": estimate, "confidence": confidence, "exposure": window_exposure(color)}
+    exposure = torch.tensor([measure_exposure(color.movedim(2, -1).numpy())])
+    return {"color": color, "estimate": estimate, "confidence": confidence, "exposure": exposure}
 
 
 @pytest.mark.parametrize("preset", [fast, unet])

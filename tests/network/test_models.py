@@ -10,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.inputs import network_inputs, window_exposure
+from network.inputs import network_inputs
 from network.kernels import apply_kernels, mean_of
 from network.models import (
     PRESETS,
@@ -65,94 +65,16 @@ def small_tkpcn(kernel: KernelConfig = SMALL) -> TKPCN:
     return TKPCN(TKPCNConfig(kernel, width=4, blocks=2))
 
 
+def exposure(color: torch.Tensor) -> torch.Tensor:
+    """Brightness of a window; 1 of a black one."""
+    mean = color.mean((1, 2, 3, 4))
+    return torch.where(mean > 0, mean, 1)
+
+
 @torch.no_grad()
 def run(model: RAUNet | RAResNet | TKPCN | MultiScale, data: dict[str, torch.Tensor]) -> torch.Tensor:
     """Kernels of a window."""
-    return model(network_inputs(**data, exposure=window_exposure(data["color"])), data["confidence"])
-
-
-# Inputs
-
-
-def test_exposure_is_the_mean_of_an_image_without_outliers() -> None:
-    color = uniform(2, 3, 3, 16, 16) + 0.5  # nothing is above four times the mean
-    torch.testing.assert_close(window_exposure(color), color.mean((1, 2, 3, 4)))
-
-
-def test_exposure_scales_with_the_image() -> None:
-    color = uniform(1, 3, 3, 16, 16) ** 8  # skewed, so that the limit is at work
-    for scale in (2.0**-20, 2.0**20):
-        assert torch.equal(window_exposure(color * scale), window_exposure(color) * scale)  # powers of two: exact
-    torch.testing.assert_close(window_exposure(color * 1234.5), window_exposure(color) * 1234.5)
-
-
-def test_a_firefly_does_not_move_the_exposure() -> None:
-    color = uniform(1, 5, 3, 32, 32)
-    before = window_exposure(color)
-    color[0, 2, :, 5, 5] = 1e6
-    # 1 pixel of 5120 now counts as at most 4 means.
-    torch.testing.assert_close(window_exposure(color), before, rtol=5e-3, atol=0)
-
-
-def test_the_exposure_of_a_black_window_is_one() -> None:
-    assert window_exposure(torch.zeros(2, 3, 3, 4, 4)).tolist() == [1, 1]
-
-
-def test_channels_and_their_order() -> None:
-    data = window()
-    estimate = uniform(1, 3, 3, 8, 12, seed=9)
-    features = network_inputs(**data, exposure=torch.tensor([0.5]), estimate=estimate)
-    log = torch.log1p(estimate / 0.5)
-    expected = torch.cat(
-        [
-            torch.log1p(data["color"] / 0.5),
-            torch.log1p(data["albedo"]),
-            data["normal"],
-            data["confidence"],
-            log,
-            10 * (log - log[:, 1:2]),
-        ],
-        2,
-    )
-    torch.testing.assert_close(features, expected)
-    without = network_inputs(**data, exposure=torch.tensor([0.5]))
-    torch.testing.assert_close(without, expected[:, :, :10])
-
-
-def test_what_is_missing_is_zero() -> None:
-    data = window()
-    features = network_inputs(data["color"], None, None, data["confidence"], torch.ones(1))
-    assert not bool(features[:, :, 3:9].any())
-
-
-def test_features_do_not_depend_on_the_scale_of_the_radiance() -> None:
-    data = window()
-    scaled = {**data, "color": data["color"] * 4096}
-    features, same = (network_inputs(**d, exposure=window_exposure(d["color"])) for d in (data, scaled))
-    assert torch.equal(features, same)  # a power of two
-
-
-def test_extreme_radiance_stays_finite_and_moderate() -> None:
-    data = window()
-    data["color"][0, 0, 0, 0] = torch.tensor([1e6, -3.0, 0.0] * 4)
-    features = network_inputs(**data, exposure=torch.tensor([0.5]))
-    assert float(features.max()) < 16  # log1p(2e6) = 14.5
-    assert float(features[:, :, :3].min()) == 0
-
-
-@pytest.mark.parametrize("name", ["albedo", "normal", "confidence"])
-def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
-    data = window()
-    data[name] = data[name][..., :-1]
-    with pytest.raises(ValueError, match=f"{name}: expected shape"):
-        network_inputs(**data, exposure=torch.ones(1))
-
-
-def test_an_exposure_or_an_estimate_of_another_shape_is_an_error() -> None:
-    with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
-        network_inputs(**window(), exposure=torch.ones(2))
-    with pytest.raises(ValueError, match="estimate: expected shape"):
-        network_inputs(**window(), exposure=torch.ones(1), estimate=torch.zeros(1, 3, 8, 12))
+    return model(network_inputs(**data, exposure=exposure(data["color"])), data["confidence"])
 
 
 # Kernels of an untrained model
@@ -366,7 +288,7 @@ def test_configurations_say_what_is_wrong(make, message: str) -> None:  # type: 
 
 
 def denoised(model: RAUNet, data: dict[str, torch.Tensor], **more: torch.Tensor) -> torch.Tensor:
-    return denoise_tile(model, {"exposure": window_exposure(data["color"]), **data, **more})[0]
+    return denoise_tile(model, {"exposure": exposure(data["color"]), **data, **more})[0]
 
 
 def test_denoising_is_scale_equivariant() -> None:
@@ -422,9 +344,9 @@ def test_a_tile_is_denoised_as_the_frame_is_if_it_has_its_halo() -> None:
     """Beyond its receptive field the network cannot see where a tile was cut."""
     model = small_unet(widths=(4, 4), ra_scales=(1,))
     data = window(h=48, w=48)
-    exposure = window_exposure(data["color"])
-    whole = denoised(model, data, exposure=exposure)
-    tile = denoised(model, {k: v[..., :32, :32] for k, v in data.items()}, exposure=exposure)
+    brightness = exposure(data["color"])
+    whole = denoised(model, data, exposure=brightness)
+    tile = denoised(model, {k: v[..., :32, :32] for k, v in data.items()}, exposure=brightness)
     # The field's radius is 26 here, half of it from the chain of three RA steps at half scale.
     torch.testing.assert_close(tile[..., :4, :4], whole[..., :4, :4], rtol=1e-4, atol=1e-5)
 

@@ -13,11 +13,9 @@ from hybrid.alignment.align import Aligner  # noqa: E402
 from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.estimates import OfWindows  # noqa: E402
 from hybrid.files.frames import open_shot  # noqa: E402
-from hybrid.neural.clips import write_clips  # noqa: E402
 from hybrid.neural.denoiser import Denoiser, shipped_weights  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
 from network.checkpoint import save_model  # noqa: E402
-from network.clips import open_clips  # noqa: E402
 from network.models import fast, unet  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -144,44 +142,6 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
     np.testing.assert_allclose(images[1], images[0], atol=1e-6)
     assert images[1][:, 60:].max() < 1e-3
     assert (images[1][:, 240:] == 0).all()  # exactly what was there
-
-
-def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
-    noisy = open_shot(SCENE.write(tmp_path / "noisy"))
-    clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
-    frames = []
-    levels = {"noisy": noisy, "clean": clean}
-    write_clips(levels, [4, 64], tmp_path, "wall", tile=0, estimate="nlm", advance=lambda: frames.append(1))
-    clips = open_clips(tmp_path)
-    assert len(clips) == len(frames) == SCENE.frames
-    assert clips.shots == ["wall"]
-    assert clips.pairs(2) == [[(1, "noisy"), (1, "pseudo_reference")], [(1, "pseudo_reference")]]
-    values = {name: value.float().numpy() for name, value in clips.read(2, 0, (1, "noisy")).items()}
-    truth = SCENE.clean(2)["ViewLayer.Combined"].transpose(2, 0, 1)
-    unit = truth.mean() / values["target"].mean()  # radiance is stored over the exposure of the cleanest level
-    np.testing.assert_allclose(values["target"] * unit, truth, rtol=2e-3)  # half has 11 bits
-    # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
-    radiance = values["color"][2] * values["modulation"] * unit
-    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
-
-
-def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
-    shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
-    (tmp_path / "clips").mkdir()
-    write_clips({"noisy": shot}, [4], tmp_path / "clips", "whole", tile=0, estimate="nlm")
-    write_clips({"noisy": shot}, [4], tmp_path / "clips", "tiles", tile=32, tiles=3, estimate="nlm")
-    clips = open_clips(tmp_path / "clips")
-    whole = clips.of(["whole"]).read(0, 0, (0, "pseudo_reference"))
-    tiles = clips.of(["tiles"])
-    assert len(tiles) == 3
-    for index in range(3):
-        tile = tiles.read(index, 0, (0, "pseudo_reference"))
-        assert tile["color"].shape == (5, 3, 32, 32)
-        assert float(tile["exposure"]) == float(whole["exposure"])
-        windows = whole["color"][2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
-        assert bool((windows == tile["color"][2]).all(-1).all(-1).all(-1).any())  # it is one of them
-    with pytest.raises(ValueError, match="tile: expected at most the frame's 90×70 pixels, got 80"):
-        write_clips({"noisy": shot}, [4], tmp_path, "large", tile=80, estimate="nlm")
 
 
 def test_contributions_sum_to_the_result_and_weights_to_one(folder, weights):

@@ -1,0 +1,119 @@
+"""Training clips: what they hold is what the network is given, and what it should say."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from hybrid.alignment.align import Aligner
+from hybrid.estimates import OfWindows
+from hybrid.files.frames import open_shot
+from hybrid.neural import clips as module
+from hybrid.neural import denoiser
+from hybrid.neural.clips import write_clips
+from hybrid.plan import Rules
+from hybrid.pseudo_reference import FINAL, gated_average
+from network.checkpoint import save_model
+from network.clips import Clip, open_clips
+from network.models import fast
+from tests.scenes import Scene
+
+pytestmark = pytest.mark.neural
+
+SCENE = Scene(height=70, width=90, frames=5)
+MIDDLE = SCENE.first + 2
+
+
+def bright_window(index, layers):
+    """A dim room: a twentieth of the picture is 300 times as bright as the rest."""
+    layers["ViewLayer.Combined"][10:25, 20:41] *= 300
+
+
+@pytest.fixture
+def dim(tmp_path):
+    """A shot whose brightness one measures one way or another: five times as much, or as little."""
+    return open_shot(SCENE.write(tmp_path / "dim", edit=bright_window))
+
+
+def prepare(shot, monkeypatch, tmp_path, **options) -> list[Clip]:
+    """Clips of a shot, before they are packed into files."""
+    found: list[Clip] = []
+    monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
+    write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="nlm", **options)
+    return found
+
+
+def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monkeypatch):
+    """The exposure too, which used to be measured in two ways."""
+    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
+    given = {}
+
+    def spy(model, window, **options):
+        given.update(window)
+        raise StopIteration
+
+    monkeypatch.setattr(denoiser, "denoise_tile", spy)
+    save_model(tmp_path / "w.safetensors", fast())
+    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
+    window = Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    with pytest.raises(StopIteration):
+        denoiser.Denoiser(tmp_path / "w.safetensors", tile=128, precision="float32")(window)
+    assert set(given) == {"color", "albedo", "normal", "estimate", "confidence", "exposure"}
+    for name, value in given.items():
+        if name != "exposure":  # tiles are padded to a multiple of 32 at the right and the bottom
+            value = value[..., : SCENE.height, : SCENE.width]
+        np.testing.assert_array_equal(value, getattr(clip, name), err_msg=name)
+
+
+def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_path, monkeypatch):
+    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
+    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
+    window = Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    image = clip.pseudo_reference[0].permute(1, 2, 0).numpy()
+    np.testing.assert_array_equal(image, gated_average(window))
+    layers = SCENE.clean(2)
+    bright_window(2, layers)
+    truth, noisy = layers["ViewLayer.Combined"], clip.noisy[0].permute(1, 2, 0).numpy()
+    assert np.median(np.abs(image - truth) / truth) < 0.5 * np.median(np.abs(noisy - truth) / truth)
+
+
+def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
+    noisy = open_shot(SCENE.write(tmp_path / "noisy"))
+    clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
+    frames = []
+    levels = {"noisy": noisy, "clean": clean}
+    write_clips(levels, [4, 64], tmp_path, "wall", tile=0, estimate="nlm", advance=lambda: frames.append(1))
+    clips = open_clips(tmp_path)
+    assert len(clips) == len(frames) == SCENE.frames
+    assert clips.shots == ["wall"]
+    assert clips.pairs(2) == [[(1, "noisy"), (1, "pseudo_reference")], [(1, "pseudo_reference")]]
+    values = {name: value.float().numpy() for name, value in clips.read(2, 0, (1, "noisy")).items()}
+    truth = SCENE.clean(2)["ViewLayer.Combined"].transpose(2, 0, 1)
+    unit = truth.mean() / values["target"].mean()  # radiance is stored over the exposure of the cleanest level
+    np.testing.assert_allclose(values["target"] * unit, truth, rtol=2e-3)  # half has 11 bits
+    # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
+    radiance = values["color"][2] * values["modulation"] * unit
+    np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
+
+
+def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
+    (tmp_path / "clips").mkdir()
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "whole", tile=0, estimate="nlm")
+    write_clips({"noisy": shot}, [4], tmp_path / "clips", "tiles", tile=32, tiles=3, estimate="nlm")
+    clips = open_clips(tmp_path / "clips")
+    whole = clips.of(["whole"]).read(0, 0, (0, "pseudo_reference"))
+    tiles = clips.of(["tiles"])
+    assert len(tiles) == 3
+    for index in range(3):
+        tile = tiles.read(index, 0, (0, "pseudo_reference"))
+        assert tile["color"].shape == (5, 3, 32, 32)
+        assert float(tile["exposure"]) == float(whole["exposure"])
+        windows = whole["color"][2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
+        assert bool((windows == tile["color"][2]).all(-1).all(-1).all(-1).any())  # it is one of them
+    with pytest.raises(ValueError, match="tile: expected at most the frame's 90×70 pixels, got 80"):
+        write_clips({"noisy": shot}, [4], tmp_path, "large", tile=80, estimate="nlm")

@@ -1,0 +1,100 @@
+"""What the network sees of a window."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network.inputs import CHANNELS, ESTIMATE_CHANNELS, network_inputs
+
+pytestmark = pytest.mark.neural
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def window() -> dict[str, torch.Tensor]:
+    """A made-up aligned window."""
+    return {
+        "color": uniform(1, 3, 3, 8, 12),
+        "albedo": uniform(1, 3, 3, 8, 12, seed=1),
+        "normal": uniform(1, 3, 3, 8, 12, seed=2) * 2 - 1,
+        "confidence": uniform(1, 3, 1, 8, 12, seed=3),
+    }
+
+
+def test_channels_and_their_order() -> None:
+    data = window()
+    estimate = uniform(1, 3, 3, 8, 12, seed=9)
+    features = network_inputs(**data, exposure=torch.tensor([0.5]), estimate=estimate)
+    log = torch.log1p(estimate / 0.5)
+    expected = torch.cat(
+        [
+            torch.log1p(data["color"] / 0.5),
+            torch.log1p(data["albedo"]),
+            data["normal"],
+            data["confidence"],
+            log,
+            10 * (log - log[:, 1:2]),
+        ],
+        2,
+    )
+    torch.testing.assert_close(features, expected)
+    without = network_inputs(**data, exposure=torch.tensor([0.5]))
+    torch.testing.assert_close(without, expected[:, :, :10])
+
+
+def test_what_is_missing_is_zero() -> None:
+    data = window()
+    features = network_inputs(data["color"], None, None, data["confidence"], torch.ones(1))
+    assert not bool(features[:, :, 3:9].any())
+
+
+def test_features_do_not_depend_on_the_scale_of_the_radiance() -> None:
+    data = window()
+    scaled = {**data, "color": data["color"] * 4096}
+    features, same = (network_inputs(**d, exposure=d["color"].mean((1, 2, 3, 4))) for d in (data, scaled))
+    assert torch.equal(features, same)  # a power of two
+
+
+def test_extreme_radiance_stays_finite_and_moderate() -> None:
+    data = window()
+    data["color"][0, 0, 0, 0] = torch.tensor([1e6, -3.0, 0.0] * 4)
+    features = network_inputs(**data, exposure=torch.tensor([0.5]))
+    assert float(features.max()) < 16  # log1p(2e6) = 14.5
+    assert float(features[:, :, :3].min()) == 0
+
+
+@pytest.mark.parametrize("name", ["albedo", "normal", "confidence"])
+def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
+    data = window()
+    data[name] = data[name][..., :-1]
+    with pytest.raises(ValueError, match=f"{name}: expected shape"):
+        network_inputs(**data, exposure=torch.ones(1))
+
+
+def test_an_exposure_or_an_estimate_of_another_shape_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
+        network_inputs(**window(), exposure=torch.ones(2))
+    with pytest.raises(ValueError, match="estimate: expected shape"):
+        network_inputs(**window(), exposure=torch.ones(1), estimate=torch.zeros(1, 3, 8, 12))
+
+
+def test_numbers_of_channels_are_what_the_models_count_on() -> None:
+    data = window()
+    assert network_inputs(**data, exposure=torch.ones(1)).shape[2] == CHANNELS
+    features = network_inputs(**data, exposure=torch.ones(1), estimate=data["color"])
+    assert features.shape[2] == CHANNELS + ESTIMATE_CHANNELS
+
+
+def test_what_is_given_is_not_written_to() -> None:
+    data = window()
+    estimate = uniform(1, 3, 3, 8, 12, seed=9)
+    copies = {name: value.clone() for name, value in data.items()}
+    network_inputs(**data, exposure=torch.tensor([0.5]), estimate=estimate)
+    assert all(torch.equal(value, copies[name]) for name, value in data.items())
+    assert torch.equal(estimate, uniform(1, 3, 3, 8, 12, seed=9))
