@@ -13,10 +13,11 @@ import argparse
 import json
 import os
 import tempfile
+from operator import attrgetter
 from pathlib import Path
 
-from hybrid.comparison.compare import spread_seconds, time_methods
 from hybrid.comparison.methods import METHODS
+from hybrid.comparison.running import summarize_runs, time_methods
 from hybrid.files.exr import read_exr, write_layers
 from hybrid.files.frames import open_shot
 
@@ -50,20 +51,20 @@ def main(argv: list[str] | None = None) -> int:
         crop_shot(folder, width, height)
         load = os.getloadavg()[0]
         for _ in range(2):
-            runs, absent = time_methods(methods, open_shot(folder), rounds=options.rounds)
+            runs, absent = time_methods(methods, open_shot(folder), options.rounds)
             if absent:
                 raise SystemExit(f"absent: {absent}")
-            times.append(spread_seconds(runs))
+            times.append({name: summarize_runs(series) for name, series in runs.items()})
     base = options.methods[0]
     report: dict[str, object] = {
         "rounds": options.rounds,
         "crop": options.crop,
         "load_average_at_start": round(load, 1),
     }
-    for clock, index in (("wall", 0), ("cpu", 3)):
-        ratios = [{n: t[n][index] / t[base][index] for n in options.methods[1:]} for t in times]
+    for clock, figure in (("wall", attrgetter("median")), ("cpu", attrgetter("cpu"))):
+        ratios = [{n: figure(t[n]) / figure(t[base]) for n in options.methods[1:]} for t in times]
         report[clock] = {
-            "seconds_per_megapixel": [{n: round(t[n][index], 3) for n in options.methods} for t in times],
+            "seconds_per_megapixel": [{n: round(figure(t[n]), 3) for n in options.methods} for t in times],
             "ratios": [{n: round(r, 3) for n, r in ratio.items()} for ratio in ratios],
             "disagreement": round(
                 max(max(a / b, b / a) for a, b in zip(*(r.values() for r in ratios), strict=True)) - 1, 3

@@ -102,9 +102,11 @@ def compare(
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
     import tempfile
 
-    from hybrid.comparison.compare import compare_shot, result_table
-    from hybrid.comparison.results import Comparison, Cost, join, markdown_table, read_comparison
+    from hybrid.comparison.compare import compare_shot
+    from hybrid.comparison.results import Comparison, Cost, join, read_comparison
     from hybrid.comparison.samples import samples_of
+    from hybrid.comparison.store import FrameStore
+    from hybrid.comparison.tables import markdown_table, result_table
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]
@@ -166,7 +168,7 @@ def compare(
             from hybrid.comparison.report import report_images, write_report
 
             judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
-            images, truth = report_images(Path(folder), comparison, judged)
+            images, truth = report_images(FrameStore(Path(folder)), comparison, judged)
             page = write_report(output, comparison, images, truth, judged, others=others, exposure=exposure, cost=cost)
             LOG.info(f"wrote {page}")
     _show(markdown, markdown_table([comparison, *others], cost), result_table(comparison.results))
@@ -174,9 +176,9 @@ def compare(
 
 def _need_page() -> None:
     """Refuse a page that cannot be made here."""
-    if find_spec("jinja2") is None:
+    if missing := [name for name in ("jinja2", "resvg_py", "font_manrope") if find_spec(name) is None]:
         words = "expected: pip install 'ravg[compare]' (the table alone is made without)"
-        raise ValueError(f"the page of --output needs jinja2, which is not installed; {words}")
+        raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
 
 
 def _show(markdown: bool, text: str, table: RichTable) -> None:

@@ -1,35 +1,28 @@
-"""The chart of a measure against what it costs, laid out once and drawn twice: as SVG and as pixels."""
+"""The chart of a measure against what it costs, laid out once and drawn twice: as SVG for the page, and as PNG."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 
-import cv2
-import numpy as np
+from font_manrope import font_files
 from markupsafe import Markup
-from numpy.typing import NDArray
+from PIL import ImageFont
+from resvg_py import svg_to_bytes
 
 from hybrid.comparison.page import render
-from hybrid.comparison.results import (
-    COSTS,
-    Cost,
-    MethodResult,
-    Metric,
-    column_title,
-    format_bytes,
-    format_seconds,
-    pareto_front,
-)
+from hybrid.comparison.results import COSTS, Cost, MethodResult, Metric, pareto_front
+from hybrid.comparison.tables import format_bytes, format_seconds
 
 WIDTH, HEIGHT = 1000, 540
 LEFT, RIGHT, TOP, BOTTOM = 66, 20, 30, 484  # the plot's box, gutters included; RIGHT counts from the edge
 GUTTER = 76  # beside the axis, for methods whose cost is nothing or not known
 FONT = 13
-HAS_FONTS = hasattr(cv2, "FontFace")  # OpenCV 5; before it only Hershey's strokes
-HERSHEY_HEIGHT = 32.0  # pixels of a line at scale 1
+FONTS = {400: "Manrope", 600: "ManropeSemiBold"}  # by weight: the files of font_manrope
+SCALE = 1.6  # of the PNG against the units above
 RADIUS = 6.5
 
 # Okabe and Ito's palette, which people with any common colour blindness tell apart, without its yellow, which no
@@ -272,9 +265,7 @@ def _labelled(points: list[Point], front: Sequence[tuple[float, float]]) -> list
             _, x, y, box = min(free, key=lambda place: place[0])  # the first of the best
             taken.append(box)
             labels[p.result.name] = (x, y, text)
-    return [
-        Point(p.result, p.x, p.y, p.bar_x, p.bar_y, p.family, p.on_front, labels.get(p.result.name)) for p in points
-    ]
+    return [replace(p, label=labels.get(p.result.name)) for p in points]
 
 
 def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
@@ -282,13 +273,14 @@ def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
 
 
 def _text_width(text: str, weight: int = 400) -> float:
-    """The width of a text of the chart's size; measured ten times as large, since OpenCV rounds to pixels."""
-    if HAS_FONTS:
-        return cv2.getTextSize((1, 1), text, (0, 0), cv2.FontFace("sans"), 10 * FONT, weight)[2] / 10
-    return cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 10 * FONT / HERSHEY_HEIGHT, 1)[0][0] / 10
+    """The width of a text of the chart's size."""
+    return _font(weight).getlength(text) / 10
 
 
-# As SVG
+@cache
+def _font(weight: int) -> ImageFont.FreeTypeFont:
+    """A font ten times as large as the chart's: Pillow rounds what it measures to 1/64 pixel."""
+    return ImageFont.truetype(font_files[FONTS[weight]], 10 * FONT)
 
 
 def to_svg(chart: Chart) -> Markup:
@@ -314,94 +306,32 @@ def marker(family: int, size: float = RADIUS) -> str:
     return " ".join(f"{x * size:.2f},{y * size:.2f}" for x, y in SHAPES[family % len(SHAPES)])
 
 
-# As pixels
-
-SCALE = 1.6  # of the finished picture against the units above
-FINE = 2  # drawn so much larger, then averaged: OpenCV's own anti-aliasing is for thin lines only
-INK, FAINT, RULE, PAPER = "#1d1d1f", "#6e6e73", "#e4e4e7", "#ffffff"
-
-
-def to_pixels(chart: Chart) -> NDArray[np.uint8]:
-    """Draw as (H, W, 3) BGR on white, 1600 pixels wide, with a legend of the families below."""
-    rows = _legend_rows(chart.families)
-    tall = HEIGHT + 12 + 24 * len(rows)
-    zoom = SCALE * FINE
-    canvas = np.full((round(tall * zoom), round(WIDTH * zoom), 3), 255, np.uint8)
-    _, top, right, bottom = chart.box
-
-    def line(a: tuple[float, float], b: tuple[float, float], color: str, width: float = 1.0) -> None:
-        cv2.line(canvas, _pixel(a, zoom), _pixel(b, zoom), _bgr(color), max(1, round(width * zoom)), cv2.LINE_AA)
-
-    def text(x: float, y: float, words: str, color: str, weight: int = 400, anchor: float = 0.0) -> None:
-        x -= anchor * _text_width(words, weight)
-        at, size = _pixel((x, y), zoom), FONT * zoom
-        if HAS_FONTS:
-            cv2.putText(canvas, words, at, _bgr(color), cv2.FontFace("sans"), round(size), weight)
-        else:
-            thick, size = round(zoom / 2), size / HERSHEY_HEIGHT
-            cv2.putText(canvas, words, at, cv2.FONT_HERSHEY_DUPLEX, size, _bgr(color), thick, cv2.LINE_AA)
-
-    def mark(x: float, y: float, family: int, filled: bool, size: float) -> None:
-        shape = np.array(SHAPES[family % len(SHAPES)]) * size + (x, y)
-        corners = np.rint(shape * zoom * 16).astype(np.int32)
-        color = COLORS[family % len(COLORS)]
-        cv2.fillPoly(canvas, [corners], _bgr(color if filled else PAPER), cv2.LINE_AA, 4)
-        edge = PAPER if filled else color
-        cv2.polylines(canvas, [corners], True, _bgr(edge), round(1.6 * zoom), cv2.LINE_AA, 4)
-
-    for start, end, title in chart.gutters:
-        box = [_pixel((start, top), zoom), _pixel((end, bottom), zoom)]
-        cv2.rectangle(canvas, box[0], box[1], _bgr("#f6f6f7"), -1)
-        text((start + end) / 2, bottom + 22, title, FAINT, anchor=0.5)
-    for x, words in chart.ticks_x:
-        line((x, top), (x, bottom), RULE)
-        text(x, bottom + 22, words, FAINT, anchor=0.5)
-    for y, words in chart.ticks_y:
-        line((LEFT, y), (WIDTH - RIGHT, y), RULE)
-        text(LEFT - 10, y + 4.5, words, FAINT, anchor=1)
-    line((LEFT, bottom), (WIDTH - RIGHT, bottom), INK, 1.2)
-    text(2, 14, f"{column_title(chart.metric)}, better ↑", INK, 600)
-    text(right, bottom + 46, f"{COSTS[chart.cost]} →", INK, 600, anchor=1)
-    for family, points in chart.series:
-        for a, b in pairwise(points):
-            line(a, b, COLORS[family % len(COLORS)], 0.8)
-    for a, b in pairwise(chart.front):
-        line(a, b, INK, 1.4)
-    for p in sorted(chart.points, key=lambda p: (p.on_front, p.x)):
-        if p.bar_x:
-            line((p.bar_x[0], p.y), (p.bar_x[1], p.y), COLORS[p.family % len(COLORS)])
-        if p.bar_y:
-            line((p.x, p.bar_y[0]), (p.x, p.bar_y[1]), COLORS[p.family % len(COLORS)])
-        mark(p.x, p.y, p.family, p.on_front, p.size)
-        if p.label:
-            text(*p.label, INK if p.on_front else FAINT, 600 if p.on_front else 400)
-    for k, row in enumerate(rows):
-        for x, family in row:
-            y = HEIGHT + 14 + 24 * k
-            mark(x + RADIUS, y, family, True, RADIUS + 1)
-            text(x + 3 * RADIUS, y + 4.5, chart.families[family], FAINT)
-    size = (round(WIDTH * SCALE), round(tall * SCALE))
-    return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), np.uint8)
+def to_png(chart: Chart) -> bytes:
+    """Draw as a PNG file on white, 1600 pixels wide, with a legend of the families below."""
+    legend = _lay_out_legend(chart.families)
+    height = round(HEIGHT + 36 + legend[-1][1] - legend[0][1])
+    picture = render(
+        "picture.svg",
+        width=WIDTH,
+        height=height,
+        colors=COLORS,
+        drawing=to_svg(chart),
+        legend=legend,
+        radius=RADIUS,
+        marker=marker,
+    )
+    # Fonts of the system stand in for letters that ours lacks.
+    return svg_to_bytes(picture, zoom=SCALE, font_files=[font_files[name] for name in FONTS.values()])
 
 
-def _legend_rows(names: Sequence[str]) -> list[list[tuple[float, int]]]:
-    """Rows of (x, family), as many families in each as there is room for."""
-    rows: list[list[tuple[float, int]]] = [[]]
-    x = float(LEFT)
+def _lay_out_legend(names: Sequence[str]) -> list[tuple[float, float, int, str]]:
+    """(x, y, family, name) of each marker, as many in a row as there is room for."""
+    places = []
+    x, y = LEFT + RADIUS, HEIGHT + 14.0
     for family, name in enumerate(names):
         wide = 3 * RADIUS + _text_width(name) + 22
-        if rows[-1] and x + wide > WIDTH:
-            rows.append([])
-            x = float(LEFT)
-        rows[-1].append((x, family))
+        if x > LEFT + RADIUS and x + wide > WIDTH:
+            x, y = LEFT + RADIUS, y + 24
+        places.append((x, y, family, name))
         x += wide
-    return rows
-
-
-def _pixel(at: tuple[float, float], zoom: float) -> tuple[int, int]:
-    return round(at[0] * zoom), round(at[1] * zoom)
-
-
-def _bgr(color: str) -> tuple[int, int, int]:
-    red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
-    return blue, green, red
+    return places

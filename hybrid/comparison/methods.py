@@ -214,17 +214,15 @@ def oidn(shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = N
         yield number, estimate_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 
 
-def oidn_then_average(
-    shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = None
-) -> Iterator[tuple[int, Array]]:
-    """OIDN on each frame, then the aligned robust average of what it gave."""
-    aligner = Aligner(MappedShot(shot, partial(_denoised, quality=quality, prefilter=prefilter)), Rules())
+def oidn_then_average(shot: Shot) -> Iterator[tuple[int, Array]]:
+    """OIDN's best mode on each frame, then the aligned robust average of what it gave."""
+    aligner = Aligner(MappedShot(shot, _denoised), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(aligner.align(number))
 
 
-def _denoised(frame: Frame, quality: Quality, prefilter: Quality | None) -> Frame:
-    return replace(frame, color=estimate_oidn(frame, quality=quality, prefilter=prefilter), variance=None)
+def _denoised(frame: Frame) -> Frame:
+    return replace(frame, color=estimate_oidn(frame, prefilter="high"), variance=None)
 
 
 def skimage_nlm(shot: Shot) -> Iterator[tuple[int, Array]]:
@@ -238,8 +236,9 @@ def skimage_nlm(shot: Shot) -> Iterator[tuple[int, Array]]:
         yield number, _radiance(filtered, exposure)
 
 
-def opencv_nlm(shot: Shot, *, radius: int = 2) -> Iterator[tuple[int, Array]]:
+def opencv_nlm(shot: Shot) -> Iterator[tuple[int, Array]]:
     """OpenCV's non-local means over five tone-mapped frames, which it does not align (16 bit, L1)."""
+    radius = 2
     for number in shot.numbers:
         tone, exposure = _tone_mapped(shot, number)
         numbers = [number + k * shot.step for k in range(-radius, radius + 1)]
@@ -327,7 +326,7 @@ METHODS: dict[str, Method] = {
     "OIDN balanced": _oidn("balanced"),
     "OIDN best": _oidn("high", prefilter="high"),
     "OIDN balanced + clean guides": _oidn("balanced", prefilter="balanced"),
-    "OIDN best + robust average": Method(partial(oidn_then_average, prefilter="high"), "OIDN"),
+    "OIDN best + robust average": Method(oidn_then_average, "OIDN"),
     "scikit-image NLM": Method(skimage_nlm, "Libraries"),
     "OpenCV temporal NLM": Method(opencv_nlm, "Libraries"),
 }

@@ -23,18 +23,25 @@ from flow.warp import warp
 Array = NDArray[np.floating]
 Reference = Array | tuple[Array, Array]
 
+EPSILON = 1e-2  # keeps black from dividing by zero, and assumes radiance around 1 after the exposure
+LEVEL = 0.95  # coverage of intervals
+RESAMPLES = 2000
+
 
 def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
     """Map linear radiance to [0, 1) by the curve T(x) = e·x / (1 + e·x).
 
     Parameters
     ----------
-    x : (...) array, linear radiance. Negative values count as 0: the curve has a pole at −1/e.
-    exposure : the factor e, one for a whole shot.
+    x : (...) array
+        Linear radiance. Negative values count as 0: the curve has a pole at −1/e.
+    exposure : float
+        The factor e, one for a whole shot.
 
     Returns
     -------
-    (...) float64 array in [0, 1).
+    (...) array of float64
+        In [0, 1).
     """
     scaled = np.maximum(np.asarray(x, np.float64) * exposure, 0.0)
     with np.errstate(invalid="ignore"):  # inf / inf: NaN is what a non-finite pixel is to become
@@ -46,14 +53,18 @@ def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
 
     Parameters
     ----------
-    image : (H, W, 3) array, linear radiance.
-    reference : the same, or two independent halves.
-    exposure : factor before the tone curve, one for a whole shot.
+    image : (H, W, 3) array
+        Linear radiance.
+    reference : (H, W, 3) array or two of them
+        The same, or two independent halves.
+    exposure : float
+        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
-    −10 log₁₀ mean (T(x) − T(r))², with peak 1. Infinite where the error is zero or, with a reference in
-    halves, where it cannot be told from zero. NaN if the image is not finite everywhere.
+    float
+        −10 log₁₀ mean (T(x) − T(r))², with peak 1. Infinite where the error is zero or, with a reference in
+        halves, where it cannot be told from zero. NaN if the image is not finite everywhere.
     """
     x, a, b = (tone_map(v, exposure) for v in _checked(image, reference))
     return _decibels(np.mean((x - a) * (x - b)))
@@ -64,8 +75,14 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
 
     Parameters
     ----------
-    image, reference : (H, W, 3) arrays, linear radiance, at least 11 × 11 pixels.
-    exposure : factor before the tone curve, one for a whole shot.
+    image, reference : (H, W, 3) array
+        Linear radiance, at least 11 × 11 pixels.
+    exposure : float
+        Factor before the tone curve, one for a whole shot.
+
+    Returns
+    -------
+    float
 
     Notes
     -----
@@ -81,37 +98,54 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     return float(structural_similarity(r, x, channel_axis=-1, **settings))
 
 
-def relmse(image: Array, reference: Reference, *, eps: float = 1e-2, trim: float = 0.0, exposure: float = 1.0) -> float:
-    """Relative mean squared error: mean (x − r)² / (r² + ε).
+def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: float = 1.0) -> float:
+    """Relative mean squared error: mean (x − r)² / (r² + 0.01).
 
     Parameters
     ----------
-    image : (H, W, 3) array, linear radiance.
-    reference : the same, or two independent halves, whose mean is then the r of the denominator.
-    eps : ε; it keeps black from dividing by zero, and assumes radiance around 1 after `exposure`.
-    trim : share of the pixels, those with the largest error, that are left out; 0.001 is usual, since a
+    image : (H, W, 3) array
+        Linear radiance.
+    reference : (H, W, 3) array or two of them
+        The same, or two independent halves, whose mean is then the r of the denominator.
+    trim : float
+        Share of the pixels, those with the largest error, that are left out; 0.001 is usual, since a
         single firefly can outweigh the rest of the frame.
-    exposure : factor on image and reference, one for a whole shot.
+    exposure : float
+        Factor on image and reference, one for a whole shot.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError
+        If trim is not in [0, 1).
     """
     if not 0.0 <= trim < 1.0:
         raise ValueError(f"trim must be in [0, 1), is {trim}")
     x, a, b = (v * exposure for v in _checked(image, reference))
-    errors = np.mean((x - a) * (x - b) / ((a + b) ** 2 / 4 + eps), axis=-1).ravel()
+    errors = np.mean((x - a) * (x - b) / ((a + b) ** 2 / 4 + EPSILON), axis=-1).ravel()
     kept = errors.size - int(trim * errors.size)
     return float(np.mean(np.partition(errors, kept - 1)[:kept]))
 
 
-def smape(image: Array, reference: Array, *, eps: float = 1e-2, exposure: float = 1.0) -> float:
-    """Symmetric mean absolute percentage error: mean |x − r| / (|x| + |r| + ε), in [0, 1].
+def smape(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
+    """Symmetric mean absolute percentage error: mean |x − r| / (|x| + |r| + 0.01), in [0, 1].
 
     Parameters
     ----------
-    image, reference : (H, W, 3) arrays, linear radiance.
-    eps : ε; as in `relmse`, it assumes radiance around 1 after `exposure`.
-    exposure : factor on image and reference, one for a whole shot.
+    image, reference : (H, W, 3) array
+        Linear radiance.
+    exposure : float
+        Factor on image and reference, one for a whole shot.
+
+    Returns
+    -------
+    float
     """
     x, r, _ = (v * exposure for v in _checked(image, reference))
-    return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + eps)))
+    return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + EPSILON)))
 
 
 def mean_bias(image: Array, reference: Array) -> float:
@@ -119,7 +153,12 @@ def mean_bias(image: Array, reference: Array) -> float:
 
     Parameters
     ----------
-    image, reference : (H, W, 3) arrays, linear radiance. A black reference gives NaN.
+    image, reference : (H, W, 3) array
+        Linear radiance. A black reference gives NaN.
+
+    Returns
+    -------
+    float
     """
     x, r, _ = _checked(image, reference)
     return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
@@ -130,15 +169,18 @@ def flip_map(image: Array, reference: Array) -> NDArray[np.float32]:
 
     Parameters
     ----------
-    image, reference : (H, W, 3) arrays, linear radiance in sRGB primaries; negative values count as 0.
+    image, reference : (H, W, 3) array
+        Linear radiance in sRGB primaries; negative values count as 0.
 
     Returns
     -------
-    (H, W) float32 array; NaN everywhere if the image is not finite everywhere.
+    (H, W) array of float32
+        NaN everywhere if the image is not finite everywhere.
 
     Raises
     ------
-    ImportError : flip-evaluator is not installed.
+    ImportError
+        If flip-evaluator is not installed.
 
     Notes
     -----
@@ -174,20 +216,27 @@ def temporal_psnr(
 
     Parameters
     ----------
-    frames : N images (H, W, 3), linear radiance, consecutive in time.
-    references : N references, each an image or two independent halves.
-    flows : N − 1 flows (H, W, 2) in pixels; flow k leads from frame k + 1 back to frame k.
-    valid : N − 1 masks (H, W); True where that flow leads to the same point of the scene.
-    exposure : factor before the tone curve, one for a whole shot.
+    frames : N arrays (H, W, 3)
+        Linear radiance, consecutive in time.
+    references : N references
+        Each an image or two independent halves.
+    flows : N − 1 arrays (H, W, 2)
+        Pixels; flow k leads from frame k + 1 back to frame k.
+    valid : N − 1 arrays (H, W) of bool
+        True where that flow leads to the same point of the scene.
+    exposure : float
+        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
-    (N − 1,) PSNR in dB. Infinite where the differences are the reference's, NaN where a frame is not
-    finite or no pixel is valid.
+    (N − 1,) array
+        PSNR in dB. Infinite where the differences are the reference's, NaN where a frame is not finite or no pixel is
+        valid.
 
     Raises
     ------
-    ValueError : numbers of frames, references, flows and masks that do not belong together.
+    ValueError
+        If the numbers of frames, references, flows and masks do not belong together.
 
     Notes
     -----
@@ -215,15 +264,19 @@ def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: 
 
     Parameters
     ----------
-    frames : N ≥ 2 images (H, W, 3), linear radiance. Their static pixels are held in memory.
-    static : (H, W) mask; True where neither the scene nor its light changes in the picture.
-    exposure : factor before the tone curve, one for a whole shot.
+    frames : N ≥ 2 arrays (H, W, 3)
+        Linear radiance. Their static pixels are held in memory.
+    static : (H, W) array of bool
+        True where neither the scene nor its light changes in the picture.
+    exposure : float
+        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
-    (N,) root mean squares over pixels and channels of each frame's distance to the mean over time, times
-    √(N / (N − 1)): their squares' mean is the unbiased variance over time. NaN where no pixel is static, there are
-    less than two frames, or one is not finite.
+    (N,) array
+        Root mean squares over pixels and channels of each frame's distance to the mean over time, times
+        √(N / (N − 1)): their squares' mean is the unbiased variance over time. NaN where no pixel is static, there are
+        less than two frames, or one is not finite.
     """
     values = []
     for frame in frames:
@@ -256,25 +309,29 @@ def bootstrap_interval(
     seed: int = 0,
     *,
     shots: Sequence[int] = (),
-    level: float = 0.95,
-    resamples: int = 2000,
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of `values`.
+    """95 % percentile bootstrap interval of the mean of `values`.
 
     Parameters
     ----------
-    values : N ≥ 1 figures, one per frame (or per shot). For "is A better than B" pass the differences
-        A − B frame by frame: the frames are the same, and most of their spread cancels. An interval
-        that contains 0 is a tie.
-    seed : of the resampling.
-    shots : how many of the values belong to each shot, if to several. Shots are then resampled first, and the
+    values : N ≥ 1 floats
+        One per frame (or per shot). For "is A better than B" pass the differences A − B frame by frame: the frames are
+        the same, and most of their spread cancels. An interval that contains 0 is a tie.
+    seed : int
+        Of the resampling.
+    shots : sequence of int
+        How many of the values belong to each shot, if to several. Shots are then resampled first, and the
         frames within each: frames of one shot are alike, and more of them tell little about another shot.
-    level : coverage of the interval.
-    resamples : number of bootstrap samples.
 
     Returns
     -------
-    (low, high); NaN if a value is NaN.
+    low, high : float
+        NaN if a value is NaN.
+
+    Raises
+    ------
+    ValueError
+        If there are no values, or `shots` do not add up to them.
 
     References
     ----------
@@ -289,15 +346,15 @@ def bootstrap_interval(
     parts = _by_shot(data, shots)
 
     def draw(part: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(part[rng.integers(0, part.size, (resamples, part.size))].mean(axis=1))
+        return np.asarray(part[rng.integers(0, part.size, (RESAMPLES, part.size))].mean(axis=1))
 
     if len(parts) == 1:
         means = draw(parts[0])
     else:
-        drawn = [rng.integers(0, len(parts), resamples) for _ in parts]
+        drawn = [rng.integers(0, len(parts), RESAMPLES) for _ in parts]
         means = np.mean([np.choose(shot, [draw(part) for part in parts]) for shot in drawn], axis=0)
     # An order statistic and no interpolation, which would make NaN of two infinite PSNRs.
-    tails = [(1 - level) / 2, (1 + level) / 2]
+    tails = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
     low, high = np.quantile(means, tails, method="inverted_cdf")
     return float(low), float(high)
 

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hybrid.comparison import chart, page
-from hybrid.comparison.compare import load_frame, map_titles
 from hybrid.comparison.embedding import ReportImages, embed_pictures
 from hybrid.comparison.results import (
     CHART_METRICS,
@@ -29,25 +27,30 @@ from hybrid.comparison.results import (
     MethodResult,
     Metric,
     best_and_ties,
+    is_comparison,
+    join,
+    pareto_front,
+    present_metrics,
+    stage_values,
+    to_document,
+    to_json,
+    to_plain_numbers,
+)
+from hybrid.comparison.store import REFERENCE, FrameStore
+from hybrid.comparison.tables import (
     format_bytes,
     format_change,
     format_seconds,
     format_value,
     format_worth,
-    is_comparison,
-    join,
     markdown_table,
-    pareto_front,
-    plain,
-    present_metrics,
-    stage_values,
     to_csv,
-    to_json,
-    to_plain_numbers,
 )
 from hybrid.files.replace import check_outputs, write_file
 
 Array = NDArray[np.float32]
+
+FILES = ("report.html", "results.json", "results.csv", "results.md", "chart.png")
 
 
 def write_report(
@@ -105,14 +108,7 @@ def write_report(
     metrics = present_metrics(results, METRICS)
     charted = [m for m in metrics if m.key in CHART_METRICS]
     costs = {key: COSTS[key] for key in (cost, *(c for c in COSTS if c != cost))}
-    document = {
-        "shot": comparison.shot,
-        "facts": dict(comparison.facts),
-        "metrics": [asdict(m) for m in metrics],
-        "results": [plain(r) for r in results],
-        "fronts": {f"{m.key} {c}": pareto_front(results, m, c) for m in metrics for c in COSTS},
-        "stages": [asdict(s) for s in stage_values(results)],
-    }
+    document = to_document(comparison)
     folder = Path(folder)
     check_report(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -121,7 +117,7 @@ def write_report(
     write_file(folder / "results.md", markdown_table([comparison, *others], cost))
     layout = chart.lay_out(results, charted[0], cost) if charted else None
     if layout is not None:
-        write_file(folder / "chart.png", cv2.imencode(".png", chart.to_pixels(layout))[1].tobytes())
+        write_file(folder / "chart.png", chart.to_png(layout))
     present = [r for r in results if r.absent_reason is None]
     text = page.render(
         "report.html",
@@ -152,9 +148,8 @@ def write_report(
             }
         ),
     )
-    path = folder / "report.html"
-    write_file(path, text)
-    return path
+    write_file(folder / "report.html", text)
+    return folder / "report.html"
 
 
 def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
@@ -179,14 +174,14 @@ def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
 
 
 def report_images(
-    folder: Path, comparison: Comparison, frames: Sequence[int]
+    store: FrameStore, comparison: Comparison, frames: Sequence[int]
 ) -> tuple[list[ReportImages], Callable[[int], Array]]:
-    """Name the pictures that `compare_shot` has left in a folder; they are read when asked for.
+    """Name the pictures that `compare_shot` has left; they are read when asked for.
 
     Parameters
     ----------
-    folder : Path
-        As given to `compare_shot`.
+    store : FrameStore
+        Of the folder given to `compare_shot`.
     comparison : Comparison
         What it has returned.
     frames : sequence of int
@@ -202,13 +197,13 @@ def report_images(
     images = [
         ReportImages(
             r.name,
-            partial(load_frame, folder, r.name),
-            {t: partial(load_frame, folder, f"{r.name} map {t}") for t in map_titles(folder, r.name, frames[0])},
+            partial(store.load, r.name),
+            {title: partial(store.load, r.name, title=title) for title in store.map_titles(r.name, frames[0])},
         )
         for r in comparison.results
         if r.absent_reason is None and not r.sweep
     ]
-    return images, partial(load_frame, folder, "reference")
+    return images, partial(store.load, REFERENCE)
 
 
 def _check(
@@ -222,8 +217,8 @@ def _check(
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"results must have different names, {name!r} appears {names.count(name)} times")
-    if "reference" in names:
-        raise ValueError("results must not be named 'reference': the viewer keeps that name")
+    if REFERENCE in names:
+        raise ValueError(f"results must not be named {REFERENCE!r}: the viewer keeps that name")
     for entry in images:
         if entry.name not in names:
             raise ValueError(f"images of {entry.name!r} belong to no result; there are {', '.join(names)}")
@@ -232,9 +227,6 @@ def _check(
 
 
 # What the templates ask for
-
-# What a report consists of.
-FILES = ("report.html", "results.json", "results.csv", "results.md", "chart.png")
 
 
 @dataclass(frozen=True)

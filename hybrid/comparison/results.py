@@ -1,12 +1,9 @@
-"""What a comparison has measured: methods, measures, who is best, what ties, and tables of it as text."""
+"""What a comparison has measured: methods, measures, who is best, what ties, and all of it as JSON."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -250,43 +247,6 @@ def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) ->
     return front
 
 
-def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
-    """Return the README's table: PSNR and temporal PSNR on each shot, then the costs on the first.
-
-    The best of a column is bold, what ties with it is marked "≈"; absent methods follow with their reason.
-    Points of a sweep are left out.
-    """
-    columns = [m for m in METRICS if m.key in MARKDOWN_METRICS]
-    tables = [{r.name: r for r in c.results if not r.sweep} for c in comparisons]
-    shown = [present_metrics(list(table.values()), columns) for table in tables]
-    verdicts = [
-        {m.key: best_and_ties(list(table.values()), m) for m in row} for table, row in zip(tables, shown, strict=True)
-    ]
-    heads = [f"{c.shot}: {' / '.join(map(column_title, row))}" for c, row in zip(comparisons, shown, strict=True)]
-    unit = {"cpu_seconds_per_megapixel": "CPU-s"}.get(cost, "s")
-    titles = ["method", *heads, f"{unit} per megapixel-frame", "peak memory", "worth in samples"]
-    lines = [titles, ["---", *("---" for _ in titles[1:])]]
-    missing = []
-    for name in dict.fromkeys(name for table in tables for name in table):
-        first = next(table[name] for table in tables if name in table)
-        if all(table[name].absent_reason is not None for table in tables if name in table):
-            missing.append([first.label, f"absent: {first.absent_reason}", *("" for _ in titles[2:])])
-            continue
-        cells = [first.label]
-        for table, row, verdict in zip(tables, shown, verdicts, strict=True):
-            figures = []
-            for m in row:
-                statistic = table[name].metrics.get(m.key) if name in table else None
-                text = "–" if statistic is None else format_value(statistic.mean, m)
-                best, ties = verdict[m.key]
-                figures.append(f"**{text}**" if name == best else f"≈ {text}" if name in ties else text)
-            cells.append(" / ".join(figures))
-        spent = first.cpu_seconds_per_megapixel if unit == "CPU-s" else first.seconds_per_megapixel
-        cells += [format_seconds(spent), format_bytes(first.peak_bytes)]
-        lines.append([*cells, format_worth(first.worth)])
-    return "".join(f"| {' | '.join(_markdown_cell(c) for c in line)} |\n" for line in [*lines, *missing])
-
-
 @dataclass(frozen=True)
 class StageValue:
     """What one stage changes: figures with it minus figures without it."""
@@ -346,48 +306,6 @@ def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) 
     return [m for m in metrics if any(m.key in r.metrics for r in results)]
 
 
-def format_value(value: float, metric: Metric) -> str:
-    """Print a figure as its metric asks for, "–" for NaN."""
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
-    text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
-    return text.replace("-", "−")
-
-
-def format_change(value: float, metric: Metric) -> str:
-    """Print a difference of two figures, with its sign."""
-    text = format_value(value, metric)
-    return f"+{text}" if value > 0 else text
-
-
-def format_seconds(value: float | None) -> str:
-    """Print seconds with three significant digits, "–" where not known."""
-    if value is None:
-        return "–"
-    return "0" if value == 0 else f"{value:.3g}" if value < 100 else f"{value:.0f}"
-
-
-def format_bytes(value: int | None) -> str:
-    """Print an amount of memory in MiB or GiB, "–" where not known."""
-    if value is None:
-        return "–"
-    return f"{value / 2**20:.0f} MiB" if value < 2**30 else f"{value / 2**30:.2f} GiB"
-
-
-def format_worth(value: float | None) -> str:
-    """Print how many times the samples a method is worth, "–" where not known."""
-    return "–" if value is None or math.isnan(value) else f"{value:.2g}×" if value < 10 else f"{value:.0f}×"
-
-
-def column_title(metric: Metric) -> str:
-    """Return the metric's label with its unit."""
-    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
-
-
-def _markdown_cell(text: str) -> str:
-    return re.sub(r"\s+", " ", text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
-
-
 def settings_as_text(result: MethodResult) -> dict[str, str]:
     """Print the settings for people: floats with four significant digits."""
     return {
@@ -395,7 +313,20 @@ def settings_as_text(result: MethodResult) -> dict[str, str]:
     }
 
 
-def plain(result: MethodResult) -> dict[str, object]:
+def to_document(comparison: Comparison) -> dict[str, object]:
+    """All that a comparison holds, and what follows from it, as plain dicts: what ``results.json`` is."""
+    results, metrics = comparison.results, present_metrics(comparison.results, METRICS)
+    return {
+        "shot": comparison.shot,
+        "facts": dict(comparison.facts),
+        "metrics": [asdict(m) for m in metrics],
+        "results": [_plain(r) for r in results],
+        "fronts": {f"{m.key} {cost}": pareto_front(results, m, cost) for m in metrics for cost in COSTS},
+        "stages": [asdict(s) for s in stage_values(results)],
+    }
+
+
+def _plain(result: MethodResult) -> dict[str, object]:
     """A result as plain dicts, settings as text: what they hold is the caller's business."""
     # asdict copies mappings by their own type, which a MappingProxy does not survive.
     metrics = {k: asdict(v) for k, v in result.metrics.items()}
@@ -419,24 +350,6 @@ def to_plain_numbers(value: object) -> object:
 def to_json(document: object, indent: int | None = None) -> str:
     """JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read."""
     return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def to_csv(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> str:
-    """One row per method: settings as JSON, five columns per measure."""
-    parts = ("mean", "minimum", "maximum", "low", "high")
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    facts = ["name", "label", "family", "sweep", "base", "absent_reason", "settings"]
-    costs = ["seconds_per_megapixel", "seconds_low", "seconds_high", "cpu_seconds_per_megapixel", "peak_bytes", "worth"]
-    writer.writerow([*facts, *costs, *(f"{m.key}_{part}" for m in metrics for part in parts)])
-    for r in results:
-        row: list[object] = [r.name, r.label, r.family, r.sweep, r.base, r.absent_reason]
-        row += [to_json(settings_as_text(r)).strip(), r.seconds_per_megapixel]
-        row += [*(r.spread or (None, None)), r.cpu_seconds_per_megapixel, r.peak_bytes, r.worth]
-        for m in metrics:
-            row += [getattr(r.metrics[m.key], p) if m.key in r.metrics else None for p in parts]
-        writer.writerow(row)
-    return out.getvalue()
 
 
 def is_comparison(path: Path) -> bool:

@@ -11,14 +11,14 @@ from importlib.resources import files
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from hybrid.comparison.results import (
+from hybrid.comparison.results import settings_as_text
+from hybrid.comparison.tables import (
     column_title,
     format_bytes,
     format_change,
     format_seconds,
     format_value,
     format_worth,
-    settings_as_text,
 )
 
 # In this order they are one module script: each file is named after the part of the page that it runs.

@@ -1,21 +1,32 @@
-"""The page's templates: whatever a name holds stays text."""
+"""The page: whatever a name holds stays text, and what it shows in a real browser, where there is one."""
+
+# ruff: noqa: E402 - skipped by name without the extra `compare`
 
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 jinja2 = pytest.importorskip("jinja2")
+for _package in ("resvg_py", "font_manrope"):
+    pytest.importorskip(_package)
 
-from hybrid.comparison import page  # noqa: E402
-from hybrid.comparison.embedding import ReportImages  # noqa: E402
-from hybrid.comparison.report import write_report  # noqa: E402
-from hybrid.comparison.results import Comparison, MethodResult, summarize  # noqa: E402
+from hybrid.comparison import page as templates
+from hybrid.comparison.embedding import ReportImages
+from hybrid.comparison.report import write_report
+from hybrid.comparison.results import Comparison, MethodResult, summarize
+from tests.hybrid.comparison.outcomes import EVIL, RESULTS
+from tests.hybrid.comparison.test_report import scene
 
 HOSTILE = [
     "<script>alert(1)</script>",
@@ -91,10 +102,303 @@ def test_a_name_makes_no_element_and_no_attribute(tmp_path: Path, name: str) -> 
 
 def test_every_script_is_on_the_page_once() -> None:
     folder = files("hybrid.comparison.page")
-    assert sorted(page.SCRIPTS) == sorted(item.name for item in folder.iterdir() if item.name.endswith(".js"))
-    assert page.script().count("function startViewer(") == 1
+    assert sorted(templates.SCRIPTS) == sorted(item.name for item in folder.iterdir() if item.name.endswith(".js"))
+    assert templates.script().count("function startViewer(") == 1
 
 
 def test_a_template_that_misses_something_is_an_error() -> None:
     with pytest.raises(jinja2.UndefinedError, match="chart"):
-        page.render("chart.svg")
+        templates.render("chart.svg")
+
+
+def test_nothing_from_a_name_becomes_markup(tmp_path: Path) -> None:
+    evil = replace(RESULTS[3], name=EVIL, label=EVIL, family=EVIL, settings={EVIL: EVIL})
+    gone = MethodResult("gone", EVIL, absent_reason=EVIL)
+    images = [ReportImages(EVIL, scene(1.0), {EVIL: lambda n: np.zeros((18, 32), np.float32)})]
+    page = write_report(tmp_path, Comparison(EVIL, (evil, gone), {EVIL: EVIL}), images, scene(1.0), [8])
+    text = page.read_text(encoding="utf-8")
+    assert "<img" not in text
+    assert text.count("</script>") == 2 + 3  # data, program; two pictures and a map
+    assert text.count("{{data}}") > 5  # never filled in again
+    assert "http" not in text.replace('http-equiv="Content-Security-Policy"', "")
+
+
+# In a browser
+
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+FLAGS += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files"]
+LEVELS = {"reference": 0.5, "noisy": 0.05, "average": 0.5, "final": 2.0, "bright": 8.0}
+EXPOSURE = 2.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("chromium is not installed")
+    with playwright.sync_playwright() as running:
+        instance = running.chromium.launch(executable_path=program, args=FLAGS)
+        yield instance
+        instance.close()
+
+
+@pytest.fixture(scope="module")
+def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    def spot(number: int) -> np.ndarray:
+        image = scene(LEVELS["noisy"])(number)
+        image[4, 6] = LEVELS["bright"] * (1 + 0.5 * (number - 8))  # one pixel to find again after zooming
+        return image
+
+    half = np.tile(np.linspace(0, 1, 32, dtype=np.float32), (18, 1))
+    images = [
+        ReportImages("noisy", spot),
+        ReportImages("average", scene(LEVELS["average"])),
+        ReportImages("final", scene(LEVELS["final"]), {"Confidence": lambda n: half}),
+    ]
+    results = tuple(replace(r, label=EVIL) if r.name == "other" else r for r in RESULTS)
+    folder = tmp_path_factory.mktemp("report")
+    return write_report(
+        folder, Comparison("Hall", results), images, scene(LEVELS["reference"]), [8, 9, 10], exposure=EXPOSURE
+    )
+
+
+@pytest.fixture
+def page(browser: Any, report_file: Path) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": 1200, "height": 900}, offline=True)
+    tab = context.new_page()
+    faults: list[str] = []
+    asked: list[str] = []
+    tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.goto(report_file.as_uri())
+    until(tab, "document.querySelectorAll('#labels div').length === 2")
+    yield tab
+    assert faults == []
+    assert asked == [report_file.as_uri()]  # nothing but the file itself
+    assert tab.evaluate("window.pwned") is None
+    context.close()
+
+
+def arrange(page: Any, layout: str) -> None:
+    """Choose an arrangement by its label; the radio button itself lies under it."""
+    page.locator(f".segments label:has(input[value={layout}])").click()
+    until(page, f"document.querySelector('[name=layout][value={layout}]').checked")
+
+
+def until(page: Any, condition: str) -> None:
+    """Wait for a JavaScript expression to become true; Playwright's own way needs eval, which the page forbids."""
+    for _ in range(200):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(50)
+    pytest.fail(f"never became true: {condition}")
+
+
+def color(page: Any, x: float, y: float = 0.5) -> list[int]:
+    """The colour on the canvas at shares of its width and height, once the page has drawn."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => setTimeout(done, 60)))")
+    script = """([x, y]) => { const c = document.getElementById('canvas');
+        return [...c.getContext('2d').getImageData(x * c.width, y * c.height, 1, 1).data].slice(0, 3); }"""
+    return list(page.evaluate(script, [x, y]))
+
+
+def shown(page: Any, method: str, number: int = 9, ev: float | None = None) -> list[int]:
+    """What a method's flat picture looks like, from the page's own definition."""
+    gain = EXPOSURE * 2 ** (float(page.input_value("#ev")) if ev is None else ev)
+    x = gain * LEVELS[method] * (1 + 0.5 * (number - 8))
+    tone = x / (1 + x)
+    return [round(255 * (1.055 * tone ** (1 / 2.4) - 0.055))] * 3
+
+
+def see(page: Any, expected: list[int], x: float, y: float = 0.5) -> None:
+    """Wait until a place on the canvas has a colour: a busy machine may draw late."""
+    for _ in range(100):
+        if close(found := color(page, x, y), expected):
+            return
+    pytest.fail(f"at ({x:.2f}, {y:.2f}) the canvas is {found}, expected {expected}")
+
+
+def close(a: list[int], b: list[int]) -> bool:
+    return max(abs(p - q) for p, q in zip(a, b, strict=True)) <= 2  # 1.5 % steps of radiance, and rounding
+
+
+def test_the_slider_divides_two_pictures_and_follows_mouse_and_keys(page: Any) -> None:
+    # It opens on the noisy input and the last of the front.
+    see(page, shown(page, "noisy"), 0.25)
+    see(page, shown(page, "final"), 0.75)
+    assert not close(shown(page, "noisy"), shown(page, "final"))
+    divider = page.locator("#divider")
+    divider.scroll_into_view_if_needed()
+    box, stage = divider.bounding_box(), page.locator("#stage").bounding_box()
+    page.mouse.move(box["x"] + 15, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(stage["x"] + 0.9 * stage["width"], box["y"] + 20, steps=4)
+    page.mouse.up()
+    see(page, shown(page, "noisy"), 0.75)
+    until(page, "document.getElementById('divider').ariaValueNow === '90'")
+    divider.focus()
+    page.keyboard.press("Home")
+    see(page, shown(page, "final"), 0.25)
+    for _ in range(10):
+        page.keyboard.press("ArrowRight")
+    until(page, "document.getElementById('divider').ariaValueNow === '20'")
+    see(page, shown(page, "noisy"), 0.1)
+    see(page, shown(page, "final"), 0.3)
+
+
+def test_any_two_methods_can_be_compared(page: Any) -> None:
+    page.select_option("#left", label="Average")
+    page.select_option("#right", label="Reference")
+    see(page, shown(page, "average"), 0.25)
+    page.locator("#swap").click()
+    until(page, "document.querySelector('#labels div').textContent.startsWith('Reference')")
+
+
+def test_frames_are_scrubbed_and_played(page: Any) -> None:
+    page.locator("#frame").focus()
+    page.keyboard.press("ArrowRight")
+    until(page, "document.getElementById('frame-text').textContent === 'frame 10'")
+    see(page, shown(page, "final", number=10), 0.75)
+    page.locator("#canvas").focus()
+    page.keyboard.press(",")
+    see(page, shown(page, "final", number=9), 0.75)
+    page.select_option("#rate", "24")
+    page.keyboard.press("Escape")
+    page.locator("#canvas").focus()
+    page.keyboard.press(" ")
+    until(page, "document.getElementById('frame-text').textContent !== 'frame 9'")
+    page.keyboard.press(" ")
+    assert page.locator("#play").get_attribute("aria-pressed") == "false"
+
+
+def test_exposure_moves_both_pictures_as_the_curve_says(page: Any) -> None:
+    before = float(page.input_value("#ev"))
+    page.locator("#canvas").focus()
+    for _ in range(6):
+        page.keyboard.press("]")
+    see(page, shown(page, "noisy", ev=before + 3), 0.25)
+    see(page, shown(page, "final", ev=before + 3), 0.75)
+
+
+def test_zoom_and_pan_are_the_same_in_both_panes(page: Any) -> None:
+    page.select_option("#right", label="Noisy")
+    arrange(page, "pair")
+    page.locator("#canvas").focus()
+    for _ in range(4):
+        page.keyboard.press("+")
+    # From the middle, (16, 9), to the bright pixel around (6.5, 4.5); a press is a tenth of what is in sight, 0.63.
+    for key, times in (("ArrowLeft", 15), ("ArrowUp", 7)):
+        for _ in range(times):
+            page.keyboard.press(key)
+    script = """() => { const c = document.getElementById('canvas'), half = c.width >> 1;
+        const data = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        const same = []; for (let y = 30; y < c.height; y += 7) for (let x = 12; x < half - 12; x += 7)
+            same.push([data[4 * (y * c.width + x)], data[4 * (y * c.width + x + half)]]);
+        return same; }"""
+    until(page, "parseFloat(document.getElementById('zoom-text').textContent) > 20")
+    color(page, 0.5)
+    pairs = page.evaluate(script)
+    assert all(a == b for a, b in pairs)
+    assert len({a for a, _ in pairs}) > 1  # the bright pixel is in sight
+
+
+def test_one_pixel_is_where_it_belongs(page: Any) -> None:
+    page.locator("#divider").focus()
+    page.keyboard.press("End")
+    see(page, shown(page, "bright"), 6.5 / 32, 4.5 / 18)
+    see(page, shown(page, "noisy"), 8.5 / 32, 4.5 / 18)
+    for _ in range(200):
+        # The page may still be settling: point again, at where the picture is now, until it has been noticed.
+        box = page.locator("#canvas").bounding_box()
+        page.mouse.move(box["x"] + 1, box["y"] + 1)
+        page.mouse.move(box["x"] + 6.5 / 32 * box["width"], box["y"] + 4.5 / 18 * box["height"])
+        if page.locator("#readout").inner_text().startswith("(6, 4)"):
+            break
+        page.wait_for_timeout(50)
+    # 8 × 1.5 on frame 9, to half a step of 1.5 %
+    assert float(page.locator("#readout").inner_text().split("Noisy")[1].split()[0]) == pytest.approx(12, rel=0.0075)
+
+
+def test_errors_and_maps_are_drawn_on_a_scale(page: Any) -> None:
+    page.select_option("#right", label="Average")  # the reference itself
+    page.select_option("#view", label="Error")
+    see(page, [0, 0, 4], 0.75)  # magma's zero
+    see(page, [0xFC, 0xFD, 0xBF], 0.25)  # and its end: noisy is a tenth of the reference
+    page.select_option("#right", label="Final")
+    page.select_option("#view", label="Confidence")
+    page.locator("#divider").focus()
+    page.keyboard.press("Home")
+    see(page, [0x44, 0x01, 0x54], 0.01, 0.9)  # viridis from end to end
+    see(page, [0xFD, 0xE7, 0x25], 0.99, 0.9)
+    arrange(page, "all")
+    until(page, "document.querySelectorAll('#labels div').length === 4")
+
+
+def test_slices_show_the_frames_downwards(page: Any) -> None:
+    script = """() => { const c = document.querySelectorAll('#slices canvas')[6];
+        const d = c.getContext('2d').getImageData(3, 0, 1, c.height).data; return [d[0], d[4], d[8]]; }"""
+    until(page, f"({script})()[2] > 0")
+    values = page.evaluate(script)
+    expected = [shown(page, "final", number=n)[0] for n in (8, 9, 10)]
+    assert close(values, expected)
+    assert all(a < b for a, b in pairwise(values))
+
+
+def test_the_axes_can_be_chosen_and_the_points_tell_their_settings(page: Any) -> None:
+    plot = page.locator(".plot:not([hidden])")
+    assert plot.get_attribute("data-axes") == "psnr seconds_per_megapixel"
+    page.select_option("#axis-up", "relmse")
+    page.select_option("#axis-over", "peak_bytes")
+    assert plot.get_attribute("data-axes") == "relmse peak_bytes"
+    assert page.locator(".plot:not([hidden]) svg").count() == 1
+    plot.locator(".point[data-name=final]").focus()
+    tip = page.locator("#tip")
+    assert "Final" in tip.inner_text()
+    assert "window" in tip.inner_text()
+    page.keyboard.press("ArrowLeft")
+    assert "Slow" in tip.inner_text()
+    page.keyboard.press("Home")
+    assert "Average" in tip.inner_text()
+    page.keyboard.press("Enter")  # sends it to the viewer
+    see(page, shown(page, "average"), 0.75)
+    page.keyboard.press("Escape")
+    assert tip.is_hidden()
+    plot.locator(".point[data-name=slow] .target").hover()
+    assert "Slow" in tip.inner_text()
+
+
+def test_a_family_can_be_hidden(page: Any) -> None:
+    point = page.locator(".plot:not([hidden]) .point[data-name=other]")
+    assert point.is_visible()
+    page.locator(".legend label", has_text="External").click()
+    assert point.is_hidden()
+
+
+def test_everything_is_reached_with_the_tab_key(page: Any) -> None:
+    reached = set()
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.getAttribute('class')"))
+    wanted = {"axis-up", "axis-over", "left", "right", "view", "ev", "canvas", "divider", "play", "frame", "row"}
+    assert wanted <= reached
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_is_readable_on_light_and_dark(page: Any, scheme: str) -> None:
+    page.emulate_media(color_scheme=scheme)
+    pairs = page.evaluate("""() => ['body', '.lead', '.hint', '.plot .tick', 'thead small', '.definitions dd']
+        .map((s) => { const style = getComputedStyle(document.querySelector(s));
+            const ink = s.startsWith('.plot') ? style.fill : style.color;
+            return [s, ink, getComputedStyle(document.body).backgroundColor]; })""")
+
+    def luminance(text: str) -> float:
+        parts = [int(v) / 255 for v in text[text.index("(") + 1 : -1].split(",")[:3]]
+        linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    for selector, ink, paper in pairs:
+        low, high = sorted((luminance(ink), luminance(paper)))
+        assert (high + 0.05) / (low + 0.05) >= 4.5, selector  # WCAG 2 AA
+    assert (luminance(pairs[0][2]) < 0.1) == (scheme == "dark")

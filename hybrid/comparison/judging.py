@@ -1,0 +1,301 @@
+"""The frames that methods have left, measured against the reference: each by itself, in pairs, and through time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.motion import Vectors, forward_backward_error, invert_flow
+from flow.warp import warp
+from hybrid.comparison.metrics import (
+    Reference,
+    flip_map,
+    mean_bias,
+    psnr,
+    relmse,
+    smape,
+    ssim,
+    static_std,
+    temporal_psnr,
+    tone_map,
+)
+from hybrid.comparison.results import Statistic, summarize
+from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor
+from hybrid.comparison.store import FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
+from hybrid.files.frames import Frame, Shot
+from hybrid.plan import STILL
+
+Array = NDArray[np.float32]
+Measure = Callable[[Array, Reference, float], float]  # of image, reference, exposure
+
+
+def _whole(reference: Reference) -> NDArray[np.floating]:
+    """The reference as one image: the mean of its halves, where it comes in halves."""
+    return (reference[0] + reference[1]) / 2 if isinstance(reference, tuple) else reference
+
+
+# What is measured on a frame by itself, beside FLIP and the measures over time.
+MEASURES: dict[str, Measure] = {
+    "psnr": lambda x, r, e: psnr(x, r, exposure=e),
+    "ssim": lambda x, r, e: ssim(x, _whole(r), exposure=e),
+    "relmse": lambda x, r, e: relmse(x, r, exposure=e),
+    "relmse_trimmed": lambda x, r, e: relmse(x, r, exposure=e, trim=0.001),
+    "smape": lambda x, r, e: smape(x, _whole(r), exposure=e),
+    "mean_bias": lambda x, r, _: mean_bias(x, _whole(r)),
+}
+# A pixel's light stands still where the 9×9 means of the reference change by less than this, on the tone curve: well
+# above their noise (a ninth of the pixels'), well below what anyone would call a change.
+STEADY = 0.02
+
+
+@dataclass(frozen=True)
+class Judge:
+    """What all methods are measured with.
+
+    Attributes
+    ----------
+    store : FrameStore
+        With the frames of the methods, the reference, and the flow of each pair.
+    numbers : sequence of int
+        Of the frames that are judged.
+    pairs : sequence of (int, int)
+        Neighbouring frames with a flow between them, from `store_flows`.
+    exposure : float
+        Factor before the tone curve, one for the whole shot.
+    static : (H, W) array of bool
+        Pixels that stand still, from `find_static_pixels`.
+    """
+
+    store: FrameStore
+    numbers: Sequence[int]
+    pairs: Sequence[tuple[int, int]]
+    exposure: float
+    static: NDArray[np.bool_]
+
+    def measure(self, name: str, *, flip: bool) -> dict[str, Statistic]:
+        """Measure the frames of a method, a frame and a pair of frames at a time.
+
+        Parameters
+        ----------
+        name : str
+            The method's.
+        flip : bool
+            Whether by FLIP too, which takes longer than many a method; its map is kept.
+
+        Returns
+        -------
+        dict of str to Statistic
+            By measure; those over time are there where there are pairs, or pixels that stand still.
+
+        Raises
+        ------
+        ValueError
+            If the method has left a frame out.
+        """
+        missing = [number for number in self.numbers if not self.store.has(name, number)]
+        if missing:
+            raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(self.numbers)}")
+        values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
+        for number in self.numbers:
+            image, truth = self.store.load(name, number), self.store.load_reference(number)
+            for key, measure in MEASURES.items():
+                values[key].append(measure(image, truth, self.exposure))
+            if flip:
+                errors = flip_map(image * np.float32(self.exposure), _whole(truth) * np.float32(self.exposure))
+                self.store.save(name, number, errors, FLIP_MAP)
+                values["flip"].append(float(errors.mean(dtype=np.float64)))
+        for pair in self.pairs:
+            values["temporal_psnr"].append(self._measure_pair(name, pair))
+        if self.static.any():
+            frames = (self.store.load(name, number) for number in self.numbers)
+            values["static_std"] = list(static_std(frames, self.static, exposure=self.exposure))
+        return {key: summarize(series) for key, series in values.items() if series}
+
+    def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
+        images = [self.store.load(name, number) for number in pair]
+        truths = [self.store.load_reference(number) for number in pair]
+        motion = self.store.load(REFERENCE, pair[1], FLOW)
+        flows, valid = [motion[..., :2]], [motion[..., 2] > 0]
+        return float(temporal_psnr(images, truths, flows, valid, exposure=self.exposure)[0])
+
+    def find_noise_law(
+        self,
+        noisy: Statistic,
+        samples: float | None,
+        levels: Sequence[tuple[Shot, float]],
+        reference_samples: float | None,
+    ) -> tuple[NoiseLaw, str]:
+        """Find how the error of the noisy render falls with its samples.
+
+        Parameters
+        ----------
+        noisy : Statistic
+            The PSNR of the noisy frames.
+        samples : float, optional
+            Theirs per pixel; without, only ratios can be told.
+        levels : sequence of (Shot, float)
+            Further renders of the shot with their samples per pixel.
+        reference_samples : float, optional
+            Samples per pixel of the reference.
+
+        Returns
+        -------
+        NoiseLaw
+        str
+            What is known of the reference's noise, in words.
+        """
+        known = [(samples or 1.0, _mean_error(noisy.values))]
+        for shot, count in levels:
+            common = [number for number in self.numbers if shot.has(number)]
+            truths = map(self.store.load_reference, common)
+            scores = [psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in zip(common, truths, strict=True)]
+            known.append((count, _mean_error(scores)))
+        known.sort()
+        floor, words = self._find_floor(known, samples, reference_samples)
+        return NoiseLaw(tuple(known), samples or 1.0, floor), words
+
+    def _find_floor(
+        self, known: Sequence[tuple[float, float]], samples: float | None, reference_samples: float | None
+    ) -> tuple[float, str]:
+        """The reference's part in the errors of `known`, and in words what is known of its noise."""
+        if isinstance(self.store.load_reference(self.numbers[0]), tuple):
+            level = _level(np.mean([self._error_of_halves(number) for number in self.numbers]))
+            return 0.0, (
+                f"Two independent halves; their mean has a noise of {level} PSNR. PSNR, temporal PSNR "
+                "and relMSE are products of the errors against both, free of it; the others are taken against the mean."
+            )
+        if samples is not None and reference_samples is not None:
+            floor = reference_floor(known[-1][1], known[-1][0], reference_samples)
+            source = f"by the 1/n law of its {reference_samples:g} samples per pixel"
+        elif len(known) > 1:
+            floor = fit_floor(known)
+            source = "by what the measured levels have in common"
+        else:
+            return 0.0, "One render; its noise is not known and counts as error of the methods."
+        return floor, (
+            f"One render with a noise of {_level(floor)} PSNR, {source}. It counts as error of the methods and "
+            "compresses differences between those that come near it; it is taken off only for the worth in samples."
+        )
+
+    def _error_of_halves(self, number: int) -> float:
+        """Mean squared error of the mean of the reference's halves: half of half of that between them."""
+        a, b = (tone_map(self.store.load(REFERENCE, number, half), self.exposure) for half in HALVES)
+        return float(np.mean((a - b) ** 2)) / 4
+
+
+def error_of(statistic: Statistic) -> float:
+    """Mean squared error of frames whose PSNR is known."""
+    return _mean_error(statistic.values)
+
+
+def _mean_error(scores: Sequence[float]) -> float:
+    return float(np.mean([float(10 ** (-score / 10)) for score in scores]))
+
+
+def _level(error: float | np.floating) -> str:
+    return f"{-10 * np.log10(error):.2f} dB" if error > 0 else "∞ dB"
+
+
+# What is made ready before any method is judged
+
+
+def store_reference(store: FrameStore, halves: Sequence[Shot], numbers: Sequence[int]) -> None:
+    """Keep the reference of every frame: the mean of its halves, and the halves where there are two."""
+    for number in numbers:
+        images = [half.read(number).color for half in halves]
+        store.save(REFERENCE, number, np.mean(images, axis=0))
+        if len(images) == 2:
+            for image, half in zip(images, HALVES, strict=True):
+                store.save(REFERENCE, number, image, half)
+
+
+def store_flows(store: FrameStore, shot: Shot, numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Keep flow and validity of the pairs of neighbouring frames, once for all methods; name the pairs."""
+    pairs = []
+    for a, b in pairwise(numbers):
+        motion = motion_between(shot.read(a), shot.read(b)) if b == a + 1 else None
+        if motion is not None:
+            store.save(REFERENCE, b, np.dstack(motion).astype(np.float32), FLOW)
+            pairs.append((a, b))
+    return pairs
+
+
+def find_static_pixels(
+    store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
+) -> NDArray[np.bool_]:
+    """Find where nothing moves from the first frame to the last, and the reference's light stays what it is.
+
+    Parameters
+    ----------
+    store : FrameStore
+        With the reference and the flows.
+    numbers : sequence of int
+        Of the frames.
+    pairs : sequence of (int, int)
+        From `store_flows`; unless they are all, nothing is known to stand still.
+    exposure : float
+        Factor before the tone curve.
+
+    Returns
+    -------
+    (H, W) array of bool
+    """
+    shape = store.load(REFERENCE, numbers[0]).shape
+    if not pairs or len(pairs) < len(numbers) - 1:
+        return np.zeros(shape[:2], bool)
+    least, most = np.full(shape, np.inf), np.full(shape, -np.inf)
+    for number in numbers:
+        tone = cv2.blur(tone_map(store.load(REFERENCE, number), exposure), (9, 9))
+        least, most = np.minimum(least, tone), np.maximum(most, tone)
+    static = np.all(most - least < STEADY, axis=-1)
+    for _, number in pairs:
+        motion = store.load(REFERENCE, number, FLOW)
+        static &= (np.hypot(motion[..., 0], motion[..., 1]) < STILL) & (motion[..., 2] > 0)
+    return np.asarray(static, bool)
+
+
+def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.bool_]] | None:
+    """Find where the pixels of a frame were one frame before, by the renderer's vectors.
+
+    Parameters
+    ----------
+    previous, current : Frame
+        Neighbours in time.
+
+    Returns
+    -------
+    flow : (H, W, 2) array
+        Pixels, from `current` to `previous`. None, and no mask, where neither has vectors between them.
+    valid : (H, W) array of bool
+        True where it leads to the same point of the scene: inside the frame, and back again by the previous
+        frame's own vectors; where it has none, to the same albedo.
+
+    References
+    ----------
+    Sundaram et al. 2010, doi:10.1007/978-3-642-15549-9_32, eq. 5
+    """
+    here, before = current.flows(), previous.flows()
+    known, back = here and here.to_previous, before and before.to_next
+    if known is None and back is not None:
+        known = Vectors(*invert_flow(back.flow, valid=back.valid, depth=previous.depth))
+    if known is None:
+        return None
+    flow, valid = known
+    if back is not None:
+        there, inside = warp(back.flow, flow)
+        lengths = np.sum(flow**2, axis=-1) + np.sum(there**2, axis=-1)
+        # Sundaram's eq. 5: a hundredth of the motion, and half a square pixel for interpolation.
+        agree = forward_backward_error(flow, back.flow) ** 2 < 0.01 * lengths + 0.5
+    elif previous.albedo is not None and current.albedo is not None:
+        there, inside = warp(previous.albedo, flow)
+        # Albedo is in [0, 1]. Another surface seldom differs by less; film sampling and a lens by less than this.
+        agree = np.max(np.abs(there - current.albedo), axis=-1) < 0.1
+    else:
+        _, inside = warp(flow, flow)
+        agree = np.ones_like(inside)
+    return flow, valid & inside & agree

@@ -1,0 +1,209 @@
+"""Methods run over a shot, in turns, each in a process of its own, so that its peak memory is its own."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import ParamSpec, Self, TypeVar
+
+import cv2
+import numba
+import numpy as np
+
+from hybrid.comparison.methods import Method
+from hybrid.comparison.store import FrameStore
+from hybrid.files.frames import Frame, Shot
+from hybrid.memory import keep_freed_memory
+from hybrid.timing import peak_memory
+
+Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a method has cost: its frames together, seconds without the reading of files, peak bytes."""
+
+    megapixels: float
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: int
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Seconds per megapixel of a method's runs: median, least and most by the wall clock, and the median CPU time."""
+
+    median: float
+    least: float
+    most: float
+    cpu: float
+
+
+def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a module's function in a fresh process.
+
+    The process is forked from a server and not from this one, whose peak memory Linux would count as its own.
+
+    Raises
+    ------
+    BrokenProcessPool
+        If the process dies.
+    """
+    # Threads that wait in turns, instead of spinning, cost little alone, and on a busy machine ten times less CPU time
+    # was counted. The libraries read this when the forked process first uses them.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])  # once, and not for every method
+    with ProcessPoolExecutor(1, mp_context=context, initializer=keep_freed_memory) as pool:
+        return pool.submit(function, *args, **kwargs).result()
+
+
+class _Clock:
+    """Adds up the wall and the CPU seconds of ``with`` blocks."""
+
+    def __init__(self) -> None:
+        self.seconds = self.cpu_seconds = 0.0
+
+    def __enter__(self) -> Self:
+        self._start = time.perf_counter(), time.process_time()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        wall, cpu = self._start
+        self.seconds += time.perf_counter() - wall
+        self.cpu_seconds += time.process_time() - cpu
+
+
+@contextmanager
+def _clock_reading(shot: Shot) -> Iterator[_Clock]:
+    """Count the time that `shot.read` takes, whoever calls it: on the instance, so that its own calls count."""
+    clock, read = _Clock(), shot.read
+
+    def clocked(number: int) -> Frame:
+        with clock:
+            return read(number)
+
+    shot.read = clocked  # type: ignore[method-assign]
+    try:
+        yield clock
+    finally:
+        del shot.read
+
+
+def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | None = None) -> Run:
+    """Run a method over a shot in this process.
+
+    The first frame is made once before the clock starts: compilation, weights and the plan are paid for there.
+
+    Parameters
+    ----------
+    method : Method
+        What to run.
+    shot : Shot
+        What to denoise.
+    name : str
+        Of the method, for the store.
+    store : FrameStore, optional
+        Where its frames are kept.
+
+    Returns
+    -------
+    Run
+        What it has cost.
+    """
+    if method.threads:
+        _limit_threads(method.threads)
+    next(method.run(shot), None)
+    clock, pixels = _Clock(), 0
+    with _clock_reading(shot) as reading:
+        frames = method.run(shot)
+        while True:
+            with clock:
+                done = next(frames, None)
+            if done is None:
+                break
+            number, image = done
+            pixels += image.shape[0] * image.shape[1]
+            if store is not None:
+                store.save(name, number, image)
+    return Run(pixels / 1e6, clock.seconds - reading.seconds, clock.cpu_seconds - reading.cpu_seconds, peak_memory())
+
+
+def _limit_threads(count: int) -> None:
+    """Let this process's libraries use so many threads; torch reads the variable when it is imported."""
+    os.environ["OMP_NUM_THREADS"] = str(count)
+    cv2.setNumThreads(count)
+    numba.set_num_threads(min(count, numba.get_num_threads()))
+
+
+def time_methods(
+    methods: Mapping[str, Method],
+    shot: Shot,
+    rounds: int,
+    store: FrameStore | None = None,
+    progress: Progress | None = None,
+) -> tuple[dict[str, list[Run]], dict[str, str]]:
+    """Run the methods in turns, so that whatever else the machine does meets all of them.
+
+    Parameters
+    ----------
+    methods : mapping of str to Method
+        By name.
+    shot : Shot
+        What to denoise.
+    rounds : int
+        How often each method runs.
+    store : FrameStore, optional
+        Where the frames of the first round are kept.
+    progress : callable, optional
+        Is told what is being done.
+
+    Returns
+    -------
+    runs : dict of str to list of Run
+        Those of each method, a round after the other.
+    absent : dict of str to str
+        Why the others have none.
+    """
+    runs: dict[str, list[Run]] = {}
+    absent: dict[str, str] = {}
+    names = list(methods)
+    for turn in range(rounds):
+        # Each round starts elsewhere, so that no method always follows the same one.
+        start = turn * len(names) // rounds
+        for done, name in enumerate(names[start:] + names[:start]):
+            if progress is not None:
+                progress(name, turn * len(names) + done, rounds * len(names))
+            if name in absent or (turn and not methods[name].timed):
+                continue
+            try:
+                run = run_apart(run_method, methods[name], shot, name, None if turn else store)
+            except ImportError as error:
+                absent[name] = str(error)
+            except BrokenProcessPool:
+                absent[name] = "its process died, out of memory perhaps"
+            else:
+                runs.setdefault(name, []).append(run)
+    return {name: runs[name] for name in names if name in runs and name not in absent}, absent
+
+
+def summarize_runs(runs: Sequence[Run]) -> Seconds:
+    """Reduce the runs of a method to seconds per megapixel.
+
+    Notes
+    -----
+    The median alone. Dividing out the load of a round (as all methods felt it), or of a run (by a fixed piece of work
+    between its frames), made ratios repeat no better on a machine under eight times its load: that changes
+    within seconds. More rounds do help; `benchmarks/bench_compare.py` shows how far the ratios can be trusted.
+    """
+    wall = np.array([run.seconds / run.megapixels for run in runs])
+    cpu = np.array([run.cpu_seconds / run.megapixels for run in runs])
+    return Seconds(float(np.median(wall)), float(wall.min()), float(wall.max()), float(np.median(cpu)))

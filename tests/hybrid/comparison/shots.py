@@ -1,0 +1,60 @@
+"""Shots in memory, and methods for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.motion import CYCLES
+from hybrid.comparison.methods import METHODS, Method, Run
+from hybrid.files.frames import Frame
+
+Array = NDArray[np.float32]
+SIZE = (24, 32)
+NOISY = {"noisy": METHODS["noisy"]}
+
+
+@dataclass(eq=False)
+class MemoryShot:
+    """What a method uses of a `Shot`, without files."""
+
+    frames: dict[int, Frame]
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        return tuple(self.frames)
+
+    def has(self, number: int) -> bool:
+        return number in self.frames
+
+    step = 1
+
+    def read(self, number: int) -> Frame:
+        return self.frames[number]
+
+
+def make_shots(numbers: tuple[int, ...] = (4, 5, 6)) -> tuple[MemoryShot, MemoryShot]:
+    """A still noisy shot with vectors, and its reference."""
+    rng = np.random.default_rng(9)
+    albedo = rng.uniform(0.2, 0.9, (*SIZE, 3)).astype(np.float32)
+    normal = np.zeros_like(albedo)
+    normal[..., 2] = 1
+    clean, rendered = {}, {}
+    for number in numbers:
+        clean[number] = Frame(number, albedo)
+        color = (albedo * rng.gamma(4, 0.25, (*SIZE, 1))).astype(np.float32)
+        vectors = np.zeros((*SIZE, 4), np.float32)
+        rendered[number] = Frame(number, color, albedo, normal, motion=vectors, motion_convention=CYCLES)
+    return MemoryShot(rendered), MemoryShot(clean)
+
+
+def perfect(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
+    for number in shot.numbers:
+        yield number, shot.read(number).albedo
+
+
+def ways(**runs: Run) -> dict[str, Method]:
+    return {name: Method(run, "Tests") for name, run in runs.items()}

@@ -1,0 +1,129 @@
+"""Frames that methods have left: measured against the reference, in space and in time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flow.motion import CYCLES, MotionConvention
+from hybrid.comparison.compare import compare_shot
+from hybrid.comparison.judging import motion_between
+from hybrid.comparison.methods import external
+from hybrid.files.frames import Frame
+from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
+
+
+def test_worth_in_samples_follows_the_levels() -> None:
+    """Gamma noise at 4, 8 and 16 samples, a method whose error is that of 16: worth twice the shot's 8."""
+
+    def render(samples: int, seed: int) -> MemoryShot:
+        rng = np.random.default_rng(seed)
+        _, clean = make_shots()
+        grain = {n: 1 + 0.4 / np.sqrt(samples) * rng.normal(size=(*SIZE, 3)) for n in clean.numbers}
+        return MemoryShot({n: Frame(n, (f.color * grain[n]).astype(np.float32)) for n, f in clean.frames.items()})
+
+    _, reference = make_shots()
+    methods = NOISY | {"better": external(render(16, 1))}
+    comparison = compare_shot(
+        render(8, 2), reference, methods, samples=8, levels=[(render(4, 3), 4), (render(64, 4), 64)]
+    )
+    # 6912 squared errors: 1.7 % each of method and level, doubled by the reading between levels.
+    assert comparison.results[1].worth == pytest.approx(2, rel=0.07)
+    assert "as 1/n asks" in comparison.facts["Worth in samples"]
+    # A clean reference: what is left for its noise is far below the least error that was measured.
+    assert "measured levels" in comparison.facts["Reference"]
+
+
+def test_static_pixels_flicker_by_what_was_put_in() -> None:
+    """A still shot whose reference stands still: the deviation over time is that of the noise put in."""
+    _, clean = make_shots(tuple(range(1, 9)))
+    sigma = 0.02
+    rng = np.random.default_rng(3)
+    frames = {}
+    for number, frame in clean.frames.items():
+        tone = frame.color / (1 + frame.color) + sigma * rng.normal(size=frame.color.shape)
+        vectors = np.zeros((*SIZE, 4), np.float32)
+        color = (tone / (1 - tone)).astype(np.float32)
+        frames[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
+    comparison = compare_shot(MemoryShot(frames), clean, NOISY)
+    assert comparison.facts["Pixels that stand still"] == "100.0%"
+    # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
+    assert comparison.results[0].metrics["static_std"].mean == pytest.approx(sigma, rel=0.03)
+
+
+def test_only_frames_and_neighbours_that_are_there_are_judged() -> None:
+    shot, _ = make_shots((1, 2, 4, 5, 6))
+    _, reference = make_shots((1, 2, 4, 6))
+    (result,) = compare_shot(shot, reference, NOISY).results
+    assert len(result.metrics["psnr"].values) == 4
+    assert len(result.metrics["temporal_psnr"].values) == 1
+
+
+def test_reference_in_halves_loses_its_noise() -> None:
+    """A perfect method is perfect against two noisy references, and is not against one."""
+    shot, reference = make_shots()
+
+    def render(seed: int) -> MemoryShot:
+        rng = np.random.default_rng(seed)
+        gain = {n: 1 + 0.05 * rng.normal(size=(*SIZE, 3)) for n in reference.numbers}
+        frames = {n: Frame(n, (f.color * gain[n]).astype(np.float32)) for n, f in reference.frames.items()}
+        return MemoryShot(frames)
+
+    halves = render(1), render(2)
+    comparison = compare_shot(shot, halves, ways(perfect=perfect))
+    (judged,) = comparison.results
+    (fooled,) = compare_shot(shot, halves[0], ways(perfect=perfect)).results
+    # 2304 values a frame: what is left of the product of two errors is about 1/50 of their square, 17 dB.
+    for key in ("psnr", "temporal_psnr"):
+        assert judged.metrics[key].mean > fooled.metrics[key].mean + 8
+    # 0.05/√2 noise of the mean over 6912 values: a standard error of 0.05 %.
+    assert abs(judged.metrics["mean_bias"].mean) < 0.003
+
+
+def test_without_vectors_there_is_no_temporal_figure() -> None:
+    shot, reference = make_shots()
+    still = {n: replace(f, motion=None, motion_convention=None) for n, f in shot.frames.items()}
+    comparison = compare_shot(MemoryShot(still), reference, NOISY)
+    assert not {"temporal_psnr", "static_std"} & set(comparison.results[0].metrics)
+    assert "psnr" in comparison.results[0].metrics
+    assert comparison.facts["Pixels that stand still"] == "0.0%"
+
+
+class TestMotionBetween:
+    """Vectors in Cycles' convention: previous at (x + X, y − Y), next at (x − Z, y + W)."""
+
+    @staticmethod
+    def frame(vector: tuple[float, ...] | None, albedo: Array | None = None) -> Frame:
+        color = np.ones((*SIZE, 3), np.float32)
+        motion = None if vector is None else np.tile(np.float32(vector), (*SIZE, 1))
+        convention = {None: None, 4: CYCLES, 2: MotionConvention()}[vector and len(vector)]
+        return Frame(1, color, albedo, motion=motion, motion_convention=convention)
+
+    def test_valid_where_it_leads_back(self) -> None:
+        flow, valid = motion_between(self.frame((0, 0, -3, 1)), self.frame((-3, 1, 0, 0)))
+        np.testing.assert_array_equal(flow, np.tile(np.float32((-3, -1)), (*SIZE, 1)))
+        expected = np.ones(SIZE, bool)
+        expected[:, :3] = expected[:1] = False  # came in from outside
+        np.testing.assert_array_equal(valid, expected)
+
+    def test_hidden_and_unknown_pixels_are_not_valid(self) -> None:
+        previous, current = self.frame((0, 0, -3, 0)), self.frame((-3, 0, 0, 0))
+        previous.motion[10:15, 10:15] = (0, 0, 4, 0)  # something else went the other way
+        current.motion[20, 20] = np.nan
+        _, valid = motion_between(previous, current)
+        assert not valid[10:15, 13:18].any()
+        assert not valid[20, 20]
+        assert valid[:10, 3:].all()
+
+    def test_albedo_decides_where_there_is_no_way_back(self) -> None:
+        albedo = np.full((*SIZE, 3), 0.5, np.float32)
+        other = albedo.copy()
+        other[5:9, 5:9, 1] = 0.9
+        _, valid = motion_between(self.frame((0, 0), other), self.frame((0, 0), albedo))
+        assert not valid[5:9, 5:9].any()
+        assert valid.sum() == valid.size - 16
+
+    def test_none_without_vectors(self) -> None:
+        assert motion_between(self.frame((0, 0)), self.frame(None)) is None

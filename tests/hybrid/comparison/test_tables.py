@@ -1,0 +1,84 @@
+"""Results as text: figures, and tables for a terminal, for Markdown and for spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from hybrid.comparison.results import METRICS, Comparison, MethodResult, Metric
+from hybrid.comparison.tables import (
+    format_bytes,
+    format_change,
+    format_seconds,
+    format_value,
+    format_worth,
+    markdown_table,
+    result_table,
+    to_csv,
+)
+from tests.hybrid.comparison.outcomes import EVIL, PSNR, RELMSE, RESULTS, SECONDS, result
+
+
+def test_markdown_marks_the_best_and_keeps_a_name_in_its_cell() -> None:
+    evil = replace(RESULTS[1], name="evil", label=EVIL)
+    other = Comparison("Other", (result("final", 30.0, 1.0), result("average", 31.0, 1.0)))
+    rows = markdown_table([Comparison("Hall", (*RESULTS, evil)), other], SECONDS).splitlines()
+    assert "| **34.00** | **" not in rows[5]
+    assert "| **34.00** | 30.00 | 4 |" in rows[5]  # the costs are the first shot's
+    assert "14×" in rows[5]
+    assert "| 28.00 | **31.00** |" in rows[3]
+    assert "<" not in rows[7]
+    assert "absent: torch is not installed" in rows[8]
+    bars = {row.replace("\\|", "").count("|") for row in rows}
+    assert len(bars) == 1  # every row has as many cells as the head
+
+
+def printed(results: tuple[MethodResult, ...]) -> str:
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(result_table(results))
+    return console.export_text()
+
+
+def test_a_terminal_sees_every_method_and_why_one_is_absent() -> None:
+    text = printed(RESULTS)
+    for r in RESULTS:
+        assert f" {r.label} " in text
+    assert "absent – Gone: torch is not installed" in text
+    row = next(line for line in text.splitlines() if " Final " in line)
+    assert "34.00" in row
+    assert "4 │" in row
+    assert "600 MiB" in row
+    assert "14×" in row
+
+
+@pytest.mark.parametrize("name", ["[/bold] [red]", "[link=x]y", "a\\[b]"])
+def test_markup_in_a_name_is_shown_as_it_is(name: str) -> None:
+    """It raised an error, or took a part of the name away."""
+    text = printed((result("a", 30.0, 1.0, label=name), MethodResult("b", name, absent_reason=name)))
+    assert text.count(f"┃ {name} ") + text.count(f"│ {name} ") == 2
+    assert f"absent – {name}: {name}" in text
+
+
+def test_a_spreadsheet_has_a_row_for_each_method() -> None:
+    rows = list(csv.DictReader(io.StringIO(to_csv([replace(RESULTS[3], label=EVIL), RESULTS[5]], METRICS[:1]))))
+    assert (rows[0]["label"], rows[0]["psnr_mean"], rows[0]["seconds_low"]) == (EVIL, "34.0", "3.8")
+    assert json.loads(rows[0]["settings"]) == {"window": "5"}
+    assert (rows[1]["absent_reason"], rows[1]["psnr_mean"]) == ("torch is not installed", "")
+
+
+def test_figures_are_printed_as_their_metric_asks() -> None:
+    digits = Metric("x", "X", "", digits=4)
+    assert [format_value(v, PSNR) for v in (34.126, -1.0, math.inf, -math.inf, math.nan)] == [
+        "34.13", "−1.00", "∞", "−∞", "–",
+    ]  # fmt: skip
+    assert (format_value(0.123456, digits), format_value(0.00123456, RELMSE)) == ("0.1235", "0.00123")
+    assert [format_change(v, PSNR) for v in (1.0, -1.0, 0.0, math.nan)] == ["+1.00", "−1.00", "0.00", "–"]
+    assert [format_seconds(v) for v in (None, 0, 1.2345, 99.96, 1234.5)] == ["–", "0", "1.23", "100", "1234"]
+    assert [format_bytes(v) for v in (None, 77 << 20, 3 << 29)] == ["–", "77 MiB", "1.50 GiB"]
+    assert [format_worth(v) for v in (None, math.nan, 4.26, 14.2)] == ["–", "–", "4.3×", "14×"]
