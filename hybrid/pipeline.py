@@ -233,7 +233,7 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
 
 def _files_around(shot: Shot, number: int, reach: int) -> list[Path]:
     numbers = range(number - reach * shot.step, number + reach * shot.step + 1, shot.step)
-    return [shot.path(n) for n in numbers if shot.has(n)]
+    return [path for n in numbers if shot.has(n) for path in shot.paths(n)]
 
 
 def _is_finished(path: Path, attributes: Mapping[str, str], sources: Iterable[Path]) -> bool:

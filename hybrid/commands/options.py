@@ -36,7 +36,8 @@ LayerOption = Annotated[
     typer.Option(
         "--layer",
         metavar="ROLE=LAYER",
-        help="take a layer for color, albedo, normal, depth, motion, variance, half_a, half_b, estimate",
+        help="take a layer for color, albedo, normal, depth, motion, variance, half_a, half_b, estimate; or a sequence "
+        "that holds it: albedo=path/alb.####.exr, with :LAYER where that has several",
         rich_help_panel=INPUT,
     ),
 ]

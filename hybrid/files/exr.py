@@ -51,18 +51,21 @@ class Layer:
     """Channels that belong together, all of one part.
 
     `channels` are qualified names, in the order R G B A or X Y Z W, any others after those. `name` is what
-    they share (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file.
+    they share (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file. `file` names the
+    sequence that it lies in where that is not the frame's own.
     """
 
     name: str
     part: int
     view: str | None
     channels: tuple[str, ...]
+    file: str = ""
 
     def __str__(self) -> str:
         components = [channel.rpartition(".")[2] for channel in self.channels]
         joined = ("" if all(len(c) == 1 for c in components) else ",").join(components)
-        return f"{self.name}.{joined}" if self.name else joined
+        own = f"{self.name}.{joined}" if self.name else joined
+        return f"{self.file}:{own}" if self.file else own
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from flow.motion import Motion, MotionConvention, normalize_motion
+from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
@@ -175,6 +176,7 @@ class Shot:
         *,
         frames: str | None = None,
         layers: Mapping[str, str | Layer] | None = None,
+        apart: Iterable[Apart] = (),
         profile: Profile | None = None,
         motion: str | None = None,
         aovs: Sequence[str] = (),
@@ -194,6 +196,9 @@ class Shot:
             self.warnings.append(f"missing frames {missing}: the windows beside them are narrower")
         self._files = dict(files)
         self._overrides = dict(layers or {})
+        self._apart = {other.role: other for other in apart}
+        for other in self._apart.values():
+            other.expect(sorted(files))
         self._profile = profile
         self._motion = motion
         self._left_out: frozenset[str] = frozenset({"motion"} if motion == "none" else ())
@@ -261,6 +266,7 @@ class Shot:
         made = Shot(
             files,
             layers={**self._overrides, "color": self._first_layers.target},
+            apart=self._apart.values(),
             profile=self.profile,
             aovs=self._aovs if aovs is None else aovs,
             keep=self._keep,
@@ -334,10 +340,23 @@ class Shot:
         return layers
 
     def _find_alone(self, image: ExrImage) -> Layers:
-        found = find_layers(image, self._overrides, self.profile, self._aovs).without(self._left_out)
+        found = find_layers(image, self._overrides, self.profile, self._aovs, self._elsewhere)
+        found = found.without(self._left_out)
         if found.motion is not None and self._convention is not None:
             found = replace(found, motion_convention=self._convention)
         return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)
+
+    @cached_property
+    def _elsewhere(self) -> dict[str, Layer]:
+        """The layers that lie in sequences of their own, as their first files have them."""
+        return {
+            role: other.find(self._read(other.files[min(self._files)], pixels=False), self.profile)
+            for role, other in self._apart.items()
+        }
+
+    def paths(self, number: int) -> tuple[Path, ...]:
+        """The files that a frame is read from, its own first."""
+        return (self.path(number), *dict.fromkeys(other.files[number] for other in self._apart.values()))
 
     @cached_property
     def _first_layers(self) -> Layers:
@@ -364,7 +383,7 @@ class Shot:
             self._held.move_to_end(number)
             return self._held[number]
         image, layers = self._open(number)
-        frame = _frame(image, layers, self._canvas, number)
+        frame = _frame(image, layers, self._canvas, number, self._open_apart(number, layers))
         self._held[number] = frame
         while len(self._held) > self._keep:
             self._held.popitem(last=False)
@@ -442,12 +461,27 @@ class Shot:
             raise ValueError(f"frames differ in size: frame {self.numbers[0]} is {first}, frame {number} is {second}")
         return image, layers
 
+    def _open_apart(self, number: int, layers: Layers) -> dict[str, ExrImage]:
+        """The files of the layers that lie in sequences of their own, by role; each is read once."""
+        images: dict[Path, ExrImage] = {}
+        found = {}
+        for role, other in self._apart.items():
+            layer, path = getattr(layers, role), other.files[number]
+            if layer is None:
+                continue
+            image = images.setdefault(path, images.get(path) or self._read(path))
+            if (size := _size(image.parts[image.again(layer).part])) != self._size:
+                first, second = ("x".join(map(str, s)) for s in (self._size, size))
+                raise ValueError(f"{path}: {role} is {second}, expected the size of the color, {first}")
+            found[role] = image
+        return found
+
     def _read(self, path: Path, *, pixels: bool = True) -> ExrImage:
         return read_exr(path, pixels=pixels, max_pixels=self._max_pixels)
 
     @cached_property
     def _identities(self) -> frozenset[object]:
-        return frozenset(known for file in self.files.values() for known in identities(file))
+        return frozenset(known for n in self._files for file in self.paths(n) for known in identities(file))
 
     @cached_property
     def _size(self) -> tuple[int, int]:
@@ -489,7 +523,8 @@ def open_shot(
     frames
         A range such as ``1001-1010x2``; else the one that `spec` names, or all.
     layers
-        Overrides for `hybrid.files.layers.find_layers`.
+        Role → name of a layer in the files (`hybrid.files.layers.find_layers`), or a sequence that holds it:
+        ``path/alb.####.exr``, ``path/alb.####.exr:layer``.
     profile
         Whose names and conventions to take; without, the one that fits the files.
     motion
@@ -509,17 +544,36 @@ def open_shot(
     ValueError
         If the folder has several sequences, or `frames` is not a range.
     """
-    files, named = find_files(str(spec))
+    said = {role: value for role, value in (layers or {}).items() if isinstance(value, str) and names_sequence(value)}
+    if "color" in said:
+        raise ValueError(f"color is {said['color']!r}, expected that sequence as the shot, over whose files is written")
+    files, named, beside = _gather(str(spec))
+    known, companions = beside or find_companions(files)
+    own = [open_apart(role, value) for role, value in said.items()]
+    apart = [other for other in companions if other.role not in {*(layers or {})}]
     return Shot(
         files,
         frames=named if frames is None else frames,
-        layers=layers,
-        profile=profile,
+        layers={role: value for role, value in (layers or {}).items() if role not in said},
+        apart=[*own, *apart],
+        profile=profile or known,
         motion=motion,
         aovs=aovs,
         keep=keep,
         max_pixels=max_pixels,
     )
+
+
+def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list[Apart]] | None]:
+    """The files of the color, the range named with them, and the sequences that a folder has for other layers."""
+    try:
+        return *find_files(spec), None
+    except (ValueError, FileNotFoundError):
+        gathered = gather_folder(Path(spec)) if Path(spec).is_dir() else None
+        if gathered is None:
+            raise
+        files, profile, apart = gathered
+        return files, None, (profile, apart)
 
 
 def open_beside(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
@@ -587,11 +641,22 @@ def _data_window(part: Part) -> tuple[int, int, int, int]:
     return left - x, top - y, right - x, bottom - y
 
 
-def _frame(image: ExrImage, layers: Layers, canvas: tuple[int, int, int, int], number: int) -> Frame:
+def _frame(
+    image: ExrImage,
+    layers: Layers,
+    canvas: tuple[int, int, int, int],
+    number: int,
+    others: Mapping[str, ExrImage],
+) -> Frame:
+    """A frame from its own file, and from `others` that hold the layer of a role."""
     for name, layer in layers.aovs.items():
         if any(image.channel(channel).dtype == np.uint32 for channel in layer.channels):
             raise ExrError(f"{image.path}: aov {name!r} is {layer}, whole numbers, of which averages mean nothing")
-    taken = {role: _pixels(image, layer, canvas) for role in ROLES if (layer := getattr(layers, role)) is not None}
+    taken = {
+        role: _pixels(others.get(role, image), layer, canvas)
+        for role in ROLES
+        if (layer := getattr(layers, role)) is not None
+    }
     for role in {"depth", "alpha"} & taken.keys():
         taken[role] = np.ascontiguousarray(taken[role][..., 0])
     if "variance" in taken and taken["variance"].shape[2] == 1:

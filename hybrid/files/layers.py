@@ -75,6 +75,7 @@ def find_layers(
     overrides: Mapping[str, str | Layer] | None = None,
     profile: Profile | None = None,
     aovs: Collection[str] = (),
+    elsewhere: Mapping[str, Layer] | None = None,
 ) -> Layers:
     """Say which channels of a file are the color, albedo, normal, depth, motion, variance, alpha, estimate.
 
@@ -91,6 +92,8 @@ def find_layers(
         Whose names to look for; without, that of the renderer that the file seems to be from.
     aovs
         Names of further layers that are to be denoised along.
+    elsewhere
+        Role → layer of another file, which goes before what would be found.
 
     Raises
     ------
@@ -114,7 +117,7 @@ def find_layers(
         raise ValueError(f"layer role {sorted(unknown)[0]!r} is unknown, expected one of {', '.join(ROLES)}")
     taken = profile or find_profile(image)
 
-    found: dict[str, Layer | None] = {}
+    found: dict[str, Layer | None] = {**(elsewhere or {})}
     for role, name in overrides.items():
         layer = image.layer(name) if isinstance(name, str) else image.again(name)
         found[role] = _fit(image, role, layer, named=True)
@@ -138,7 +141,7 @@ def find_layers(
         found["target"] = found["estimate"] or color
     for role in ROLES[1:]:
         guide = found[role]
-        if guide is not None and set(guide.channels) & set(color.channels):
+        if guide is not None and not guide.file and set(guide.channels) & set(color.channels):
             raise ExrError(f"{image.path}: {guide} is taken for both color and {role}, expected two layers")
     view = color.view or (image.views[0] if image.views else None)
     if len(image.views) > 1:
@@ -158,6 +161,31 @@ def find_layers(
         aovs=_find_aovs(image, aovs, [layer for layer in (found["target"], found["alpha"]) if layer is not None]),
         notes=tuple(notes),
     )
+
+
+def fit_alone(image: ExrImage, role: str, name: str | None, profile: Profile) -> Layer:
+    """The layer of a file that is there for one role: the one with this name, with one of the role's, or that fits.
+
+    Raises
+    ------
+    ExrError
+        If there is none, or several could be it.
+    """
+    layers = list(image.layers) if name is None else [image.layer(name)]
+    fitting = {layer: fitted for layer in layers if (fitted := _fit_file(image, role, layer))}
+    known = [fitted for layer, fitted in fitting.items() if set(profile.names(role)) & {*_tails(image, layer)} - {""}]
+    candidates = known or [*fitting.values()]
+    if not candidates:
+        raise ExrError(f"{image.path}: no layer for {role}: {_NEEDS[role]}; {image.listing()}")
+    return _only(image, role, candidates)
+
+
+def _fit_file(image: ExrImage, role: str, layer: Layer) -> Layer | None:
+    """As `_fit`; of a map that was saved as a picture its first channel will do."""
+    fitted = _fit(image, role, layer, named=True)
+    if fitted is None and role in ("depth", "alpha") and (picture := _fit(image, "color", layer, named=True)):
+        return replace(picture, channels=picture.channels[:1])
+    return fitted
 
 
 def _find_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer | None:

@@ -89,7 +89,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
     if path.is_file():
         if (called := parse_pattern(spec)[0]).digits and called.files():
             raise ValueError(f"{spec} is a file, and a pattern that others match; expected one or the other")
-        number = _pattern_of(path).number(path.name)
+        number = pattern_of(path).number(path.name)
         return {1 if number is None else number: path}, None
     pattern, frames = parse_pattern(spec)
     if pattern.digits:
@@ -133,11 +133,16 @@ def _names(folder: Path) -> list[Path]:
     return sorted(folder / name for name in names if not name.startswith("."))
 
 
+def list_patterns(folder: Path) -> list[Pattern]:
+    """The sequences, and single files, that lie in a folder."""
+    return _patterns(_names(folder))
+
+
 def _patterns(paths: Iterable[Path]) -> list[Pattern]:
     """The sequences that files belong to."""
     groups: dict[tuple[str, str], list[tuple[Pattern, Path]]] = {}
     for path in paths:
-        pattern = _pattern_of(path)
+        pattern = pattern_of(path)
         groups.setdefault((pattern.before, pattern.after), []).append((pattern, path))
     found: set[Pattern] = set()
     for group in groups.values():
@@ -148,7 +153,7 @@ def _patterns(paths: Iterable[Path]) -> list[Pattern]:
     return sorted(found, key=str)
 
 
-def _pattern_of(path: Path) -> Pattern:
+def pattern_of(path: Path) -> Pattern:
     """The sequence that a file belongs to: its number is the last one in its name."""
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.name)
     if match is None:

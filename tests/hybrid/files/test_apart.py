@@ -1,0 +1,195 @@
+"""Layers in sequences of their own: the same bytes as from one file; missing frames are named."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.cli import main
+from hybrid.files.apart import names_sequence
+from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.frames import open_shot
+from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
+
+FRAMES = truths()
+
+Split = dict[str, dict[str, tuple[str, str]]]
+
+
+def color(truth: Truth) -> Channels:
+    return layer("", "RGBA", truth.color, truth.alpha)
+
+
+def others(truth: Truth) -> dict[str, Channels]:
+    return {
+        "albedo": layer("", "RGB", truth.albedo),
+        "normal": layer("", "XYZ", truth.normal),
+        "depth": layer("", "Z", truth.depth),
+        "motion": layer("", "XYZW", cycles_vector(truth)),
+    }
+
+
+def merged(folder: Path) -> Path:
+    """All layers in one file, by plain names."""
+    for truth in FRAMES:
+        channels = color(truth)
+        for role, planes in others(truth).items():
+            channels |= {f"{role}.{name}": plane for name, plane in planes.items()}
+        save(folder / f"shot.{truth.number:04d}.exr", channels)
+    return folder / "shot.####.exr"
+
+
+def split(folder: Path, names: dict[str, str]) -> None:
+    """Each layer in a file of its own, by these names."""
+    for truth in FRAMES:
+        for role, channels in {"color": color(truth), **others(truth)}.items():
+            save(folder / names[role].replace("####", f"{truth.number:04d}"), channels)
+
+
+def made(spec: Path, out: Path, *options: str) -> bytes:
+    arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
+    assert main(arguments) == 0
+    image = read_exr(next(out.glob("*.0010.exr")))
+    return b"".join(image.channel(name).tobytes() for name in "RGBA")
+
+
+ROLES = ("albedo", "normal", "depth", "motion")
+APART = {role: f"{role}/{role}.####.exr" for role in ROLES} | {"color": "beauty/beauty.####.exr"}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    folder = tmp_path_factory.mktemp("merged")
+    return made(merged(folder), folder / "out")
+
+
+def test_sequences_apart_give_the_same_bytes_as_one_file(whole: bytes, tmp_path: Path) -> None:
+    split(tmp_path, APART)
+    named = [word for role in ROLES for word in ("--layer", f"{role}={tmp_path / APART[role]}")]
+    assert made(tmp_path / APART["color"], tmp_path / "out", *named) == whole
+
+
+def test_a_folder_for_each_layer_is_found_by_their_names(whole: bytes, tmp_path: Path) -> None:
+    split(tmp_path, APART)
+    assert made(tmp_path, tmp_path.parent / "out of folders") == whole
+
+
+def test_a_file_for_each_layer_is_found_by_their_names(whole: bytes, tmp_path: Path) -> None:
+    split(tmp_path, {role: f"sh_010.{role}.####.exr" for role in ROLES} | {"color": "sh_010.beauty.####.exr"})
+    assert made(tmp_path, tmp_path.parent / "out of files") == whole
+
+
+def test_in_any_mixture(whole: bytes, tmp_path: Path) -> None:
+    """Albedo apart, beside the color's own and worse; normal and motion in one other file."""
+    spec = merged(tmp_path)
+    for truth in FRAMES:
+        path = tmp_path / f"shot.{truth.number:04d}.exr"
+        kept = {n: read_exr(path).channel(n) for n in [*"RGBA", "albedo.R", "albedo.G", "albedo.B", "depth.Z"]}
+        save(path, kept | {"albedo.R": 0 * kept["R"]})
+        save(tmp_path / "apart" / f"alb.{truth.number:04d}.exr", layer("", "RGB", truth.albedo))
+        both = layer("nrm", "XYZ", truth.normal) | layer("vec", "XYZW", cycles_vector(truth))
+        save(tmp_path / "apart" / f"two.{truth.number:04d}.exr", both)
+    apart = {"albedo": "alb.####.exr", "normal": "two.####.exr:nrm", "motion": "two.####.exr:vec"}
+    named = [word for role, name in apart.items() for word in ("--layer", f"{role}={tmp_path / 'apart' / name}")]
+    assert made(spec, tmp_path / "out", *named) == whole
+
+
+def test_renderman_s_variance_file_is_found_beside_the_beauty(tmp_path: Path) -> None:
+    for truth in FRAMES:
+        save(tmp_path / f"sh.{truth.number:04d}.exr", layer("Ci", "rgb", truth.color) | {"a": truth.alpha})
+        rest = layer("albedo", "rgb", truth.albedo) | layer("normal", "rgb", truth.normal)
+        rest |= layer("mse", "rgb", truth.variance) | layer("backward", "rg", truth.previous)
+        save(tmp_path / f"sh_variance.{truth.number:04d}.exr", rest)
+    for spec in (tmp_path / "sh.####.exr", tmp_path):
+        shot = open_shot(spec)
+        layers = shot.layers(10)
+        assert (layers.profile, layers.reason) == ("RenderMan", "sh_variance.####.exr beside it")
+        assert str(layers.color) == "Ci.rgb"
+        assert str(layers.albedo) == "sh_variance.####.exr:albedo.rgb"
+        assert str(layers.motion) == "sh_variance.####.exr:backward.rg"
+        frame = shot.read(10)
+        np.testing.assert_array_equal(frame.albedo, FRAMES[1].albedo)
+        np.testing.assert_array_equal(frame.variance, FRAMES[1].variance)
+        assert shot.reads(tmp_path / "sh_variance.0010.exr")  # and nothing writes over it
+    assert main(["inspect", str(tmp_path / "sh_variance.####.exr")]) == 1  # it holds no color
+
+
+@pytest.mark.parametrize(
+    ("profile", "names"),
+    [
+        ("LuxCore", {"color": "RGB_IMAGEPIPELINE_####.exr", "albedo": "ALBEDO_####.exr", "depth": "DEPTH_####.exr"}),
+        (
+            "Unreal",
+            {
+                "color": "Sh.FinalImage.####.exr",
+                "depth": "Sh.FinalImageMovieRenderQueue_WorldDepth.####.exr",
+                "motion": "Sh.FinalImageMovieRenderQueue_MotionVectors.####.exr",
+            },
+        ),
+    ],
+)
+def test_renderers_that_write_a_file_for_each_output(profile: str, names: dict[str, str], tmp_path: Path) -> None:
+    for truth in FRAMES:
+        for role, channels in {"color": color(truth), **others(truth)}.items():
+            if role in names:
+                save(tmp_path / names[role].replace("####", f"{truth.number:04d}"), channels)
+    layers = open_shot(tmp_path).layers(10)
+    assert layers.profile == profile
+    assert {role for role in ROLES if getattr(layers, role) is not None} == {*names} - {"color"}
+
+
+def test_a_layer_that_was_made_again_makes_the_frame_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    split(tmp_path / "in", APART)
+    command = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "9", "--preset", "draft"]
+    assert main([*command, "--resume"]) == 0
+    finished = tmp_path / "out" / "beauty.0009.exr"
+    first = finished.stat().st_mtime_ns
+    assert main([*command, "--resume"]) == 0
+    assert finished.stat().st_mtime_ns == first
+    albedo = tmp_path / "in" / "albedo" / "albedo.0010.exr"
+    later = first + 10**9
+    os.utime(albedo, ns=(later, later))
+    assert main([*command, "--resume"]) == 0
+    assert finished.stat().st_mtime_ns != first
+
+
+def test_a_missing_frame_is_an_error_that_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    split(tmp_path, APART)
+    (tmp_path / "albedo" / "albedo.0011.exr").unlink()
+    spec = tmp_path / APART["albedo"]
+    assert main(["inspect", str(tmp_path / APART["color"]), "--layer", f"albedo={spec}"]) == 1
+    assert f"albedo ({spec}): no frame 11; it has 9-10,12" in " ".join(capsys.readouterr().err.split())
+
+
+def test_another_size_and_several_layers_are_errors(tmp_path: Path) -> None:
+    split(tmp_path, APART)
+    for truth in FRAMES:
+        save(tmp_path / "small" / f"a.{truth.number:04d}.exr", layer("", "RGB", truth.albedo[::2, ::2]))
+        two = layer("one", "RGB", truth.albedo) | layer("two", "RGB", truth.albedo)
+        save(tmp_path / "two" / f"a.{truth.number:04d}.exr", two)
+    spec = tmp_path / APART["color"]
+    shot = open_shot(spec, layers={"albedo": str(tmp_path / "small" / "a.####.exr")})
+    with pytest.raises(ValueError, match="albedo is 72x44, expected the size of the color, 144x88"):
+        shot.read(10)
+    with pytest.raises(ExrError, match=r"albedo can be one\.RGB, two\.RGB, expected one"):
+        open_shot(spec, layers={"albedo": str(tmp_path / "two" / "a.####.exr")}).layers(10)
+    with pytest.raises(ValueError, match=r"color is .* expected that sequence as the shot"):
+        open_shot(spec, layers={"color": str(spec)})
+
+
+def test_two_sequences_with_the_name_of_one_layer_are_refused(tmp_path: Path) -> None:
+    split(tmp_path, APART)
+    for truth in FRAMES:
+        save(tmp_path / "N" / f"n.{truth.number:04d}.exr", layer("", "XYZ", truth.normal))
+    with pytest.raises(ValueError, match="normal can be"):
+        open_shot(tmp_path)
+
+
+def test_what_names_a_sequence_and_what_a_layer() -> None:
+    for value in ("a/alb.####.exr", "alb.%04d.EXR", "alb.####.exr:RGBA", "a.####.exr 8-10"):
+        assert names_sequence(value)
+    for value in ("albedo", "ViewLayer.Denoising Albedo", "exr", "a.exrs", "no/folder"):
+        assert not names_sequence(value)
