@@ -76,6 +76,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--before", metavar="REVISION", help="run the tests on the packages of this revision too")
     parser.add_argument("--fuzz", type=int, default=2000, help="files to damage")
+    parser.add_argument("--shots", type=int, default=300, help="made-up shots with one odd window")
     parser.add_argument("--damaged", type=Path, help="folder of damaged EXR files to run on as well")
     parser.add_argument("--json", type=Path, help="write the rows there too")
     options = parser.parse_args(argv)
@@ -100,6 +101,7 @@ def main(argv: list[str] | None = None) -> int:
             "denoise --estimate nlm",
         ],
     }
+    scripts["one odd window in a calm shot"] = ["benchmarks/odd_windows.py", "--shots", str(options.shots)]
     if options.damaged:
         scripts["damaged files (given)"] = ["benchmarks/fuzz_files.py", "--folder", str(options.damaged)]
     for name, words in scripts.items():

@@ -14,7 +14,7 @@ from hybrid.estimates import EstimateSource
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
-from hybrid.plan import Plan, Rules
+from hybrid.plan import Plan, Rules, as_run
 from hybrid.timing import Timings
 
 Array = NDArray[np.float32]
@@ -170,7 +170,7 @@ def denoise_shot(
             continue
         try:
             denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
-            plan = rules.plan(*aligner.facts_of(aligner.around(number, radius)))
+            plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
             with timings.stage("write"):
                 images = {"color": denoised.color, **denoised.aovs}
                 stages = {"ravg/stages": " ".join(sorted(plan.stages))}
@@ -203,6 +203,7 @@ class _Counts:
     fireflies: int
     removed: float
     outliers: int
+    stages: frozenset[str]
 
 
 def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, _Counts]:
@@ -215,7 +216,7 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
         aligned = aligner.align(number, band)
         part = denoise(aligned)
         outliers += aligned.outliers
-        counts = _Counts(aligned.repaired, aligned.fireflies, aligned.removed, outliers)
+        counts = _Counts(aligned.repaired, aligned.fireflies, aligned.removed, outliers, aligned.stages)
         named = {("color", ""): part.color}
         named |= {("aovs", name): layer for name, layer in part.aovs.items()}
         named |= {("extra", name): layer for name, layer in part.extra.items()}

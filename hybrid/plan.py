@@ -103,6 +103,17 @@ class Plan:
         )
 
 
+def as_run(plan: Plan, stages: Collection[str]) -> Plan:
+    """Say of the plan of a window what ran: where there are estimates the gate compares them in any case."""
+    words = "estimates are compared in any case; measured: "
+    return Plan(
+        tuple(
+            replace(d, on=True, reason=words + d.reason) if d.stage in stages and not d.on else d
+            for d in plan.decisions
+        )
+    )
+
+
 @dataclass(frozen=True)
 class Rules:
     """What decides the stages of a window: the figures, and what the user has forced.

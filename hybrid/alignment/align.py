@@ -409,6 +409,9 @@ class Aligner:
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
         self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
         stages = self.stages_of(numbers)
+        if given:
+            # Estimates are compared in any case, for outlines: that their light is alike costs nothing to ask.
+            stages |= self._decide.allowed & {"gate"}
         centre = self._frames[number]
         height = len(centre.irradiance)
         rows = slice(0, height) if rows is None else rows

@@ -212,3 +212,28 @@ def flow_of(shot, rules):
     aligner = Aligner(shot, rules, radius=1)
     aligner.load([1002, 1003])
     return aligner.flow(1002, 1003)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_without_vectors_a_drift_of_one_pixel_shows_in_the_guides(tmp_path, noise):
+    """Noise hides it in the color; averaged as if it stood still, such a shot lost 3 to 5 dB."""
+    scene = replace(CALM, frames=3, step=(1, 0), noise=noise)
+    found = {
+        d.stage for d in plan_shot(open_shot(scene.write(tmp_path / "drift", without={"Vector"}))).decisions if d.on
+    }
+    assert {"warp", "dense-flow", "gate"} <= found
+    still = replace(scene, step=(0, 0)).write(tmp_path / "still", without={"Vector"})
+    assert not {"warp", "dense-flow", "gate"} & plan_shot(open_shot(still)).stages
+
+
+def test_estimates_are_compared_in_any_case(tmp_path):
+    """What single frames' denoisers make of a calm shot may differ by itself: the gate costs nothing there."""
+    shot = open_shot(CALM.write(tmp_path))
+    estimates = OfFrames(lambda frame: frame.color * np.float32(1 + 0.5 * (frame.number == 1005)))
+    window = Aligner(shot, Rules(), estimates=estimates).align(1006)
+    assert "gate" in window.stages
+    assert np.median(window.confidence[1]) < 0.1
+    off = Aligner(shot, Rules(off=frozenset({"gate"})), estimates=estimates).align(1006)
+    assert "gate" not in off.stages
+    assert np.median(off.confidence[1]) > 0.9
+    assert "gate" not in plan_shot(shot).stages
