@@ -26,9 +26,9 @@ def shot_folder(tmp_path: Path) -> Path:
     return Scene().write(tmp_path / "noisy")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium without a window; tests that ask for it carry the mark `browser`."""
+    """Chromium without a window. For one module: Playwright keeps an event loop that other tests must not meet."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if program is None:

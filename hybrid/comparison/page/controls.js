@@ -35,6 +35,7 @@ function showState({ state, sources, pictures }, scale) {
   divider.setAttribute("aria-valuenow", percent);
   divider.setAttribute("aria-valuetext", `${percent} percent ${left}, the rest ${right}`);
   for (const id of ["left", "right", "frame", "ev", "row"]) find(id).value = state[id];
+  find("magnify").checked = state.magnify;
   find("frame-text").textContent = `frame ${pictures.frames[state.frame]}`;
   find("ev-text").textContent = `${state.ev < 0 ? "−" : "+"}${Math.abs(state.ev).toFixed(2)} EV`;
   find("zoom-text").textContent = `${rounded(scale, 2)}×`;
@@ -64,8 +65,9 @@ function listenToControls(viewer) {
   for (const id of ["left", "right"]) listen(id, "change", (value) => viewer.update({ [id]: Number(value) }));
   listen("view", "change", (view) => { showScale(view); viewer.update({ view }); });
   for (const radio of document.querySelectorAll("[name=layout]")) {
-    radio.addEventListener("change", () => viewer.update({ layout: radio.value }));
+    radio.addEventListener("change", () => viewer.arrange(radio.value));
   }
+  find("magnify").addEventListener("change", (event) => viewer.update({ magnify: event.target.checked }));
   listen("swap", "click", () => viewer.swap());
   listen("zoom-in", "click", () => viewer.zoom(1.5));
   listen("zoom-out", "click", () => viewer.zoom(1 / 1.5));
@@ -90,9 +92,12 @@ function listenToPointer(viewer) {
       const scale = stage.scaleOf(at.pane), dx = event.clientX - drag.px, dy = event.clientY - drag.py;
       drag.moved ||= Math.hypot(dx, dy) > 3;
       viewer.update({ x: drag.x - dx / scale, y: drag.y - dy / scale });
+    } else if (state.magnify) {
+      viewer.update({ at });
     }
     viewer.readOut(at.x, at.y);
   });
+  canvas.addEventListener("pointerleave", () => { if (state.magnify) viewer.update({ at: null }); });
   canvas.addEventListener("pointerup", (event) => {
     if (drag && !drag.moved && state.layout === "all") viewer.update({ right: stage.under(event).pane.source });
     drag = null;
@@ -141,6 +146,7 @@ function listenToKeys(viewer) {
     "0": () => viewer.update({ zoom: 1 }),
     ",": () => viewer.step(-1), ".": () => viewer.step(1), " ": () => viewer.play(!state.playing),
     "[": () => viewer.expose(state.ev - 0.5), "]": () => viewer.expose(state.ev + 0.5),
+    m: () => viewer.update({ magnify: !state.magnify }), M: () => viewer.update({ magnify: !state.magnify }),
     x: () => viewer.swap(), X: () => viewer.swap(),
   };
   for (let i = 0; i < Math.min(sources.length, 9); i++) actions[i + 1] = () => viewer.update({ right: i });

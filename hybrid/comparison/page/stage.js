@@ -1,5 +1,7 @@
 // The stage: where each picture goes, drawing them there, and what a pointer is over.
 
+const LENS = 120, MAGNIFIED = 4; // the side of a lens in CSS pixels, and how much larger than around it things are there
+
 // Where each picture goes, in CSS pixels. With the slider both fill the stage, and are cut at the divider.
 const LAYOUTS = {
   slider({ left, right, split }, { width, height }, wide, most) {
@@ -11,6 +13,10 @@ const LAYOUTS = {
   pair({ left, right }, { width, height }, wide, most) {
     const w = wide / 2, h = Math.min(w * height / width, most);
     return { tall: h, panes: [left, right].map((source, i) => ({ source, ...cell(i * w, 0, w, h) })) };
+  },
+  flicker({ left, right, flipped }, { width, height }, wide, most) {
+    const h = Math.min(wide * height / width, most);
+    return { tall: h, panes: [{ source: flipped ? right : left, ...cell(0, 0, wide, h) }] };
   },
   all(state, { width, height, sources }, wide) {
     const columns = clamp(Math.min(sources.length, Math.floor(wide / 250)), 1, 4);
@@ -51,6 +57,7 @@ class Stage {
     // Whole enlarged pixels are shown as they are; smoothing would flatter.
     context.imageSmoothingEnabled = this.scaleOf(panes[0]) * devicePixelRatio < 2;
     panes.forEach((pane, i) => this.drawPane(context, pane, tiles[i]));
+    if (this.state.magnify && this.state.at) await this.drawLenses(context, panes[0], this.state.at);
     this.drawLabels(panes);
     return panes;
   }
@@ -85,6 +92,30 @@ class Stage {
     context.restore();
   }
 
+  // The left and the right picture where the pointer is, enlarged, side by side above it.
+  async drawLenses(context, pane, { x, y, px, py }) {
+    const { left, right, view, frame } = this.state, scale = this.scaleOf(pane) * MAGNIFIED;
+    const tiles = await Promise.all([left, right].map((source) => this.painter.tile(source, view, frame)));
+    const top = py > LENS + 20 ? py - LENS - 20 : py + 20;
+    const start = clamp(px - LENS, 0, Math.max(0, this.element.clientWidth - 2 * LENS));
+    context.imageSmoothingEnabled = scale * devicePixelRatio < 2;
+    tiles.forEach((tile, i) => {
+      const from = start + i * LENS, { width, height } = this.pictures;
+      context.save();
+      context.beginPath();
+      context.rect(from, top, LENS, LENS);
+      context.fillStyle = "#18181a";
+      context.fill();
+      context.clip();
+      if (tile) {
+        context.drawImage(tile, from + LENS / 2 - x * scale, top + LENS / 2 - y * scale, width * scale, height * scale);
+      }
+      context.restore();
+      context.strokeStyle = "#fff";
+      context.strokeRect(from + 0.5, top + 0.5, LENS - 1, LENS - 1);
+    });
+  }
+
   // What each pane shows, and its figure by the chart's first measure.
   drawLabels(panes) {
     const { layout } = this.state, labels = find("labels");
@@ -106,7 +137,7 @@ class Stage {
     const box = this.canvas.getBoundingClientRect(), px = event.clientX - box.left, py = event.clientY - box.top;
     const inside = (pane) => px >= pane.from && px <= pane.to && py >= pane.y && py <= pane.y + pane.h;
     const { panes } = this.layOut(), pane = panes.find(inside) ?? panes[0], scale = this.scaleOf(pane);
-    return { pane, x: this.state.x + (px - pane.x - pane.w / 2) / scale,
+    return { pane, px, py, x: this.state.x + (px - pane.x - pane.w / 2) / scale,
       y: this.state.y + (py - pane.y - pane.h / 2) / scale };
   }
 }

@@ -10,6 +10,7 @@ class Viewer {
     this.stage = new Stage(this.pictures, this.painter, this.state);
     this.slices = new Slices(this.pictures, this.painter, this.state);
     this.tick = 0; // the next frame of the animation, while it plays
+    this.flips = 0; // the timer of the arrangement that flickers
   }
 
   // The noisy frames on the left, the last of the front on the right.
@@ -23,7 +24,15 @@ class Viewer {
     return {
       left, right: best === left ? 0 : best, view: "picture", layout: "slider",
       frame: Math.floor(frames.length / 2), ev, split: 0.5, zoom: 1, x: width / 2, y: height / 2, row, playing: false,
+      flipped: false, magnify: false, at: null,
     };
+  }
+
+  // Two pictures in one place change twice a second: slow enough to look at each, and to be safe for anybody.
+  arrange(layout) {
+    clearInterval(this.flips);
+    if (layout === "flicker") this.flips = setInterval(() => this.update({ flipped: !this.state.flipped }), 500);
+    return this.update({ layout, flipped: false });
   }
 
   // Change the state, and draw again what shows it.

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -125,22 +124,8 @@ def test_nothing_from_a_name_becomes_markup(tmp_path: Path) -> None:
 
 # In a browser
 
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-FLAGS += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files"]
 LEVELS = {"reference": 0.5, "noisy": 0.05, "average": 0.5, "final": 2.0, "bright": 8.0}
 EXPOSURE = 2.0
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if program is None:
-        pytest.skip("chromium is not installed")
-    with playwright.sync_playwright() as running:
-        instance = running.chromium.launch(executable_path=program, args=FLAGS)
-        yield instance
-        instance.close()
 
 
 @pytest.fixture(scope="module")
@@ -302,6 +287,34 @@ def test_zoom_and_pan_are_the_same_in_both_panes(page: Any) -> None:
     pairs = page.evaluate(script)
     assert all(a == b for a, b in pairs)
     assert len({a for a, _ in pairs}) > 1  # the bright pixel is in sight
+
+
+def test_two_pictures_flicker_in_one_place(page: Any) -> None:
+    arrange(page, "flicker")
+    for _ in range(2):  # there and back
+        see(page, shown(page, "noisy"), 0.25)
+        see(page, shown(page, "final"), 0.25)
+    assert page.locator("#divider").is_hidden()
+    arrange(page, "pair")
+    see(page, shown(page, "noisy"), 0.25)
+    see(page, shown(page, "final"), 0.75)
+
+
+def test_the_magnifier_shows_both_pictures_where_the_pointer_is(page: Any) -> None:
+    page.locator("#canvas").focus()
+    page.keyboard.press("m")
+    until(page, "document.getElementById('magnify').checked")
+    page.locator("#canvas").scroll_into_view_if_needed()
+    box = page.locator("#canvas").bounding_box()
+    x, y = 6.5 / 32 * box["width"], 4.5 / 18 * box["height"]  # the bright pixel of the noisy picture
+    page.mouse.move(box["x"] + x, box["y"] + y)
+    # Two lenses of 120 pixels, above the pointer where there is room: left the left picture, right the right one.
+    middle = (y - 80 if y > 140 else y + 80) / box["height"]
+    start = max(0.0, x - 120)
+    see(page, shown(page, "bright"), (start + 60) / box["width"], middle)
+    see(page, shown(page, "final"), (start + 180) / box["width"], middle)
+    page.keyboard.press("m")
+    see(page, shown(page, "noisy"), (start + 180) / box["width"], middle)
 
 
 def test_one_pixel_is_where_it_belongs(page: Any) -> None:
