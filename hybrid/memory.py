@@ -11,7 +11,16 @@ import re
 import sys
 from collections.abc import Collection
 
-from hybrid.alignment.align import MARGIN, Estimates
+from hybrid.alignment.align import (
+    MARGIN,
+    PLANES_REFINING,
+    Estimates,
+    can_refine,
+    planes_aligned,
+    planes_of_flows,
+    planes_written,
+)
+from hybrid.alignment.prepare import planes_prepared
 from hybrid.files.frames import Shot
 
 # Rows are taken in whole strips of the guided filter.
@@ -20,6 +29,8 @@ STRIP = 64
 BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
 SHARE = 0.92
+# Planes that come and go while a frame is prepared, and while rows of a window are filtered.
+PREPARING, FILTERING = 14, 40
 # Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1
 KEPT = 2**30
@@ -121,26 +132,12 @@ def _planes(
 ) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
-    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
-    if layers.alpha is not None and "alpha" in stages:
-        aovs += 1
-    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
-    light = 3 if "gate" in stages or estimates is not None else 0
-    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
-    frame = 3 + light + guides + motion + (layers.depth is not None) + 3 * (layers.variance is not None) + aovs + 0.25
+    frame = planes_prepared(layers)
     reach = radius if estimates is None else estimates.reach(radius)
     frames = min(2 * reach + 1, shot.count)
-    kept = frames * frame + 3 + aovs  # and the result
-    if "warp" in stages:
-        kept += 2.25 * 4 * max(radius - 1, 0)
-        if {*stages} & {"refine", "dense-flow"} or (layers.motion_convention and not layers.motion_convention.pair):
-            kept += 2.25 * 2 * (frames - 1)
+    window = (2 * radius + 1) * planes_aligned(layers)
+    kept = frames * frame + planes_of_flows(layers, stages, frames, radius) + planes_written(layers)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
-    passing = len(header.channel_names) + frame + 14
-    if {*stages} & {"refine", "dense-flow"}:
-        passing = max(passing, 45)
-    window = (2 * radius + 1) * (3 + light + guides + aovs + 1)
-    worked = 2.0 * window + 40
-    if neural:
-        worked += window
+    passing = max(len(header.channel_names) + frame + PREPARING, PLANES_REFINING if can_refine(stages) else 0)
+    worked = 2.0 * window + FILTERING + (window if neural else 0)
     return kept, passing, worked

@@ -25,6 +25,7 @@ from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_
 from hybrid.alignment.prepare import ALPHA, PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.transfer import measure_exposure, remodulate
 from hybrid.files.frames import Frame, Frames
+from hybrid.files.layers import Layers
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.fireflies import find_fireflies, recurring, replace_fireflies
@@ -46,6 +47,8 @@ HIDDEN = 3.0
 # Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, then
 # the network's context. Whole strips of the guided filter (64 rows): it then sums in the order it would in the frame.
 MARGIN = 128
+# Float32 planes that come and go while TV-L1 solves for a flow.
+PLANES_REFINING = 45
 
 
 @dataclass(frozen=True)
@@ -612,3 +615,29 @@ def _layers(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -
         "valid": frame.valid[..., None].astype(np.float32),
     }
     return {name: layer for name, layer in named.items() if layer is not None}
+
+
+def planes_aligned(layers: Layers) -> float:
+    """Count the float32 planes that each frame of an `AlignedWindow` of these layers takes, with its estimate."""
+    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
+    return 3 + 3 + guides + planes_written(layers) - 3 + 1
+
+
+def planes_written(layers: Layers) -> float:
+    """Count the float32 planes that are made of a window: the color, and what is filtered along."""
+    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
+    return 3 + aovs + (layers.alpha is not None)
+
+
+def planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
+    """Count the float32 planes of the flows that an `Aligner` keeps while windows slide over so many frames."""
+    if "warp" not in stages:
+        return 0.0
+    made = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
+    steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
+    return (2 + 0.25) * (4 * max(radius - 1, 0) + steps)
+
+
+def can_refine(stages: Collection[str]) -> bool:
+    """Whether flow may be solved for."""
+    return bool({"refine", "dense-flow"} & {*stages})
