@@ -22,6 +22,7 @@ from hybrid.alignment.align import (
 )
 from hybrid.alignment.prepare import planes_prepared
 from hybrid.files.frames import Shot
+from hybrid.oidn import HOLDS
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
@@ -72,6 +73,7 @@ def plan_rows(
     *,
     radius: int = 2,
     neural: bool,
+    gathers: bool = False,
 ) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
 
@@ -89,6 +91,8 @@ def plan_rows(
         Frames on each side of the centre.
     neural : bool
         Whether the network runs.
+    gathers : bool
+        Whether samples are gathered, and denoised by OIDN.
 
     Returns
     -------
@@ -109,6 +113,9 @@ def plan_rows(
     kept, passing, worked = _planes(shot, stages, estimates, radius, neural)
     plane = 4 * height * width
     base = (BASE_NEURAL if neural else BASE) + (0 if estimates is None else estimates.holds)
+    if gathers:
+        base += HOLDS - min(HOLDS, 0 if estimates is None else estimates.holds)
+        worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
 
     def needed(rows: int) -> int:
         return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))

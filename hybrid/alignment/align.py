@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Protocol
 
@@ -23,7 +23,7 @@ from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
 from hybrid.alignment.prepare import ALPHA, PreparedFrame, prepare, rendered_flow
-from hybrid.alignment.transfer import measure_exposure, remodulate
+from hybrid.alignment.transfer import demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame, Frames
 from hybrid.files.layers import Layers
 from hybrid.timing import Timings
@@ -78,6 +78,10 @@ class AlignedWindow:
         Of the centre's `color`, where the file tells it.
     estimate : (T, H, W, 3) array or None
         The estimates that were asked for, aligned, as irradiance; the centre's where a frame shows nothing.
+    picture : (h, W, 3) array or None
+        The centre's estimate, radiance of the whole frame.
+    beyond : callable or None
+        What gives `residual`.
     aovs : dict of str to (T, H, W, C) array
         Further layers, warped and demodulated like the color.
     repaired : int
@@ -108,6 +112,8 @@ class AlignedWindow:
     trust: Array
     rendered_variance: Array | None
     estimate: Array | None
+    picture: Array | None
+    beyond: Callable[[], Array] | None
     aovs: dict[str, Array]
     repaired: int
     fireflies: int
@@ -135,6 +141,15 @@ class AlignedWindow:
         if self.rendered_variance is None:
             return variance_from_window(self.color, self.confidence)
         return smooth_variance(self.rendered_variance)
+
+    @cached_property
+    def residual(self) -> Array | None:
+        """What the noisy frames show beyond their estimates, aligned, (T, H, W, 3) irradiance, as `nlm.gather` asks.
+
+        Noisy irradiance − estimate, each in its own place and divided by its own albedo, aligned to the nearest pixel.
+        0 where a frame or its estimate is missing. Made when asked for.
+        """
+        return None if self.beyond is None else self.beyond()
 
     @property
     def centre(self) -> int:
@@ -423,9 +438,15 @@ class Aligner:
         light = "gate" in stages and not given
         layers = {name: layer[outer] for name, layer in _layers(centre, light=light, alpha="alpha" in stages).items()}
         window, confidence, seen = self._gather(number, numbers, layers, outer, stages)
-        estimates = self._gather_estimates(number, numbers, seen, outer) if given else None
+        estimates, beyond = None, None
+        if given:
+            estimates = self._gather_estimates(number, numbers, seen, outer)
+            links = [None if n == number else self.flow(number, n) for n in numbers]
+            flows = [None if link is None else link[0][outer] for link in links]
+            there = [(self._frames.get(n), self.estimates.get(n)) for n in numbers]
+            beyond = partial(_warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, estimates, confidence, seen, inner, stages)
+            return self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
 
     def _gather(
         self, number: int, numbers: Sequence[int], layers: dict[str, Array], rows: slice, stages: frozenset[str]
@@ -525,6 +546,7 @@ class Aligner:
         centre: PreparedFrame,
         window: dict[str, Array],
         estimates: Array | None,
+        beyond: Callable[[], Array] | None,
         confidence: Array,
         seen: Array,
         inner: slice,
@@ -570,6 +592,8 @@ class Aligner:
             trust=trust,
             rendered_variance=centre.variance,
             estimate=estimates,
+            picture=self.estimates.get(centre.number),
+            beyond=beyond,
             aovs={name.removeprefix("aov "): layer for name, layer in window.items() if name.startswith("aov ")},
             repaired=centre.repaired,
             outliers=outliers,
@@ -580,6 +604,25 @@ class Aligner:
             inner=inner,
             stages=stages,
         )
+
+
+def _warp_residuals(
+    there: Sequence[tuple[PreparedFrame | None, Array | None]], flows: Sequence[Array | None], rows: slice
+) -> Array:
+    """See `AlignedWindow.residual`; a frame without a flow is the centre, or missing."""
+    parts: list[Array | None] = []
+    for (frame, estimate), flow in zip(there, flows, strict=True):
+        if frame is None or estimate is None:
+            parts.append(None)
+            continue
+        own = demodulate(estimate, frame.albedo) if frame.demodulated and frame.albedo is not None else estimate
+        left = frame.irradiance - own
+        if flow is None or not flow.any():
+            parts.append(left[rows])
+        else:
+            parts.append(warp(left, flow, interpolation="nearest", first_row=rows.start)[0])
+    nothing = np.zeros(next(part.shape for part in parts if part is not None), np.float32)
+    return np.stack([nothing if part is None else part for part in parts])
 
 
 def _clean(layer: Array, trust: Array, stages: Collection[str]) -> Array:

@@ -65,7 +65,12 @@ def pseudoref(
     motion: MotionOption = None,
     strict: StrictOption = False,
     preset: Annotated[
-        Literal["draft", "standard", "final"], typer.Option(help="of our own estimate", rich_help_panel=WHAT)
+        Literal["draft", "standard", "final", "gathered"],
+        typer.Option(
+            help="of our own estimate; or gathered, the best: samples meet along the motion, and OIDN denoises them "
+            "once more (pyoidn; --estimate is oidn-fast if not given)",
+            rich_help_panel=WHAT,
+        ),
     ] = "standard",
     estimate: EstimateOption = "none",
     keep_estimates: KeepOption = None,
@@ -86,7 +91,7 @@ def pseudoref(
     from hybrid.estimates import choose_estimate
     from hybrid.pipeline import Denoised
     from hybrid.plan import NEURAL_STAGES
-    from hybrid.pseudo_reference import CLASSICAL_PRESETS, gated_average
+    from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL, gated_average, gather_and_denoise
     from hybrid.pseudo_reference import filter_window as estimate_centre
     from hybrid.timing import Timings
 
@@ -94,7 +99,10 @@ def pseudoref(
     if neural := rules.on & NEURAL_STAGES:
         raise typer.BadParameter(f"--stages: {min(neural)} is a stage of the network, expected one that pseudoref has")
     rules = replace(rules, off=rules.off | NEURAL_STAGES)
-    chosen = CLASSICAL_PRESETS[preset]
+    chosen = CLASSICAL_PRESETS.get(preset, FINAL)
+    gathers = preset == "gathered"
+    if gathers and estimate == "none":
+        estimate = "oidn-fast"
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
     opened, judgement = judge_input(opened, strict=strict)
@@ -104,7 +112,7 @@ def pseudoref(
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
-        make = partial(gated_average, timings=timings)
+        make = partial(gather_and_denoise if gathers else gated_average, timings=timings)
     _run(
         Job(
             shot,
@@ -121,6 +129,7 @@ def pseudoref(
             keep_going=keep_going,
             max_memory=max_memory,
             judgement=judgement,
+            gathers=gathers,
         )
     )
     _look(opened, output, preview, fps, contact)
@@ -357,6 +366,7 @@ class Job:
     judgement: Judgement
     radius: int = 2
     neural: bool = False
+    gathers: bool = False  # samples of the window, which OIDN then denoises
 
 
 @contextmanager
@@ -446,7 +456,9 @@ def _denoise(job: Job, record: Record) -> None:
     rules = job.rules
     rows = None
     if limit is not None:
-        rows = plan_rows(limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural)
+        rows = plan_rows(
+            limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural, gathers=job.gathers
+        )
     taken = shot.layers(shot.numbers[0])
     layers = summarize_layers(taken)
     said = [finding.message for finding in job.judgement.findings if not finding.warning]

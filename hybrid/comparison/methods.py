@@ -24,7 +24,7 @@ from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Plan, Rules, plan_shot
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise
 from nlm.average import average, replace_nonfinite, robust_average
 
 if TYPE_CHECKING:
@@ -318,6 +318,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "gated OIDN clean": _aligned("Gated averages", gated_average, source="oidn-clean"),
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
+    "gathered": _aligned("Gated averages", gather_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("quality", "nlm"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
     "tKPCN": _network("tkpcn", "none"),
