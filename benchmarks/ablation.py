@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.comparison.metrics import ssim
 from network.checkpoint import load_model, load_notes
-from network.clips import Clips, SamplerConfig, open_clips, split_by_shot, whole_frames
+from network.clips import Clips, open_clips, split_by_shot, whole_frames
 from network.losses import tone_mapped_psnr
 from network.models import (
     TKPCN,
@@ -43,7 +43,8 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
-from network.train import TrainConfig, predict, train
+from network.train import predict, train
+from network.train_config import SamplerConfig, TrainConfig
 
 
 def networks(frames: int, width: int, blocks: int, activation: str) -> dict[str, Callable[[], Model]]:

@@ -30,7 +30,8 @@ from network.blocks import RobustAverage, outermost_first, ravg
 from network.kernels import apply_kernels, predict_kernel, threshold_kernel
 from network.losses import relmse
 from network.models import PRESETS, channels_last, denoise_tile, for_inference
-from network.train import TrainConfig, batch_loss
+from network.train import batch_loss
+from network.train_config import TrainConfig
 
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:

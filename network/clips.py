@@ -23,6 +23,7 @@ from network import losses
 from network.checkpoint import new_partial
 from network.kernels import mean_of
 from network.losses import ImageLoss
+from network.train_config import SamplerConfig
 
 FORMAT = "ravg-clips"
 VERSION = "1"
@@ -484,25 +485,6 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
     if not training:
         raise ValueError(f"validation: expected a shot left to train on, got all of {clips.shots}")
     return clips.of(training), clips.of(validation)
-
-
-@dataclass(frozen=True)
-class SamplerConfig:
-    """How samples are drawn and varied. Probabilities are per sample."""
-
-    crop: int = 128  # height and width; of larger clips a place is drawn by importance
-    sets: int = 10  # disjoint sets of clips, one for each epoch; the paper's ten
-    drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
-    fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
-    exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
-
-    def __post_init__(self) -> None:
-        for name in ("crop", "sets"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("drop_frames", "fireflies"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a probability, got {getattr(self, name)}")
 
 
 class Samples(Dataset[dict[str, Tensor]]):

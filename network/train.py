@@ -16,7 +16,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,85 +27,12 @@ from torch.utils.data import DataLoader
 
 from network import losses
 from network.checkpoint import describe, new_partial, save_model
-from network.clips import Clips, SamplerConfig, Samples, whole_frames
+from network.clips import Clips, Samples, whole_frames
 from network.kernels import Filtered, mean_of
 from network.models import Model, channels_last, filter_window
 from network.perceptual import Perceptual, load_vgg19
 from network.stabilizer import Stabilized
-
-LOSSES: dict[str, losses.ImageLoss] = {
-    "l1": losses.l1,
-    "smape": losses.smape,
-    "relmse": losses.relmse,
-    "display": losses.display,
-}
-TERMS = ("temporal", "power", "spatial")
-DEVICES = ("auto", "cpu", "cuda")
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """One training; with the clips and the model it determines the weights."""
-
-    steps: int | None = None  # stop after so many steps; reproducible from the seed
-    minutes: float | None = None  # or after so long, whichever comes first
-    batch: int = 2  # of all processes together
-    rate: float = 1e-3  # peak learning rate
-    warmup: int = 200  # steps of linear rise; the kernels start at a sane mean, and must not be thrown off it
-    weight_decay: float = 1e-4
-    clip_norm: float = 1.0  # largest norm of the gradient; one firefly is one sample
-    ema: float = 0.999  # of the weights that are validated and kept
-    loss: str = "relmse"  # which leaves the mean alone: of LOSSES, or perceptual
-    vgg: str | None = None  # weights of VGG19 in torchvision's format, or hub; for perceptual
-    terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
-    whole: float = 1.0  # weight of the whole window's term beside the temporal ones
-    slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
-    bfloat16: bool = True  # for the convolutions; kernels and losses are float32
-    compile: bool = False  # torch.compile the network: a minute at the start, pays on a GPU
-    device: str = "auto"  # the GPU if there is one
-    workers: int = 0  # processes that read clips; 0: the training itself
-    seed: int = 0
-    checkpoint_minutes: float = 5.0
-    validate_minutes: float = 5.0
-    sampler: SamplerConfig = field(default_factory=SamplerConfig)
-
-    def __post_init__(self) -> None:
-        if self.steps is None and self.minutes is None:
-            raise ValueError("steps, minutes: expected at least one limit, got none")
-        for name in ("steps", "minutes", "batch", "rate", "clip_norm"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name}: expected a positive number, got {value}")
-        if not 0 <= self.ema < 1:
-            raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
-        for name, choices in (("loss", (*LOSSES, "perceptual")), ("terms", TERMS), ("device", DEVICES)):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        if (self.loss == "perceptual") != (self.vgg is not None):
-            raise ValueError("vgg: expected weights with the perceptual loss, and only with it")
-        if self.whole < 0 or self.slope < 1:
-            raise ValueError(f"whole, slope: expected whole >= 0 and slope >= 1, got {self.whole} and {self.slope}")
-
-    def loss_terms(self, frames: int) -> list[losses.Term]:
-        """Terms of the loss.
-
-        Parameters
-        ----------
-        frames : int
-            Length of the window.
-
-        Returns
-        -------
-        list of Term
-            As `terms` says.
-        """
-        if self.terms == "temporal":
-            return losses.temporal_terms(frames, self.whole)
-        return losses.power_terms(frames) if self.terms == "power" else losses.spatial_terms(frames)
-
-    def image_loss(self) -> losses.ImageLoss:
-        """The image loss by name; reads VGG19 for the perceptual one."""
-        return LOSSES[self.loss] if self.vgg is None else Perceptual(load_vgg19(self.vgg))
+from network.train_config import TrainConfig
 
 
 def predict(
@@ -131,6 +58,32 @@ def predict(
     """
     with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
         return filter_window(model, batch, run=run)
+
+
+def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
+    """Terms of the loss.
+
+    Parameters
+    ----------
+    config : TrainConfig
+        Its `terms` says which.
+    frames : int
+        Length of the window.
+
+    Returns
+    -------
+    list of Term
+    """
+    if config.terms == "temporal":
+        return losses.temporal_terms(frames, config.whole)
+    return losses.power_terms(frames) if config.terms == "power" else losses.spatial_terms(frames)
+
+
+def image_loss(config: TrainConfig) -> losses.ImageLoss:
+    """Find the image loss by name; read VGG19 for the perceptual one."""
+    if config.vgg is not None:
+        return Perceptual(load_vgg19(config.vgg))
+    return {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse, "display": losses.display}[config.loss]
 
 
 def batch_loss(
@@ -170,7 +123,7 @@ def batch_loss(
     would undo what a hundred others have taught.
     """
     filtered = predict(model, batch, config.bfloat16, run)
-    terms = config.loss_terms(batch["color"].shape[1])
+    terms = loss_terms(config, batch["color"].shape[1])
     value = losses.temporal_loss(
         loss, filtered, batch["color"], batch["target"], batch["modulation"], batch["exposure"], terms, config.slope
     )
@@ -288,7 +241,7 @@ def train(
         optimizer.load_state_dict(state["optimizer"])
         progress = json.loads(state["progress"])
         step, before, history = progress["step"], progress["seconds"], progress["history"]
-    loss_of_image = config.image_loss()
+    loss_of_image = image_loss(config)
     if isinstance(loss_of_image, nn.Module):
         loss_of_image.to(device)
     run: nn.Module = DistributedDataParallel(model) if world > 1 else model

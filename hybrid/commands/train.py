@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,11 +22,13 @@ from hybrid.commands.options import (
     parse_layers,
     usage,
 )
+from network.train_config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
     from hybrid.files.frames import Shot
 
 TRAINING = "Training"
+DEFAULTS = TrainConfig(steps=1)  # one limit there must be
 
 
 def open_levels(
@@ -139,7 +142,9 @@ def prepare(
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
-    neural = import_neural()
+    import_neural()
+    from hybrid.neural import write_clips
+
     with usage():
         samples = None if levels is None else parse_samples(levels)
     roles = parse_layers(layer)
@@ -155,7 +160,7 @@ def prepare(
         if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
             bar.advance(len(first), f"{name} has clips already")
             continue
-        neural.write_clips(
+        write_clips(
             shot,
             counts,
             output,
@@ -168,7 +173,7 @@ def prepare(
             if reference
             else None,
             seed=seed,
-            advance=lambda name=name: bar.advance(message=name),
+            advance=partial(bar.advance, message=name),
         )
     LOG.info(f"clips of {len(found)} shots are in {output}")
 
@@ -209,49 +214,57 @@ def train(
     minutes: Annotated[float | None, typer.Option(help="stop after so many minutes", rich_help_panel=TRAINING)] = None,
     batch: Annotated[
         int, typer.Option(help="samples of a step, of all processes together", rich_help_panel=TRAINING)
-    ] = 2,
-    rate: Annotated[float, typer.Option(help="peak learning rate", rich_help_panel=TRAINING)] = 1e-3,
-    warmup: Annotated[int, typer.Option(help="steps in which the rate rises", rich_help_panel=TRAINING)] = 200,
+    ] = DEFAULTS.batch,
+    rate: Annotated[float, typer.Option(help="peak learning rate", rich_help_panel=TRAINING)] = DEFAULTS.rate,
+    warmup: Annotated[
+        int, typer.Option(help="steps in which the rate rises", rich_help_panel=TRAINING)
+    ] = DEFAULTS.warmup,
     clip_norm: Annotated[
         float, typer.Option("--clip", help="largest norm of a gradient", rich_help_panel=TRAINING)
-    ] = 1.0,
+    ] = DEFAULTS.clip_norm,
     ema: Annotated[
         float, typer.Option(help="how slowly the weights that are kept follow", rich_help_panel=TRAINING)
-    ] = 0.999,
+    ] = DEFAULTS.ema,
     loss: Annotated[
         str,
         typer.Option(
             help="relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)", rich_help_panel=TRAINING
         ),
-    ] = "relmse",
+    ] = DEFAULTS.loss,
     vgg: Annotated[
         str | None,
         typer.Option(help="torchvision's VGG19 weights: a file, or hub to fetch them", rich_help_panel=TRAINING),
     ] = None,
     terms: Annotated[
         str, typer.Option(help="temporal, power (every subset of the window), or spatial", rich_help_panel=TRAINING)
-    ] = "temporal",
+    ] = DEFAULTS.terms,
     whole: Annotated[
         float, typer.Option(help="weight of the whole window's term beside the temporal ones", rich_help_panel=TRAINING)
-    ] = 1.0,
+    ] = DEFAULTS.whole,
     slope: Annotated[
         float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail", rich_help_panel=TRAINING)
-    ] = 1.0,
-    crop: Annotated[int, typer.Option(help="pixels on a side of a sample", rich_help_panel=TRAINING)] = 128,
-    sets: Annotated[int, typer.Option(help="disjoint sets of clips, one an epoch", rich_help_panel=TRAINING)] = 10,
-    seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = 0,
+    ] = DEFAULTS.slope,
+    crop: Annotated[
+        int, typer.Option(help="pixels on a side of a sample", rich_help_panel=TRAINING)
+    ] = DEFAULTS.sampler.crop,
+    sets: Annotated[
+        int, typer.Option(help="disjoint sets of clips, one an epoch", rich_help_panel=TRAINING)
+    ] = DEFAULTS.sampler.sets,
+    seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = DEFAULTS.seed,
     device: Annotated[
         str, typer.Option(envvar="RAVG_DEVICE", help="auto, cpu or cuda", rich_help_panel=RESOURCES)
-    ] = "auto",
+    ] = DEFAULTS.device,
     threads: Annotated[int | None, typer.Option(help="of torch and numba", rich_help_panel=RESOURCES)] = None,
-    workers: Annotated[int, typer.Option(help="processes that read clips", rich_help_panel=RESOURCES)] = 0,
+    workers: Annotated[
+        int, typer.Option(help="processes that read clips", rich_help_panel=RESOURCES)
+    ] = DEFAULTS.workers,
     float32: Annotated[bool, typer.Option("--float32", help="no bfloat16", rich_help_panel=RESOURCES)] = False,
     compile: Annotated[
         bool, typer.Option("--compile", help="compile the network; pays on a GPU", rich_help_panel=RESOURCES)
     ] = False,
     validate_minutes: Annotated[
         float, typer.Option(help="between validations, and between checkpoints", rich_help_panel=TRAINING)
-    ] = 5.0,
+    ] = DEFAULTS.validate_minutes,
     tensorboard: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="write TensorBoard's logs there", rich_help_panel=OUTPUT)
     ] = None,
@@ -264,7 +277,31 @@ def train(
 
     Fine-tune on your own footage, without any reference: ravg prepare it, then --init fast --rate 1e-4.
     """
-    neural = import_neural()
+    import_neural()
+    from hybrid.neural import train_network
+
+    config = TrainConfig(
+        steps=steps,
+        minutes=minutes,
+        batch=batch,
+        rate=rate,
+        warmup=warmup,
+        clip_norm=clip_norm,
+        ema=ema,
+        loss=loss,
+        vgg=vgg,
+        terms=terms,
+        whole=whole,
+        slope=slope,
+        bfloat16=not float32,
+        compile=compile,
+        device=device,
+        workers=workers,
+        seed=seed,
+        checkpoint_minutes=validate_minutes,
+        validate_minutes=validate_minutes,
+        sampler=SamplerConfig(crop=crop, sets=sets),
+    )
     writer = None
     if tensorboard is not None:
         try:
@@ -288,36 +325,16 @@ def train(
             figures = "  ".join(f"{name.partition('/')[2]} {value:.3f}" for name, value in values.items())
             LOG.info(f"step {step}: {figures}")
 
-    neural.train_network(
+    train_network(
         clips,
         output,
+        config,
         preset=preset,
         init=init,
         validation=[name for item in validation or () for name in item.split(",")],
         threads=threads,
         resume=resume,
         log=log,
-        crop=crop,
-        sets=sets,
-        steps=steps,
-        minutes=minutes,
-        batch=batch,
-        rate=rate,
-        warmup=warmup,
-        clip_norm=clip_norm,
-        ema=ema,
-        loss=loss,
-        vgg=vgg,
-        terms=terms,
-        whole=whole,
-        slope=slope,
-        seed=seed,
-        device=device,
-        workers=workers,
-        bfloat16=not float32,
-        compile=compile,
-        validate_minutes=validate_minutes,
-        checkpoint_minutes=validate_minutes,
     )
     if writer is not None:
         writer.close()

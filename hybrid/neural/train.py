@@ -5,32 +5,29 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numba
 import torch
 
 from hybrid.neural.denoiser import shipped_weights
 from network.checkpoint import load_model
-from network.clips import SamplerConfig, open_clips, split_by_shot
+from network.clips import open_clips, split_by_shot
 from network.models import PRESETS, window_length
-from network.train import TrainConfig, train
+from network.train import train
+from network.train_config import TrainConfig
 
 
 def train_network(
     clips: Path,
     output: Path,
+    config: TrainConfig,
     *,
-    preset: str = "fast",
-    init: str | None = None,
-    validation: Sequence[str] = (),
-    threads: int | None = None,
-    resume: bool = False,
-    log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
-    crop: int = 128,
-    sets: int = 10,
-    seed: int = 0,
-    **settings: Any,
+    preset: str,
+    init: str | None,
+    validation: Sequence[str],
+    threads: int | None,
+    resume: bool,
+    log: Callable[[int, dict[str, float]], None],
 ) -> list[float]:
     """Train a preset, or weights there are, on the clips of a folder.
 
@@ -40,6 +37,8 @@ def train_network(
         From `write_clips`.
     output : Path
         Weights to write.
+    config : TrainConfig
+        All that determines the training beside clips and model; its seed is that of the initial weights too.
     preset : str
         Of `network.models.PRESETS`; not looked at with init.
     init : str, optional
@@ -48,14 +47,10 @@ def train_network(
         Shots kept out of training.
     threads : int, optional
         Of torch and numba.
-    resume, log
-        As for `network.train.train`.
-    crop, sets
-        Of `network.clips.SamplerConfig`.
-    seed : int
-        Of initial weights and samples.
-    **settings
-        Further fields of `network.train.TrainConfig`.
+    resume : bool
+        Whether to go on from what an interrupted training has left, as for `network.train.train`.
+    log : callable
+        Is given a step and figures.
 
     Returns
     -------
@@ -71,7 +66,6 @@ def train_network(
     -----
     Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over nccl with GPUs and gloo without.
     """
-    config = TrainConfig(seed=seed, sampler=SamplerConfig(crop=crop, sets=sets), **settings)
     if threads is not None:
         torch.set_num_threads(threads)
         numba.set_num_threads(min(threads, numba.get_num_threads()))
@@ -79,7 +73,7 @@ def train_network(
     if init is None:
         if preset not in PRESETS:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
-        model = PRESETS[preset](frames=training.frames, seed=seed)
+        model = PRESETS[preset](frames=training.frames, seed=config.seed)
     else:
         path = Path(init) if Path(init).suffix else shipped_weights(init)
         model = load_model(path)

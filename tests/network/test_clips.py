@@ -18,7 +18,6 @@ from torch.utils.data import DataLoader
 from network.clips import (
     Clip,
     Clips,
-    SamplerConfig,
     Samples,
     importance,
     important_places,
@@ -28,6 +27,7 @@ from network.clips import (
     whole_frames,
     write_shards,
 )
+from network.train_config import SamplerConfig
 
 pytestmark = pytest.mark.neural
 

@@ -20,8 +20,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import network.train
+from network import losses
 from network.checkpoint import build, describe, load_model, load_notes, save_model
-from network.clips import Clip, Clips, SamplerConfig, Samples, open_clips, split_by_shot, write_shards
+from network.clips import Clip, Clips, Samples, open_clips, split_by_shot, write_shards
 from network.models import (
     TKPCN,
     KernelConfig,
@@ -35,7 +36,8 @@ from network.models import (
     TKPCNConfig,
 )
 from network.stabilizer import Stabilizer, StabilizerConfig
-from network.train import TrainConfig, batch_loss, train, validate
+from network.train import batch_loss, image_loss, train, validate
+from network.train_config import LOSSES, SamplerConfig, TrainConfig
 
 pytestmark = pytest.mark.neural
 
@@ -103,6 +105,11 @@ def equal_weights(a: Model, b: Model) -> bool:
     return all(torch.equal(p, q) for p, q in zip(a.parameters(), b.parameters(), strict=True))
 
 
+@pytest.mark.parametrize("name", [name for name in LOSSES if name != "perceptual"])
+def test_every_loss_that_can_be_asked_for_is_there(name: str) -> None:
+    assert image_loss(replace(CONFIG, loss=name)) is getattr(losses, name)
+
+
 # Training
 
 
@@ -116,7 +123,7 @@ def test_training_on_noisy_targets_approaches_the_clean_image(
     with torch.no_grad():
         model.head.window.bias[4] = 20  # it starts with nearly all weight on the pixels themselves
     batch, clean = a_batch(sets[0], config, 16), clips.of(["clean"])
-    loss = config.image_loss()
+    loss = image_loss(config)
     loss_before, before = batch_loss(model, batch, config, loss).item(), validate(model, clean)
     train(sets[0], clips.of([]), model, config, tmp_path / "w.safetensors")
     assert batch_loss(model, batch, config, loss).item() < loss_before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
 from network.models import unet  # noqa: E402
 from network.stabilizer import Stabilizer, StabilizerConfig  # noqa: E402
+from network.train_config import SamplerConfig, TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -139,6 +141,65 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
         assert message in capsys.readouterr().err
     assert run("train", tmp_path / "logs", "-o", out, "--steps", "1") == 1
     assert "expected what ravg prepare writes" in capsys.readouterr().err
+
+
+# Every field of a training's configuration: the words that set it, and what they make of it.
+OPTIONS = {
+    "steps": (["--steps", 7], 7),
+    "minutes": (["--minutes", 1.5], 1.5),
+    "batch": (["--batch", 3], 3),
+    "rate": (["--rate", 2e-3], 2e-3),
+    "warmup": (["--warmup", 11], 11),
+    "clip_norm": (["--clip", 0.5], 0.5),
+    "ema": (["--ema", 0.9], 0.9),
+    "loss": (["--loss", "perceptual"], "perceptual"),
+    "vgg": (["--vgg", "vgg.pth"], "vgg.pth"),
+    "terms": (["--terms", "power"], "power"),
+    "whole": (["--whole", 0.25], 0.25),
+    "slope": (["--slope", 2], 2.0),
+    "bfloat16": (["--float32"], False),
+    "compile": (["--compile"], True),
+    "device": (["--device", "cpu"], "cpu"),
+    "workers": (["--workers", 2], 2),
+    "seed": (["--seed", 5], 5),
+    "checkpoint_minutes": ([], 3.0),  # as often as it is validated
+    "validate_minutes": (["--validate-minutes", 3], 3.0),
+    "sampler": (["--crop", 64, "--sets", 4], SamplerConfig(crop=64, sets=4)),
+}
+NOT_OFFERED = {"weight_decay"}
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the command asks the network's side for, which trains nothing."""
+    calls = []
+    monkeypatch.setattr("hybrid.neural.train_network", lambda *given, **more: calls.append((given, more)))
+    return calls
+
+
+def test_what_is_not_said_is_as_the_configuration_has_it(asked):
+    assert run("train", "clips", "-o", "w.safetensors", "--steps", 7) == 0
+    (((clips, output, config), more),) = asked
+    assert (str(clips), str(output)) == ("clips", "w.safetensors")
+    assert config == TrainConfig(steps=7)
+    del more["log"]
+    assert more == {"preset": "fast", "init": None, "validation": [], "threads": None, "resume": False}
+
+
+def test_every_option_arrives_where_it_belongs(asked):
+    words = [word for option, _ in OPTIONS.values() for word in option]
+    more = ["--preset", "quality", "--init", "balanced", "--threads", 2, "--resume"]
+    assert run("train", "clips", "-o", "w.safetensors", *words, *more, "--validation", "a,b", "--validation", "c") == 0
+    (((_, _, config), settings),) = asked
+    assert set(OPTIONS) | NOT_OFFERED == {field.name for field in fields(TrainConfig)}
+    plain = TrainConfig(steps=1)
+    for name, (_, value) in OPTIONS.items():
+        assert getattr(config, name) == value, name
+        assert getattr(plain, name) != value, f"{name}: the same without the option"
+    del settings["log"]
+    assert settings == {
+        "preset": "quality", "init": "balanced", "validation": ["a", "b", "c"], "threads": 2, "resume": True,
+    }  # fmt: skip
 
 
 def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
