@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -94,7 +94,7 @@ def check_written(
     written = [("output", output_path(output, shot, number)) for number in shot.numbers]
     written += [("keep-estimates", path) for path in source.kept]
     written += [(what, path) for what, path in others.items() if path is not None]
-    read = [("frame", path) for path in shot.files.values()]
+    read = [("frame", path) for number in shot.files for path in shot.paths(number)]
     read += [("estimate", path) for path in (source.files.files.values() if source.files else ())]
     read += [(what, Path(path)) for what, path in inputs.items() if path is not None]
     check_outputs(written, read)
@@ -108,6 +108,7 @@ def denoise_shot(
     *,
     radius: int = 2,
     estimates: Estimates | None = None,
+    others: Sequence[tuple[Shot, Estimates | None]] = (),
     attributes: Mapping[str, str] | None = None,
     rows: int | None = None,
     resume: bool = False,
@@ -130,6 +131,8 @@ def denoise_shot(
         Frames on each side of the centre.
     estimates : Estimates, optional
         Where the estimates of single frames come from (`hybrid.estimates`).
+    others : sequence of (Shot, Estimates or None)
+        Further pictures of the same files (`Shot.pictures`), each with a window of its own. A file is written once.
     attributes : mapping of str to str, optional
         Written to the header of each file.
     rows : int, optional
@@ -157,7 +160,10 @@ def denoise_shot(
     earlier processes have left half written is removed.
     """
     timings = timings or Timings()
-    aligner = Aligner(shot, rules, radius=radius, estimates=estimates, timings=timings)
+    aligner, *beside = (
+        Aligner(picture, rules, radius=radius, estimates=theirs, timings=timings)
+        for picture, theirs in ((shot, estimates), *others)
+    )
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
@@ -170,23 +176,28 @@ def denoise_shot(
             continue
         try:
             denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
+            counted, pictures = [aligned], []
+            for (picture, _), other in zip(others, beside, strict=True):
+                theirs, counts = _denoise_frame(other, number, denoise, rows or shot.shape[0])
+                pictures.append((picture, {"color": theirs.color, **theirs.aovs}))
+                counted.append(counts)
             plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
             with timings.stage("write"):
                 images = {"color": denoised.color, **denoised.aovs}
                 stages = {"ravg/stages": " ".join(sorted(plan.stages))}
-                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages})
+                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages}, pictures)
             finished = Finished(
                 number=number,
                 path=path,
-                pixels=denoised.color[..., 0].size,
-                repaired=aligned.repaired,
-                fireflies=aligned.fireflies,
-                removed=aligned.removed,
-                outliers=aligned.outliers,
+                pixels=denoised.color[..., 0].size * len(counted),
+                repaired=sum(counts.repaired for counts in counted),
+                fireflies=sum(counts.fireflies for counts in counted),
+                removed=max(counts.removed for counts in counted),
+                outliers=sum(counts.outliers for counts in counted),
                 clamped=clamped,
                 plan=plan,
             )
-            del denoised, aligned  # or they would still be there while the next window is made
+            del denoised, aligned, pictures  # or they would still be there while the next window is made
         except (ValueError, OSError) as error:
             if not keep_going:
                 raise

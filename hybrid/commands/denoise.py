@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -38,6 +38,7 @@ from hybrid.commands.options import (
     SheetOption,
     ShotArgument,
     StrictOption,
+    each_view,
     import_neural,
     judge_input,
     open_input,
@@ -88,6 +89,8 @@ def pseudoref(
 
     With --estimate, pictures that are denoised already, each by itself, are made stable instead.
     """
+    if each_view(pseudoref, locals()):
+        return
     from hybrid.estimates import choose_estimate
     from hybrid.pipeline import Denoised
     from hybrid.plan import NEURAL_STAGES
@@ -105,9 +108,11 @@ def pseudoref(
         estimate = "oidn-fast"
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
-    opened, judgement = judge_input(opened, strict=strict)
+    (opened, *others), judgement = judge_input(opened, strict=strict)
+    _expect_one(others, {"keep-estimates": keep_estimates})
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
+    beside = [(other, choose_estimate(estimate, other, own=chosen)) for other in others]
     _spare_inputs(opened, output, source, {"profile": profile}, preview=preview, contact=contact)
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
@@ -130,6 +135,7 @@ def pseudoref(
             max_memory=max_memory,
             judgement=judgement,
             gathers=gathers,
+            others=beside,
         )
     )
     _look(opened, output, preview, fps, contact)
@@ -216,6 +222,8 @@ def denoise(
     max_pixels: PixelsOption = None,
 ) -> None:
     """Denoise with the Robust Average network."""
+    if each_view(denoise, locals()):
+        return
     neural = import_neural()
     from rich.console import Console
     from rich.table import Table
@@ -228,7 +236,9 @@ def denoise(
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
-    opened, judgement = judge_input(opened, strict=strict)
+    (opened, *others), judgement = judge_input(opened, strict=strict)
+    alone = {"keep-estimates": keep_estimates, "breakdown": breakdown, "passes": passes if passes > 1 else None}
+    _expect_one(others, alone)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -245,8 +255,10 @@ def denoise(
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
         source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
+        beside = [(other, choose_estimate(wanted, other, mode=mode)) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
+        beside = [(other, source) for other in others]
     else:
         raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
     inputs = {"weights": path, "profile": profile}
@@ -278,6 +290,7 @@ def denoise(
         keep_going=keep_going,
         max_memory=max_memory,
         judgement=judgement,
+        others=beside,
         radius=denoiser.radius,
         neural=True,
     )
@@ -311,6 +324,12 @@ def _spare_inputs(
             check_preview(preview)
         if (contact := pictures.get("contact")) is not None:
             check_sheet(contact)
+
+
+def _expect_one(others: Sequence[Shot], options: Mapping[str, object]) -> None:
+    """Refuse what is made of one picture where a file has several."""
+    if given := [name for name, value in options.items() if others and value is not None]:
+        raise typer.BadParameter(f"--{given[0]} is of one picture, and the files have several: --layer color=NAME")
 
 
 def _expect_all(shot: Shot, keep_going: bool) -> None:
@@ -364,6 +383,7 @@ class Job:
     keep_going: bool
     max_memory: str | None
     judgement: Judgement
+    others: Sequence[tuple[Shot, EstimateSource]] = ()
     radius: int = 2
     neural: bool = False
     gathers: bool = False  # samples of the window, which OIDN then denoises
@@ -457,7 +477,13 @@ def _denoise(job: Job, record: Record) -> None:
     rows = None
     if limit is not None:
         rows = plan_rows(
-            limit, shot, rules.allowed, source.estimates, radius=job.radius, neural=job.neural, gathers=job.gathers
+            limit // (1 + len(job.others)),
+            shot,
+            rules.allowed,
+            source.estimates,
+            radius=job.radius,
+            neural=job.neural,
+            gathers=job.gathers,
         )
     taken = shot.layers(shot.numbers[0])
     layers = summarize_layers(taken)
@@ -484,6 +510,7 @@ def _denoise(job: Job, record: Record) -> None:
         rules,
         radius=job.radius,
         estimates=source.estimates,
+        others=[(picture, theirs.estimates) for picture, theirs in job.others],
         attributes=attributes,
         rows=rows,
         resume=job.resume,

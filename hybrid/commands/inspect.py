@@ -20,6 +20,7 @@ from hybrid.commands.options import (
     ProfileOption,
     ShotArgument,
     StrictOption,
+    each_view,
     judge_input,
     open_input,
     rules_of,
@@ -44,6 +45,8 @@ def inspect(
     max_pixels: PixelsOption = None,
 ) -> None:
     """Show which channels are taken for what, and which stages the shot calls for."""
+    if each_view(inspect, locals()):
+        return
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -53,11 +56,11 @@ def inspect(
     from hybrid.plan import STAGES, plan_shot
 
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
+    (opened, *_), judgement = judge_input(opened, strict=strict)
     first = opened.numbers[0]
     height, width = opened.shape
     layers = opened.layers(first)
     rows = describe_layers(layers)
-    opened, judgement = judge_input(opened, strict=strict)
     rules = rules_of(stages, no_stages)
     progress = Progress("look", len(opened))
     plan = plan_shot(opened, rules, advance=progress.advance)

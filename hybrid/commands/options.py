@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
@@ -218,16 +219,47 @@ def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
     return overrides
 
 
-def judge_input(shot: Shot, *, strict: bool) -> tuple[Shot, Judgement]:
-    """The shot without the layers that make no sense, each of which is said in a line; an error if `strict`."""
+def each_view(command: Callable[..., None], given: Mapping[str, object]) -> bool:
+    """Run a command for each stereo view that %V or %v stands for in the shot's name; False where it has neither."""
+    from hybrid.files.sequences import find_views, name_view
+
+    spec, output = str(given["shot"]), given.get("output")
+    views = find_views(spec)
+    if views and output is not None and name_view(str(output), views[0]) == str(output):
+        named = name_view(Path(spec).name, views[0]) != Path(spec).name
+        if not named or str(output).lower().endswith(".exr"):
+            raise typer.BadParameter(f"output is {str(output)!r}, expected %V or %v in it, as the shot has")
+    for view in views:
+        LOG.info(f"view {view}")
+        here = {
+            option: type(value)(name_view(str(value), view)) if isinstance(value, str | Path) else value
+            for option, value in given.items()
+        }
+        here["layer"] = [name_view(item, view) for item in given.get("layer") or ()]  # type: ignore[attr-defined]
+        command(**here)
+    return bool(views)
+
+
+def judge_input(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:
+    """The pictures of the shot, without the layers that make no sense.
+
+    Each of those is said in a line; it is an error if `strict`. The judgement is that of the first picture, with what
+    was found in the others.
+    """
     from hybrid.plausibility import judge_layers
 
-    judgement = judge_layers(shot)
+    pictures = shot.pictures
+    judged = [judge_layers(picture) for picture in pictures]
+    findings = [finding for judgement in judged for finding in judgement.findings]
+    judgement = replace(judged[0], findings=tuple(dict.fromkeys(findings)))
     if strict and (warnings := [*shot.warnings, *judgement.warnings]):
         raise ValueError("; ".join(warnings))
     for warning in judgement.warnings:
         LOG.warning(printable(warning))
-    return judgement.apply(shot), judgement
+    if len(pictures) > 1:
+        colors = ", ".join(str(picture.layers(picture.numbers[0]).color) for picture in pictures)
+        LOG.info(f"pictures: {printable(colors)}: each is denoised; --layer color=NAME chooses one")
+    return tuple(own.apply(picture) for own, picture in zip(judged, pictures, strict=True)), judgement
 
 
 def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:

@@ -18,7 +18,7 @@ import numpy as np
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
-from hybrid.files.layers import Layers, find_layers
+from hybrid.files.layers import Layers, find_colors, find_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
@@ -354,6 +354,34 @@ class Shot:
             for role, other in self._apart.items()
         }
 
+    @cached_property
+    def pictures(self) -> tuple[Shot, ...]:
+        """This shot, once for each view layer and stereo view in its files; as it is where the color was chosen.
+
+        Raises
+        ------
+        ExrError
+            If there are several, and layers that lie in other files: whose they are is not known.
+        """
+        if "color" in self._overrides:
+            return (self,)
+        image = self.header(self.numbers[0])
+        colors = find_colors(image, self.profile)
+        if len(colors) < 2:
+            return (self,)
+        if self._apart:
+            names = ", ".join(map(str, colors))
+            raise ExrError(f"{image.path}: {names}, and layers in other files: expected one (--layer color=NAME)")
+        return tuple(self._picture(color) for color in colors)
+
+    def _picture(self, color: Layer) -> Shot:
+        other = copy(self)
+        for name in ("_first_layers", "_size", "_canvas", "pictures"):
+            other.__dict__.pop(name, None)
+        other._held = OrderedDict()
+        other._overrides = {**self._overrides, "color": color}
+        return other
+
     def paths(self, number: int) -> tuple[Path, ...]:
         """The files that a frame is read from, its own first."""
         return (self.path(number), *dict.fromkeys(other.files[number] for other in self._apart.values()))
@@ -401,6 +429,7 @@ class Shot:
         images: Mapping[str, np.ndarray],
         extra: Mapping[str, np.ndarray] | None = None,
         attributes: Mapping[str, str] | None = None,
+        others: Iterable[tuple[Shot, Mapping[str, np.ndarray]]] = (),
     ) -> int:
         """Write a frame's file again with some layers replaced (`hybrid.files.exr.write_exr`).
 
@@ -417,6 +446,8 @@ class Shot:
             Layers to add; name → (H, W, C) or (H, W), of the same size.
         attributes
             Strings for the header.
+        others
+            Further `pictures` of the same files, and what replaces layers of theirs.
 
         Returns
         -------
@@ -424,6 +455,15 @@ class Shot:
             How many values were too large for a half channel.
         """
         source = self.source(number)
+        replaced = self._replace(source, images)
+        for other, theirs in others:
+            replaced |= other._replace(source, theirs)
+        home = source.parts[self._find(source).color.part]
+        added = {name: self._cut(image, home) for name, image in (extra or {}).items()}
+        return write_exr(path, source, replaced, added, attributes)
+
+    def _replace(self, source: ExrImage, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The channels of a file that pictures by role or AOV take the place of."""
         layers = self._find(source)
         places = {**layers.aovs, "color": layers.target, "alpha": layers.alpha}
         replaced: dict[str, np.ndarray] = {}
@@ -438,9 +478,7 @@ class Shot:
             planes = [cut] if cut.ndim == 2 else list(np.moveaxis(cut, 2, 0))
             for channel, plane in zip(layer.channels, planes, strict=False):
                 replaced[channel] = plane if inside.all() else np.where(inside, plane, source.channel(channel))
-        home = source.parts[layers.color.part]
-        added = {name: self._cut(image, home) for name, image in (extra or {}).items()}
-        return write_exr(path, source, replaced, added, attributes)
+        return replaced
 
     def _cut(self, image: np.ndarray, part: Part) -> np.ndarray:
         """What lies on the data window of a part, of an image on the shot's."""

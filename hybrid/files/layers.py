@@ -144,7 +144,7 @@ def find_layers(
         if guide is not None and not guide.file and set(guide.channels) & set(color.channels):
             raise ExrError(f"{image.path}: {guide} is taken for both color and {role}, expected two layers")
     view = color.view or (image.views[0] if image.views else None)
-    if len(image.views) > 1:
+    if len(image.views) > 1 and not isinstance(overrides.get("color"), Layer):
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
     convention, samples = _convention(found, taken), _samples(image, taken)
     return Layers(
@@ -188,9 +188,33 @@ def _fit_file(image: ExrImage, role: str, layer: Layer) -> Layer | None:
     return fitted
 
 
+def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
+    """The colors of all the pictures in a file: of each stereo view, of each of its view layers.
+
+    Raises
+    ------
+    ExrError
+        If there is none in a view, or if several could be the color of one picture.
+    """
+    colors = []
+    for view in image.views or (None,):
+        named = _name_colors(image, profile, view, [])
+        groups = {_group(layer) for layer in named}
+        # Layers of no view layer beside those of one are no picture of their own, but in doubt.
+        split = [named] if "" in groups else [[x for x in named if _group(x) == group] for group in sorted(groups)]
+        colors += [_only(image, "color", layers) for layers in split if layers]
+    return colors
+
+
 def _find_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer | None:
-    """The one layer that has a name for the color; of the renderer's own names, or else of common ones."""
-    seen = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
+    """The one layer that has a name for the color, in the default view."""
+    named = _name_colors(image, profile, image.views[0] if image.views else None, notes)
+    return _only(image, "color", named) if named else None
+
+
+def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: list[str]) -> list[Layer]:
+    """The layers of a view that have a name for the color; of the renderer's own names, or else of common ones."""
+    seen = [layer for layer in image.layers if layer.view in (None, view)]
     for names in (profile.own_names("color"), profile.names("color")):
         # Bare channels are a file's, not those of any of its parts.
         named = [x for x in seen if ({*_tails(image, x)} - {""} if x.name else {""}) & {*names}]
@@ -200,12 +224,15 @@ def _find_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer | 
         groups = {_group(layer) for layer in fitting}
         if COMPOSITE in groups and len(groups) > 1:
             notes += [f"{x} stays as it is: the compositor's" for x in fitting.values() if _group(x) == COMPOSITE]
-            fitting = {layer: fitted for layer, fitted in fitting.items() if _group(layer) != COMPOSITE}
             groups.remove(COMPOSITE)
-        if len(groups) == 1 and sorted(_tails(image, layer)[0] for layer in fitting) == ["combined", "noisyimage"]:
-            fitting = {x: fitted for x, fitted in fitting.items() if "noisyimage" in _tails(image, x)}
-        return _only(image, "color", [*fitting.values()])
-    return None
+        chosen: list[Layer] = []
+        for group in sorted(groups):
+            own = {layer: fitted for layer, fitted in fitting.items() if _group(layer) == group}
+            if sorted(_tails(image, layer)[0] for layer in own) == ["combined", "noisyimage"]:
+                own = {x: fitted for x, fitted in own.items() if "noisyimage" in _tails(image, x)}
+            chosen += own.values()
+        return chosen
+    return []
 
 
 def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> Layer | None:

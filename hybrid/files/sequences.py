@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -131,6 +132,37 @@ def _names(folder: Path) -> list[Path]:
     with os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name.lower().endswith(".exr") and not e.is_dir(follow_symlinks=False)]
     return sorted(folder / name for name in names if not name.startswith("."))
+
+
+def find_views(spec: str) -> list[str]:
+    """The stereo views whose files are there for a pattern with %V (left) or %v (l) in it; left first, [] without.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    """
+    if name_view(spec, "xx") == spec:
+        return []
+    pattern, _ = parse_pattern(spec)
+    called = f"{pattern.folder / pattern.before}"
+    expression = re.escape(called).replace("%V", "(?P<long>[A-Za-z]{2,})", 1).replace("%v", "(?P<short>[A-Za-z])", 1)
+    expression = expression.replace("%V", "(?P=long)").replace("%v", "(?P=short)")
+    expression += (r"\d+" if pattern.digits else "") + re.escape(pattern.after)
+    loose = glob.escape(called).replace("%V", "*").replace("%v", "?")
+    paths = glob.glob(loose + ("*" if pattern.digits else "") + glob.escape(pattern.after))
+    matches = [match for path in paths if (match := re.fullmatch(expression, path))]
+    views = {match.groupdict().get("long") or match.groupdict()["short"] for match in matches}
+    if not views:
+        raise FileNotFoundError(
+            f"{spec}: no view is there, expected files with left and right, or l and r, for %V or %v"
+        )
+    return sorted(views)
+
+
+def name_view(text: str, view: str) -> str:
+    """A pattern with the name of a view for %V, and its first letter for %v."""
+    return text.replace("%V", view).replace("%v", view[0])
 
 
 def list_patterns(folder: Path) -> list[Pattern]:

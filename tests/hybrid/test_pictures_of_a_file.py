@@ -1,0 +1,126 @@
+"""Files with several pictures: stereo views and view layers are all denoised, each by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from hybrid.cli import main
+from hybrid.files.exr import read_exr
+from hybrid.files.frames import open_shot
+from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
+
+FRAMES = truths()
+
+
+def view(truth: Truth, name: str = "", *, other: bool = False) -> Channels:
+    """One picture; the other is the same one mirrored, in another light."""
+    turn: Callable[[np.ndarray], np.ndarray] = (lambda a: a[:, ::-1]) if other else (lambda a: a)
+    sign = np.array([-1, 1, -1, 1]) if other else np.ones(4)
+    end = f".{name}" if name else ""
+    return (
+        layer(f"ViewLayer.Combined{end}", "RGBA", turn(truth.color) * (0.5 if other else 1), turn(truth.alpha))
+        | layer(f"ViewLayer.Denoising Albedo{end}", "RGB", turn(truth.albedo))
+        | layer(f"ViewLayer.Denoising Normal{end}", "XYZ", turn(truth.normal) * ([-1, 1, 1] if other else 1))
+        | layer(f"ViewLayer.Vector{end}", "XYZW", turn(cycles_vector(truth)) * sign)
+    )
+
+
+def run(spec: Path, out: Path, *options: str) -> Path:
+    arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
+    assert main(arguments) == 0
+    return out
+
+
+def color(folder: Path, name: str) -> bytes:
+    image = read_exr(next(folder.glob("*.0010.exr")))
+    return b"".join(image.channel(f"{name}.{c}").tobytes() for c in "RGB")
+
+
+@pytest.fixture(scope="module")
+def mono(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Each picture denoised alone."""
+    made = {}
+    for name in ("left", "right"):
+        folder = tmp_path_factory.mktemp(name)
+        for truth in FRAMES:
+            save(folder / f"shot.{truth.number:04d}.exr", view(truth, other=name == "right"))
+        made[name] = color(run(folder, folder / "out"), "ViewLayer.Combined")
+    assert made["left"] != made["right"]
+    return made
+
+
+def test_both_eyes_of_a_stereo_file_are_those_of_mono_files(mono: dict[str, bytes], tmp_path: Path) -> None:
+    for truth in FRAMES:
+        channels = view(truth, "left") | view(truth, "right", other=True)
+        save(tmp_path / f"shot.{truth.number:04d}.exr", channels, {"multiView": ["left", "right"]})
+    out = run(tmp_path, tmp_path / "out")
+    assert color(out, "ViewLayer.Combined.left") == mono["left"]
+    assert color(out, "ViewLayer.Combined.right") == mono["right"]
+
+
+def test_views_in_parts(mono: dict[str, bytes], tmp_path: Path) -> None:
+    for truth in FRAMES:
+        parts = []
+        for eye in ("left", "right"):
+            groups: dict[str, dict[str, np.ndarray]] = {}
+            for name, plane in view(truth, other=eye == "right").items():
+                groups.setdefault(name.rpartition(".")[0], {})[name] = np.ascontiguousarray(plane, np.float32)
+            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "view": eye}
+            parts += [OpenEXR.Part(dict(header), planes, f"{name}-{eye}") for name, planes in groups.items()]
+        OpenEXR.File(parts).write(str(tmp_path / f"shot.{truth.number:04d}.exr"))
+    out = run(tmp_path, tmp_path / "out")
+    assert color(out, "ViewLayer.Combined.left") == mono["left"]
+    assert color(out, "ViewLayer.Combined.right") == mono["right"]
+
+
+def test_every_view_layer_is_denoised_or_the_one_that_was_chosen(
+    mono: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for truth in FRAMES:
+        channels = {n.replace("ViewLayer.", "Front."): p for n, p in view(truth).items()}
+        channels |= {n.replace("ViewLayer.", "Back."): p for n, p in view(truth, other=True).items()}
+        save(tmp_path / f"shot.{truth.number:04d}.exr", channels)
+    both = run(tmp_path, tmp_path / "both")
+    assert color(both, "Front.Combined") == mono["left"]
+    assert color(both, "Back.Combined") == mono["right"]
+    assert "Back.Combined.RGB, Front.Combined.RGB: each is denoised" in " ".join(capsys.readouterr().err.split())
+    back = run(tmp_path, tmp_path / "back", "--layer", "color=Back.Combined")
+    assert color(back, "Back.Combined") == mono["right"]
+    noisy = color(tmp_path, "Front.Combined")
+    assert color(back, "Front.Combined") == noisy != mono["left"]
+
+
+def test_layers_apart_need_to_know_of_which_picture_they_are(tmp_path: Path) -> None:
+    for truth in FRAMES:
+        channels = view(truth, "left") | view(truth, "right", other=True)
+        save(tmp_path / "in" / f"shot.{truth.number:04d}.exr", channels, {"multiView": ["left", "right"]})
+        save(tmp_path / "alb" / f"a.{truth.number:04d}.exr", layer("", "RGB", truth.albedo))
+    shot = open_shot(tmp_path / "in", layers={"albedo": str(tmp_path / "alb" / "a.####.exr")})
+    with pytest.raises(ValueError, match=r"and layers in other files: expected one \(--layer color=NAME\)"):
+        _ = shot.pictures
+
+
+@pytest.mark.parametrize(("pattern", "letter"), [("%V/shot.####.exr", False), ("shot_%v.####.exr", True)])
+def test_a_file_for_each_eye(pattern: str, letter: bool, mono: dict[str, bytes], tmp_path: Path) -> None:
+    for truth in FRAMES:
+        for eye in ("left", "right"):
+            name = pattern.replace("%V", eye).replace("%v", eye[0]).replace("####", f"{truth.number:04d}")
+            save(tmp_path / name, view(truth, other=eye == "right"))
+    run(tmp_path / pattern, tmp_path / f"out_{'%v' if letter else '%V'}")
+    for eye, expected in mono.items():
+        assert color(tmp_path / f"out_{eye[0] if letter else eye}", "ViewLayer.Combined") == expected
+
+
+def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for eye in ("left", "right"):
+        save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
+    spec = str(tmp_path / "%V" / "shot.####.exr")
+    assert main(["pseudoref", spec, "-o", str(tmp_path / "out")]) == 2
+    assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert main(["pseudoref", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
+    assert "no view is there" in capsys.readouterr().err
