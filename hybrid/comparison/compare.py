@@ -184,7 +184,7 @@ def _judge_methods(
     for done, (name, method) in enumerate(methods.items()):
         if progress is not None:
             progress(f"measure {name}", done, len(methods))
-        statistics[name] = judge.measure(name, flip=_has_flip() and not method.sweep)
+        statistics[name] = judge.measure(name, flip=_has_flip() and not method.sweep, change=not method.sweep)
     return statistics
 
 

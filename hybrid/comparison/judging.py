@@ -26,7 +26,7 @@ from hybrid.comparison.metrics import (
 )
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor
-from hybrid.comparison.store import FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
+from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
 from hybrid.files.frames import Frame, Shot
 from hybrid.plan import STILL
 
@@ -51,6 +51,8 @@ MEASURES: dict[str, Measure] = {
 # A pixel's light stands still where the 9×9 means of the reference change by less than this, on the tone curve: well
 # above their noise (a ninth of the pixels'), well below what anyone would call a change.
 STEADY = 0.02
+# How much brighter the map of changes shows them: a change of a fiftieth of the tone curve is black or white.
+AMPLIFIED = 25
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Judge:
     exposure: float
     static: NDArray[np.bool_]
 
-    def measure(self, name: str, *, flip: bool) -> dict[str, Statistic]:
+    def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
         """Measure the frames of a method, a frame and a pair of frames at a time.
 
         Parameters
@@ -86,6 +88,8 @@ class Judge:
             The method's.
         flip : bool
             Whether by FLIP too, which takes longer than many a method; its map is kept.
+        change : bool
+            Whether the map of what changes between frames is kept too.
 
         Returns
         -------
@@ -111,10 +115,29 @@ class Judge:
                 values["flip"].append(float(errors.mean(dtype=np.float64)))
         for pair in self.pairs:
             values["temporal_psnr"].append(self._measure_pair(name, pair))
+        if change and self.pairs:
+            for number in self.numbers:
+                self.store.save(name, number, self._map_change(name, number), CHANGE_MAP)
         if self.static.any():
             frames = (self.store.load(name, number) for number in self.numbers)
             values["static_std"] = list(static_std(frames, self.static, exposure=self.exposure))
         return {key: summarize(series) for key, series in values.items() if series}
+
+    def _map_change(self, name: str, number: int) -> Array:
+        """What a frame changes along the motion, amplified, on the tone curve: 0.5 is still, (H, W) in [0, 1].
+
+        With W the warp of the frame before, it is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5 where
+        no motion leads to a pixel. Unlike temporal PSNR it also shows what changes in truth: light, what mirrors show.
+        """
+        current = tone_map(self.store.load(name, number), self.exposure)
+        before = next((pair[0] for pair in self.pairs if pair[1] == number), None)
+        if before is None:
+            return np.full(current.shape[:2], 0.5, np.float32)
+        motion = self.store.load(REFERENCE, number, FLOW)
+        earlier = tone_map(self.store.load(name, before), self.exposure).astype(np.float32)
+        change = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
+        change = np.where((motion[..., 2] > 0) & np.isfinite(change), change, 0)
+        return np.clip(0.5 + AMPLIFIED * change, 0, 1).astype(np.float32)
 
     def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
         images = [self.store.load(name, number) for number in pair]

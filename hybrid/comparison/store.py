@@ -20,7 +20,8 @@ REFERENCE = "reference"
 HALVES = ("half a", "half b")  # of a reference that comes in halves
 FLOW = "flow"
 FLIP_MAP = "FLIP"
-MAP_TITLES = (FLIP_MAP, "Confidence", "Temporal contribution")
+CHANGE_MAP = "Change between frames"
+MAP_TITLES = (FLIP_MAP, CHANGE_MAP, "Confidence", "Temporal contribution")
 
 
 @dataclass(frozen=True)

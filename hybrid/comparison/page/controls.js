@@ -56,8 +56,8 @@ function showScale(view) {
   const scale = find("scale"), [low, bar, high] = scale.children;
   scale.hidden = view === "picture";
   bar.style.background = `linear-gradient(90deg, ${scaleOfView(view).stops.join(", ")})`;
-  low.textContent = "0";
-  high.textContent = view === "error" ? `≥ ${ERROR_RANGE} of T` : "1";
+  low.textContent = scaleOfView(view) === GRAYS ? "darker" : "0";
+  high.textContent = scaleOfView(view) === GRAYS ? "brighter" : view === "error" ? `≥ ${ERROR_RANGE} of T` : "1";
 }
 
 function listenToControls(viewer) {

@@ -8,6 +8,8 @@ const MAGMA = colorScale(["#000004", "#180f3d", "#440f76", "#721f81", "#9e2f7f",
 const VIRIDIS = colorScale(["#440154", "#482878", "#3e4989", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58",
   "#b5de2b", "#fde725"]);
 
+const GRAYS = colorScale(["#000000", "#ffffff"]);
+
 // 256 colors between stops, red, green and blue in turn.
 function colorScale(stops) {
   const rgb = stops.map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)));
@@ -20,6 +22,7 @@ function colorScale(stops) {
 }
 
 function scaleOfView(view) {
+  if (/change/i.test(view)) return GRAYS; // its middle is what stays
   return view === "error" || /flip|error/i.test(view) ? MAGMA : VIRIDIS;
 }
 

@@ -12,7 +12,7 @@ from hybrid.comparison import compare
 from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
-from hybrid.comparison.store import FLIP_MAP, REFERENCE, FrameStore
+from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, REFERENCE, FrameStore
 from hybrid.files.frames import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 from tests.hybrid.comparison.test_running import killed, not_installed
@@ -67,7 +67,7 @@ def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
     methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
     compare_shot(shot, reference, methods, maps=True, folder=tmp_path)
     store = FrameStore(tmp_path)
-    assert set(store.map_titles("noisy", 5)) <= {FLIP_MAP}
+    assert set(store.map_titles("noisy", 5)) <= {FLIP_MAP, CHANGE_MAP}
     assert "Confidence" in store.map_titles("mapped", 5)
     assert store.load("mapped", 5, "Confidence").shape == SIZE
 

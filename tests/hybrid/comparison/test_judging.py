@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from flow.motion import CYCLES, MotionConvention
 from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.judging import motion_between
 from hybrid.comparison.methods import external
+from hybrid.comparison.store import CHANGE_MAP, FrameStore
 from hybrid.files.frames import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 
@@ -51,6 +53,25 @@ def test_static_pixels_flicker_by_what_was_put_in() -> None:
     assert comparison.facts["Pixels that stand still"] == "100.0%"
     # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
     assert comparison.results[0].metrics["static_std"].mean == pytest.approx(sigma, rel=0.03)
+
+
+def test_what_changes_between_frames_is_kept_as_a_map(tmp_path: Path) -> None:
+    """A wall is brighter by 1/100 of the tone curve on one frame: a quarter above gray there, and below after it."""
+    tones = {1: 0.5, 2: 0.5, 3: 0.51, 4: 0.5, 6: 0.5}
+    frames = {}
+    for number, tone in tones.items():
+        color = np.full((*SIZE, 3), tone / (1 - tone), np.float32)
+        vectors = np.zeros((*SIZE, 4), np.float32)
+        frames[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
+    reference = MemoryShot({n: Frame(n, np.full((*SIZE, 3), 1.0, np.float32)) for n in tones})
+    compare_shot(MemoryShot(frames), reference, NOISY, folder=tmp_path)
+    store = FrameStore(tmp_path)
+    assert CHANGE_MAP in store.map_titles("noisy", 1)
+    maps = {number: store.load("noisy", number, CHANGE_MAP) for number in tones}
+    # The frame after a gap has none before it: gray.
+    expected = {1: 0.5, 2: 0.5, 3: 0.75, 4: 0.25, 6: 0.5}
+    for number, value in expected.items():
+        np.testing.assert_allclose(maps[number][4:-4, 4:-4], value, atol=1e-3)
 
 
 def test_only_frames_and_neighbours_that_are_there_are_judged() -> None:
