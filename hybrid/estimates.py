@@ -157,7 +157,13 @@ class EstimateSource:
 
 
 def choose_estimate(
-    spec: str, shot: Shot, *, own: ClassicalPreset = FINAL, kept: str | None = None, mode: str = "oidn-clean"
+    spec: str,
+    shot: Shot,
+    *,
+    own: ClassicalPreset = FINAL,
+    kept: str | None = None,
+    mode: str = "oidn-clean",
+    quicker: Callable[..., Array] | None = None,
 ) -> EstimateSource:
     """Find the estimates that are asked for.
 
@@ -177,6 +183,8 @@ def choose_estimate(
     kept : str, optional
         Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder. Where none are
         made, the reason says that none are kept.
+    quicker : callable, optional
+        What "auto" has in the place of `hybrid.oidn.denoise_oidn`, with the same parameters.
 
     Raises
     ------
@@ -187,17 +195,26 @@ def choose_estimate(
     FileNotFoundError
         If there is no such sequence.
     """
-    source = _choose(spec, shot, own, kept, mode)
+    source = _choose(spec, shot, own, kept, mode, quicker)
     if kept is not None and source.name not in OIDN_MODES:
         return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
     return source
 
 
-def _choose(spec: str, shot: Shot, own: ClassicalPreset, kept: str | None, mode: str) -> EstimateSource:
+def _choose(
+    spec: str,
+    shot: Shot,
+    own: ClassicalPreset,
+    kept: str | None,
+    mode: str,
+    quicker: Callable[..., Array] | None,
+) -> EstimateSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if _has_oidn():
+            if quicker is not None:
+                return _oidn(mode, shot, kept, "OIDN is installed; its networks run in bfloat16", quicker)
             return _oidn(mode, shot, kept, "OIDN is installed")
         return EstimateSource("nlm", OfWindows(own), "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
@@ -219,8 +236,10 @@ def _has_oidn() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
-def _oidn(mode: str, shot: Shot, kept: str | None, reason: str) -> EstimateSource:
-    run: Callable[..., Array] = partial(_run_mode, mode)
+def _oidn(
+    mode: str, shot: Shot, kept: str | None, reason: str, denoise: Callable[..., Array] | None = None
+) -> EstimateSource:
+    run: Callable[..., Array] = partial(_run_mode, mode, denoise=denoise)
     places: dict[int, Path] = {}
     if kept is not None:
         # Of neighbours too that were not asked for.
@@ -230,10 +249,12 @@ def _oidn(mode: str, shot: Shot, kept: str | None, reason: str) -> EstimateSourc
     return EstimateSource(mode, estimates, reason, kept=tuple(places.values()))
 
 
-def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True) -> Array:
+def _run_mode(
+    mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array] | None = None
+) -> Array:
     """Run a mode of OIDN; guides without noise are declared clean as they are."""
-    settings = OIDN_MODES[mode]
-    return estimate_oidn(frame, **(settings if noisy_guides else {**settings, "prefilter": None, "clean": True}))
+    settings = OIDN_MODES[mode] if noisy_guides else {**OIDN_MODES[mode], "prefilter": None, "clean": True}
+    return estimate_oidn(frame, denoise, **settings)
 
 
 def _checked(found: Array | None, frame: Frame) -> Array | None:
@@ -249,11 +270,14 @@ def _from_file(frame: Frame) -> Array | None:
     return frame.estimate
 
 
-def estimate_oidn(frame: Frame, **mode: Any) -> Array:
-    """Run OIDN on a frame with what guides it has, non-finite pixels replaced; `mode` as for `denoise_oidn`."""
+def estimate_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
+    """Run OIDN, or what stands for it, on a frame with what guides it has; `mode` as for `denoise_oidn`.
+
+    Pixels that are not finite are replaced.
+    """
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
-    return denoise_oidn(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
+    return (denoise or denoise_oidn)(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
 
 
 def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:

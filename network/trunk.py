@@ -380,7 +380,14 @@ def _find_blob(library: mmap.mmap, name: str, path: Path) -> bytes:
 
 
 @torch.inference_mode()
-def denoise_picture(trunk: Trunk, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
+def denoise_picture(
+    trunk: Trunk,
+    color: Tensor,
+    albedo: Tensor | None = None,
+    normal: Tensor | None = None,
+    *,
+    exposure: Tensor | None = None,
+) -> Tensor:
     """Denoise pictures as OIDN does.
 
     Parameters
@@ -391,6 +398,8 @@ def denoise_picture(trunk: Trunk, color: Tensor, albedo: Tensor | None = None, n
         ``(N, 3, H, W)`` linear radiance, float32; NaN and negative values count as 0.
     albedo, normal : Tensor, optional
         Likewise; albedo in [0, 1], normals in [−1, 1] in any fixed space, what lies beyond is clipped.
+    exposure : Tensor, optional
+        ``(N,)``, what color is multiplied by; without, its `autoexposure`. Part of a picture needs the whole's.
 
     Returns
     -------
@@ -402,13 +411,13 @@ def denoise_picture(trunk: Trunk, color: Tensor, albedo: Tensor | None = None, n
     ValueError
         If the inputs are not as many as the trunk's, or differ in shape.
     """
-    exposure = autoexposure(color).view(-1, 1, 1, 1)
-    layers = [pu_forward(_clip(color * exposure, 0, _MOST))]
+    scale = (autoexposure(color) if exposure is None else exposure).view(-1, 1, 1, 1)
+    layers = [pu_forward(_clip(color * scale, 0, _MOST))]
     if albedo is not None:
         layers.append(_clip(albedo, 0, 1))
     if normal is not None:
         layers.append(_clip(normal, -1, 1) * 0.5 + 0.5)
-    return pu_inverse(_run(trunk, layers).clamp_min(0)) / exposure
+    return pu_inverse(_run(trunk, layers).clamp_min(0)) / scale
 
 
 @torch.inference_mode()

@@ -254,8 +254,10 @@ def denoise(
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
-        source = choose_estimate(wanted, made, kept=keep_estimates, mode=mode)
-        beside = [(other, choose_estimate(wanted, other, mode=mode)) for other in others]
+        quicker = neural.denoise_unet if denoiser.precision == "bfloat16" and neural.has_unet() else None
+        choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker)
+        source = choose(made, kept=keep_estimates)
+        beside = [(other, choose(other)) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
         beside = [(other, source) for other in others]

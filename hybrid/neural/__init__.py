@@ -3,5 +3,15 @@
 from hybrid.neural.clips import write_clips
 from hybrid.neural.denoiser import SMALL_TILE, TILE, Denoiser, shipped_weights
 from hybrid.neural.train import train_network
+from hybrid.neural.unet import denoise_unet, has_unet
 
-__all__ = ["SMALL_TILE", "TILE", "Denoiser", "shipped_weights", "train_network", "write_clips"]
+__all__ = [
+    "SMALL_TILE",
+    "TILE",
+    "Denoiser",
+    "denoise_unet",
+    "has_unet",
+    "shipped_weights",
+    "train_network",
+    "write_clips",
+]

@@ -163,7 +163,7 @@ class Denoiser:
         exposure = exposure_of(aligned)
         irradiance, filtered = np.empty_like(color[centre]), np.empty_like(others[centre])
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
-        for inner, outer, offset in _tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
+        for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if "skip" in aligned.stages and not aligned.variance[outer].any():
                 irradiance[inner], filtered[inner] = color[centre][inner], others[centre][inner]
@@ -228,7 +228,7 @@ def _pad(window: Array, multiple: int) -> Array:
     return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
 
 
-def _tiles(
+def tiles(
     rows: slice, height: int, width: int, tile: int, halo: int, multiple: int
 ) -> Iterator[tuple[Block, Block, Block]]:
     """Cover some rows: where each tile's result goes, what it is computed from, and where in that the result is."""

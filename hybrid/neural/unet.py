@@ -1,0 +1,83 @@
+"""OIDN's networks in torch, called as OIDN is: the same pictures, in bfloat16 in about 0.6 of the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hybrid.neural.denoiser import image_of, tiles
+from hybrid.oidn import Quality
+from network.trunk import Trunk, autoexposure, denoise_albedo, denoise_normal, denoise_picture, load_oidn, round_trunk
+
+Array = NDArray[np.float32]
+
+# Pixels of context around a tile: nothing farther away changes a picture, with any of the networks.
+HALO = 112
+# Side of a tile, so that memory does not grow with the frame.
+TILE = 1024
+
+
+def denoise_unet(
+    color: Array,
+    albedo: Array | None = None,
+    normal: Array | None = None,
+    *,
+    quality: Quality = "high",
+    prefilter: Quality | None = None,
+    clean: bool = False,
+) -> Array:
+    """Denoise one frame with OIDN's networks in bfloat16, 64 to 66 dB from OIDN's own picture.
+
+    Parameters and result are those of `hybrid.oidn.denoise_oidn`. Where its weights are not found it raises as
+    `network.trunk.load_oidn`; see `has_unet`.
+    """
+    layers = [_tensor(layer) for layer in (color, albedo, normal) if layer is not None]
+    if prefilter is not None and albedo is not None:
+        size = "_large" if prefilter == "high" else ""
+        filters: list[Callable[..., Tensor]] = [denoise_albedo, denoise_normal]
+        for index, (name, run) in enumerate(zip(("rt_alb", "rt_nrm"), filters, strict=True), start=1):
+            if index < len(layers):
+                layers[index] = _tiled(run, _network(name + size), layers[index : index + 1])
+    reliable = (clean or prefilter is not None) and len(layers) == 3
+    name = "rt_hdr" + ("", "_alb", "_calb_cnrm" if reliable else "_alb_nrm")[len(layers) - 1]
+    if quality == "fast":
+        name += "_small"
+    elif quality == "high" and reliable:
+        name += "_large"
+    exposure = autoexposure(layers[0])
+
+    def run_color(trunk: Trunk, *parts: Tensor) -> Tensor:
+        return denoise_picture(trunk, *parts, exposure=exposure)
+
+    return image_of(_tiled(run_color, _network(name), layers))
+
+
+def has_unet() -> bool:
+    """Whether the installed OIDN is of a version whose networks are known."""
+    try:
+        _network("rt_hdr_alb_nrm_small")
+    except (FileNotFoundError, ValueError):
+        return False
+    return True
+
+
+@lru_cache
+def _network(name: str) -> Trunk:
+    return round_trunk(load_oidn(name))
+
+
+def _tensor(image: Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1), np.float32))[None]
+
+
+def _tiled(run: Callable[..., Tensor], trunk: Trunk, layers: list[Tensor]) -> Tensor:
+    height, width = layers[0].shape[2:]
+    result = torch.empty_like(layers[0])
+    for inner, outer, offset in tiles(slice(0, height), height, width, TILE, HALO, trunk.multiple):
+        result[..., *inner] = run(trunk, *(layer[..., *outer] for layer in layers))[..., *offset]
+    return result

@@ -1,0 +1,88 @@
+"""OIDN's networks in torch give OIDN's pictures, whatever its mode, and stand for it where they are quicker."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from hybrid import neural
+from hybrid.alignment.align import Aligner
+from hybrid.cli import main
+from hybrid.comparison.metrics import psnr
+from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
+from hybrid.files.frames import Frame, open_shot
+from hybrid.neural import denoise_unet, unet
+from network.trunk import OIDN_WEIGHTS
+from tests.scenes import Scene
+
+pytestmark = [
+    pytest.mark.neural,
+    pytest.mark.oidn,
+    pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed"),
+]
+SCENE = Scene(frames=3, height=72, width=90)
+
+
+@pytest.fixture
+def frame(tmp_path) -> Frame:
+    return open_shot(SCENE.write(tmp_path / "noisy")).read(1002)
+
+
+@pytest.mark.parametrize("mode", [*OIDN_MODES])
+@pytest.mark.parametrize("guides", [0, 1, 2])
+def test_is_the_picture_of_oidn(frame, mode, guides) -> None:
+    layers = [frame.albedo, frame.normal][:guides] + [None] * (2 - guides)
+    plain = Frame(1002, frame.color, *layers)
+    settings = OIDN_MODES[mode]
+    expected = estimate_oidn(plain, **settings)
+    result = estimate_oidn(plain, denoise_unet, **settings)
+    assert result.shape == expected.shape
+    # Another network's picture is 35 to 45 dB away; 60 was measured here.
+    assert psnr(result, expected) > 52
+
+
+def test_clean_guides_are_declared_so(frame) -> None:
+    settings = {"quality": "high", "prefilter": None, "clean": True}
+    assert psnr(estimate_oidn(frame, denoise_unet, **settings), estimate_oidn(frame, **settings)) > 52
+
+
+def test_tiles_do_not_show(frame, monkeypatch) -> None:
+    tall = Frame(1, *(np.tile(layer, (5, 1, 1)) for layer in (frame.color, frame.albedo, frame.normal)))
+    whole = estimate_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
+    monkeypatch.setattr(unet, "TILE", 64)
+    parts = estimate_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
+    # Exact but for the order of sums in bfloat16.
+    assert psnr(parts, whole) > 70
+
+
+def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
+    shot = open_shot(SCENE.write(tmp_path))
+    calls = []
+
+    def quicker(color, *_, **mode):
+        calls.append(mode)
+        return color
+
+    source = choose_estimate("auto", shot, mode="oidn-fast", quicker=quicker)
+    assert "bfloat16" in source.reason
+    Aligner(shot, {"demodulate"}, radius=0, estimates=source.estimates).align(1002)
+    assert calls == [{"quality": "fast"}]
+    named = choose_estimate("oidn-fast", shot, quicker=quicker)
+    Aligner(shot, {"demodulate"}, radius=0, estimates=named.estimates).align(1002)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize(("precision", "known"), [("float32", True), ("bfloat16", True), ("bfloat16", False)])
+def test_denoise_takes_them_where_it_runs_in_bfloat16(tmp_path, monkeypatch, precision, known) -> None:
+    folder, calls = SCENE.write(tmp_path / "noisy"), []
+    if not known:  # another version of OIDN
+        unet._network.cache_clear()
+        monkeypatch.setitem(OIDN_WEIGHTS, "rt_hdr_alb_nrm_small", (641480, "0" * 64))
+    monkeypatch.setattr(neural, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--frames", "1002", "--precision", precision]
+    assert main(words) == 0
+    assert bool(calls) == (precision == "bfloat16" and known)
