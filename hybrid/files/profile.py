@@ -48,7 +48,7 @@ class Profile:
     name : str
         Of the renderer.
     attributes : tuple of str
-        Header attributes that its files have; ``*`` stands for anything.
+        Header attributes that its files have, as ``name`` or ``name=value``; ``*`` stands for anything.
     known_layers : tuple of str
         Names of layers that hardly any other renderer writes.
     layers : mapping of str to tuple of str
@@ -264,12 +264,16 @@ def find_profile(image: ExrImage) -> Profile:
     An attribute of the header counts most, then the names of layers that only one renderer writes. Among equals it is
     the one that knows what more of the layers are, then the user's own.
     """
-    attributes = {name for part in image.parts for name in part.header}
+    header = {name: f"{name}={value}" for part in image.parts for name, value in part.header.items()}
     names = {plain_name(token) for layer in image.layers for token in _tails(layer.name)}
     names |= {plain_name(channel.rpartition(".")[2]) for channel in image.channel_names}
     best, why, score = read_profiles()[COMMON], "no renderer is known by its header or its layers", (0, 0, 0)
     for profile in read_profiles().values():
-        known = sorted(a for a in attributes if any(fnmatchcase(a, pattern) for pattern in profile.attributes))
+        known = sorted(
+            name
+            for name, said in header.items()
+            if any(fnmatchcase(said if "=" in pattern else name, pattern) for pattern in profile.attributes)
+        )
         typical = [name for name in profile.known_layers if plain_name(name) in names]
         roles = sum(any(name in names for name in map(plain_name, own)) for own in profile.layers.values())
         this = len(known[:1]), len(typical), roles

@@ -271,3 +271,24 @@ def test_one_line_says_what_was_taken(tmp_path):
     left = layers.without({"motion", "alpha"})
     assert (left.motion, left.motion_convention, left.alpha) == (None, None, None)
     assert str(left.depth) == "Z"
+
+
+def test_an_attribute_may_be_asked_for_with_its_value(tmp_path):
+    assert find_profile(image(tmp_path, "RGBA", generatedBy="Mitsuba version 3.9.1")).name == "Mitsuba"
+    assert find_profile(image(tmp_path, "RGBA", generatedBy="something else")).name == "common names"
+
+
+DOCUMENT = (Path(__file__).parents[3] / "docs" / "renderers.md").read_text(encoding="utf-8")
+
+
+def test_the_profile_of_the_documentation_is_one(tmp_path):
+    path = tmp_path / "studio.toml"
+    path.write_text(DOCUMENT.partition("```toml\n")[2].partition("```")[0], encoding="utf-8")
+    profile = read_profile(path)
+    assert (profile.name, profile.samples, profile.files) == ("Studio", "studio/spp", {"variance": "{name}_stats"})
+    assert profile.settled == {"unit", "y", "offset"}
+
+
+@pytest.mark.parametrize("name", sorted(set(read_profiles()) - {"common"}))
+def test_every_renderer_is_documented(name):
+    assert f"| {read_profiles()[name].name.replace('Cycles', 'Blender Cycles').replace('pbrt', 'pbrt-v4')}" in DOCUMENT
