@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from hybrid.alignment.align import Aligner
-from hybrid.estimates import choose_estimate
+from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.frames import Shot
 from hybrid.neural.denoiser import exposure_of, tensor_of
 from hybrid.plan import Rules
-from hybrid.pseudo_reference import gated_average
+from hybrid.pseudo_reference import gated_average, gather_and_denoise
 from network.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
 
@@ -80,14 +81,19 @@ def write_clips(
     if not numbers:
         what = ", ".join(levels) + ("" if reference is None else " and the reference")
         raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
+    sources = [choose_estimate(estimate, shot) for shot in shots]
     aligners = [
-        Aligner(shot, Rules(), radius=radius, estimates=choose_estimate(estimate, shot).estimates) for shot in shots
+        Aligner(shot, Rules(), radius=radius, estimates=source.estimates)
+        for shot, source in zip(shots, sources, strict=True)
     ]
+    # Beside estimates by OIDN it is there for a second look as well.
+    make_target = gather_and_denoise if all(source.name in OIDN_MODES for source in sources) else gated_average
 
     def make() -> Iterator[Clip]:
         rng = np.random.default_rng(seed)
         for number in numbers:
-            whole = _clip([_level(shot, aligner, number) for shot, aligner in zip(shots, aligners, strict=True)])
+            levels_here = zip(shots, aligners, strict=True)
+            whole = _clip([_level(shot, aligner, number, make_target) for shot, aligner in levels_here])
             if reference is not None:
                 clean = tensor_of(replace_nonfinite(reference.read(number).color)[0][None])[:, 0]
                 whole = replace(whole, reference=clean.expand_as(whole.noisy))
@@ -112,7 +118,9 @@ def write_clips(
     return write_shards(folder, name, samples, make())
 
 
-def _level(shot: Shot, aligner: Aligner, number: int) -> dict[str, torch.Tensor]:
+def _level(
+    shot: Shot, aligner: Aligner, number: int, make_target: Callable[[AlignedWindow], NDArray[np.float32]]
+) -> dict[str, torch.Tensor]:
     """What a clip holds of one noise level, with N = 1 in front."""
     aligned = aligner.align(number)
     if aligned.estimate is None:
@@ -127,7 +135,7 @@ def _level(shot: Shot, aligner: Aligner, number: int) -> dict[str, torch.Tensor]
         "confidence": tensor_of(aligned.confidence[..., None]),
         "modulation": tensor_of(aligned.modulation[None])[:, 0],
         "noisy": tensor_of(noisy[None])[:, 0],
-        "pseudo_reference": tensor_of(gated_average(aligned)[None])[:, 0],
+        "pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0],
         "exposure": exposure_of(aligned),
     }
 

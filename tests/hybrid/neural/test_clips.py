@@ -9,14 +9,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from hybrid import estimates, pseudo_reference
 from hybrid.alignment.align import Aligner
-from hybrid.estimates import OfWindows
+from hybrid.estimates import OfWindows, choose_estimate
 from hybrid.files.frames import open_shot
 from hybrid.neural import clips as module
 from hybrid.neural import denoiser
 from hybrid.neural.clips import write_clips
 from hybrid.plan import Rules
-from hybrid.pseudo_reference import FINAL, gated_average
+from hybrid.pseudo_reference import FINAL, gated_average, gather_and_denoise
 from network.checkpoint import save_model
 from network.clips import Clip, open_clips
 from network.models import fast
@@ -79,6 +80,20 @@ def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_p
     bright_window(2, layers)
     truth, noisy = layers["ViewLayer.Combined"], clip.noisy[0].permute(1, 2, 0).numpy()
     assert np.median(np.abs(image - truth) / truth) < 0.5 * np.median(np.abs(noisy - truth) / truth)
+
+
+def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path, monkeypatch):
+    found: list[Clip] = []
+    monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    for place in (estimates, pseudo_reference):
+        monkeypatch.setattr(place, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
+    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
+    write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="oidn-fast")
+    window = Aligner(shot, Rules(), estimates=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
+    image = found[0].pseudo_reference[0].permute(1, 2, 0).numpy()
+    np.testing.assert_array_equal(image, gather_and_denoise(window))
+    assert np.abs(image - gated_average(window)).max() > 0.01 * image.mean()
 
 
 def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
