@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable
 from hybrid.commands.options import (
     OUTPUT,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 
 def pseudoref(
+    context: typer.Context,
     shot: ShotArgument,
     output: OutputOption,
     frames: FramesOption = None,
@@ -84,6 +86,8 @@ def pseudoref(
     keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
     max_pixels: PixelsOption = None,
+    scheduler: SchedulerOption = None,
+    chunk: ChunkOption = 10,
 ) -> None:
     """Denoise without a network: align, average, non-local means, guided filter. Makes training targets too.
 
@@ -108,6 +112,10 @@ def pseudoref(
         estimate = "oidn-fast"
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
+    if scheduler is not None:
+        _hand_out(context, shot, opened, output, scheduler, chunk)
+        _look(opened, output, preview, fps, contact)
+        return
     (opened, *others), judgement = judge_input(opened, strict=strict)
     _expect_one(others, {"keep-estimates": keep_estimates})
     timings = Timings()
@@ -142,6 +150,7 @@ def pseudoref(
 
 
 def denoise(
+    context: typer.Context,
     shot: ShotArgument,
     output: OutputOption,
     frames: FramesOption = None,
@@ -220,6 +229,8 @@ def denoise(
     keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
     max_pixels: PixelsOption = None,
+    scheduler: SchedulerOption = None,
+    chunk: ChunkOption = 10,
 ) -> None:
     """Denoise with the Robust Average network."""
     if each_view(denoise, locals()):
@@ -236,6 +247,12 @@ def denoise(
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
     opened = open_input(shot, frames, layer, aov, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
+    if scheduler is not None:
+        if budget is not None or breakdown is not None:
+            raise typer.BadParameter("--budget and --breakdown are of one machine, expected no --scheduler with them")
+        _hand_out(context, shot, opened, output, scheduler, chunk)
+        _look(opened, output, preview, fps, contact)
+        return
     (opened, *others), judgement = judge_input(opened, strict=strict)
     alone = {"keep-estimates": keep_estimates, "breakdown": breakdown, "passes": passes if passes > 1 else None}
     _expect_one(others, alone)
@@ -332,6 +349,21 @@ def _expect_one(others: Sequence[Shot], options: Mapping[str, object]) -> None:
     """Refuse what is made of one picture where a file has several."""
     if given := [name for name, value in options.items() if others and value is not None]:
         raise typer.BadParameter(f"--{given[0]} is of one picture, and the files have several: --layer color=NAME")
+
+
+def _hand_out(context: typer.Context, spec: str, shot: Shot, output: str, scheduler: str, size: int) -> None:
+    """Let a cluster denoise the shot, a chunk of its frames at a time."""
+    from hybrid.files.sequences import format_frames
+
+    parts = [shot.numbers[start : start + size] for start in range(0, len(shot.numbers), size)]
+    names = {format_frames(part): len(part) for part in parts}
+    # A chunk that is run again, as a worker has died, leaves alone what was finished.
+    changes = {"shot": spec, "output": output, "resume": True}
+    chunks = {name: Chunk(arguments_of(context, frames=name, **changes), size) for name, size in names.items()}
+    run_on_cluster(scheduler, str(context.info_name), chunks)
+    if shot.missing:
+        LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
+        raise typer.Exit(1)
 
 
 def _expect_all(shot: Shot, keep_going: bool) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import INPUT, OUTPUT, RESOURCES, WHAT, usage
 from hybrid.simulate.run import missing, parse_center, parse_numbers, parse_size, shots_of
@@ -17,6 +18,7 @@ from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
 
 def simulate(
+    context: typer.Context,
     scene: Annotated[
         str, typer.Argument(metavar="SCENE", help="a .blend file, random, hard, validation, test, or one as test:NAME")
     ],
@@ -102,6 +104,7 @@ def simulate(
             rich_help_panel=RESOURCES,
         ),
     ] = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for."""
     from hybrid.files.sequences import parse_frames
@@ -130,6 +133,15 @@ def simulate(
         several = shots_of(scene, output, shots, spp, levels, first)
         # Half buffers last: they ask for levels of two samples, and the levels are only now read.
         asked = [(replace(shot, halves=halves), folder) for shot, folder in several]
+    if scheduler is not None:
+        chunks = {}
+        for shot, folder in asked:
+            own = {"scene": shot.scene, "seed": shot.seed, "shots": 1, "output": folder}
+            samples = sum(missing(shot, folder, frame) for frame in shot.frames)
+            if samples:
+                chunks[folder.name] = Chunk(arguments_of(context, **own), samples)
+        run_on_cluster(scheduler, "rendering", chunks, "spp·frames")
+        return
     _run_with_progress(asked, jobs, threads, python)
 
 

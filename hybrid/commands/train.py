@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import (
     INPUT,
@@ -91,6 +92,7 @@ def open_levels(
 
 
 def prepare(
+    context: typer.Context,
     shots: Annotated[
         list[str],
         typer.Argument(metavar="SHOTS...", help="folders, each with LEVEL.####.exr at one or more noise levels"),
@@ -131,6 +133,7 @@ def prepare(
     seed: Annotated[int, typer.Option(help="of the places", rich_help_panel=WHAT)] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Make training clips: aligned windows at all noise levels, with first estimates and pseudo-references.
 
@@ -152,6 +155,12 @@ def prepare(
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
+    if scheduler is not None:
+        frames_of = {name: len(next(iter(shot.values()))) for name, shot, _ in found}
+        words = dict(zip(names, shots, strict=True))
+        chunks = {name: Chunk(arguments_of(context, shots=[words[name]]), count) for name, count in frames_of.items()}
+        run_on_cluster(scheduler, "prepare", chunks)
+        return
     output.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
     bar = Progress("prepare", sum(len(next(iter(shot.values()))) for _, shot, _ in found))

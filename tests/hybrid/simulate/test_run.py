@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.commands.simulate import simulate as simulate_command
+from hybrid.cli import main
 from hybrid.simulate.run import (
     SimulationError,
     check_blender,
@@ -211,13 +211,12 @@ def test_without_blender_the_message_says_how_to_get_it(stub):
         check_blender("/no/such/python")
 
 
-def test_a_missing_scene_is_one_line(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no file"):
-        simulate_command(str(tmp_path / "no.blend"), tmp_path)
-    with pytest.raises(
-        FileNotFoundError, match=r"no file test:lense; expected a \.blend file or one of random, .*test:lens"
-    ):
-        simulate_command("test:lense", tmp_path)
+@pytest.mark.parametrize("scene", ["no.blend", "test:lense"])
+def test_a_missing_scene_is_one_line(tmp_path, capsys, scene):
+    assert main(["simulate", scene, "-o", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: scene: no file {scene}; expected a .blend file or one of random, ")
+    assert error.count("\n") == 1
 
 
 def test_importing_the_command_loads_no_renderer():

@@ -1,0 +1,220 @@
+"""Work handed to the workers of a Dask cluster: the same command, a chunk of the frames or shots at a time.
+
+A chunk runs in a process of its own on the worker, so that what it takes is given back, and an error ends it alone.
+The folders must be shared, under the same paths. Dask gives the chunk of a worker that has died to another one, which
+leaves alone what was finished.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import uuid4
+
+import typer
+
+from hybrid.commands.log import LOG, Progress
+from hybrid.commands.options import RESOURCES
+from hybrid.interrupt import INTERRUPTED, interruptible
+
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        envvar="RAVG_SCHEDULER",
+        help="of a Dask scheduler, such as tcp://host:8786: its workers do it, over shared folders",
+        rich_help_panel=RESOURCES,
+    ),
+]
+ChunkOption = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="frames that a worker of --scheduler makes at a time", rich_help_panel=RESOURCES
+    ),
+]
+# Of the process of a chunk: what is said where, is for the one that hands it out to say.
+NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact", "fps")
+# How long a connection may take, seconds.
+PATIENCE = 10
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A part of the work: the words of its command, and its share of the whole in frames or samples."""
+
+    arguments: Sequence[str]
+    size: float
+
+
+def arguments_of(context: typer.Context, **changes: Any) -> list[str]:
+    """The words of this command with the options that were given, but for some changes."""
+    words, positional = [str(context.info_name)], []
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        value = changes.get(name, context.params.get(name))
+        if name in NOT_PASSED_ON or value is None or value is False:
+            continue
+        values = [str(item) for item in value] if isinstance(value, list | tuple) else [str(value)]
+        if parameter.param_type_name == "argument":
+            positional += values
+        elif value is True:
+            words.append(_longest(parameter.opts))
+        else:  # with "=", as a value may begin with a hyphen
+            words += [f"{_longest(parameter.opts)}={item}" for item in values]
+    return [*words, "--", *positional]
+
+
+def _longest(names: Sequence[str]) -> str:
+    return next(name for name in names if name.startswith("--"))
+
+
+def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
+    """Let the workers of a scheduler run all chunks, and tell how far they have come.
+
+    Parameters
+    ----------
+    address : str
+        Of the scheduler.
+    what : str
+        What is being done.
+    chunks : mapping of str to Chunk
+        By name.
+    unit : str
+        Of the chunks' sizes.
+
+    Raises
+    ------
+    ImportError
+        If distributed is not installed.
+    OSError
+        If the scheduler does not answer.
+    typer.Exit
+        With 1 if a chunk ended with an error, when all others are done; with 130 if Ctrl-C has ended it.
+    """
+    try:
+        from distributed import Client, Event, as_completed
+    except ModuleNotFoundError as error:
+        raise ImportError("distributed is not installed; expected: pip install 'ravg[cluster]'") from error
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise OSError(f"no Dask scheduler answers at {address}, expected one as `dask scheduler` starts it") from error
+    topic = f"ravg-{uuid4().hex}"
+    with client:
+        workers = client.scheduler_info()["workers"]
+        LOG.info(f"{len(chunks)} chunks for {len(workers)} workers of {address}")
+        if not workers:
+            LOG.warning("the scheduler has no workers yet, expected some as `dask worker` starts them")
+        bar, shares = Progress(what, sum(chunk.size for chunk in chunks.values()), unit), dict.fromkeys(chunks, 0.0)
+
+        def hear(event: tuple[float, dict[str, Any]]) -> None:
+            _tell(event[1], chunks, shares, bar)
+
+        client.subscribe_topic(topic, hear)
+        stop, failed = Event(f"{topic}-stop", client=client), []
+        tasks = {
+            client.submit(
+                run_chunk, name, list(chunk.arguments), str(Path.cwd()), topic, key=f"{topic}-{name}", pure=False
+            ): name
+            for name, chunk in chunks.items()
+        }
+
+        def report() -> None:
+            LOG.error("stopped: what is finished is kept; the same command goes on from there")
+
+        try:
+            with interruptible(report):
+                for task in as_completed(list(tasks), loop=client.loop):
+                    try:
+                        words = task.result()
+                    except Exception as lost:  # its workers died too often, or could not start it
+                        words = str(lost)
+                    if words:
+                        failed.append(tasks[task])
+                        LOG.error(f"{tasks[task]}: {words}")
+                    else:
+                        _tell(
+                            {"chunk": tasks[task], "percent": 100, "message": f"{tasks[task]} done"},
+                            chunks,
+                            shares,
+                            bar,
+                        )
+        except KeyboardInterrupt:
+            stop.set()
+            client.cancel(list(tasks))
+            raise typer.Exit(INTERRUPTED) from None
+        if failed:
+            LOG.error(f"{len(failed)} of {len(chunks)} chunks were not made: {', '.join(failed)}")
+            raise typer.Exit(1)
+
+
+def _tell(record: dict[str, Any], chunks: Mapping[str, Chunk], shares: dict[str, float], bar: Progress) -> None:
+    """Pass on what a chunk has told: warnings, and how far it has come."""
+    name = record["chunk"]
+    if "percent" in record:
+        shares[name] = max(shares[name], record["percent"] / 100 * chunks[name].size)
+        if (gained := sum(shares.values()) - bar.done) > 0:
+            bar.advance(gained, record["message"])
+    elif record["level"] == "warning":
+        LOG.warning(f"{name}: {record['message']}")
+
+
+def run_chunk(name: str, arguments: Sequence[str], folder: str, topic: str) -> str:
+    """Run a chunk on a worker, and pass on what it tells.
+
+    Returns
+    -------
+    str
+        Its error; "" where there was none.
+    """
+    from distributed import Event, get_client, get_worker
+
+    worker = get_worker()
+    stop = Event(f"{topic}-stop", client=get_client())
+    environment = {key: value for key, value in os.environ.items() if key not in ("RAVG_SCHEDULER", "RAVG_LOG_FILE")}
+    if not Path(folder).is_dir():
+        return f"there is no folder {folder} on {worker.address}, expected shared folders with the same paths"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybrid.cli", *_before_positional(arguments, "--log-format=json")],
+        cwd=folder,
+        env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
+    )
+
+    def watch() -> None:
+        while process.poll() is None:
+            if stop.is_set():
+                process.terminate()
+                return
+            time.sleep(0.5)
+
+    threading.Thread(target=watch, daemon=True).start()
+    last = ""
+    for line in process.stderr or ():
+        try:
+            record = json.loads(line)
+        except ValueError:  # of a library, or a traceback
+            last = line.strip() or last
+            continue
+        if record["level"] == "error":
+            last = record["message"]
+        worker.log_event(topic, {"chunk": name, **record})
+    code = process.wait()
+    return "" if code == 0 else f"ended with {code} on {worker.address}: {last}"
+
+
+def _before_positional(arguments: Sequence[str], word: str) -> list[str]:
+    at = list(arguments).index("--")
+    return [*arguments[:at], word, *arguments[at:]]

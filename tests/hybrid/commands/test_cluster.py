@@ -1,0 +1,146 @@
+"""A Dask cluster: a real scheduler and two workers, one of which dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+
+from hybrid.cli import main
+from hybrid.commands.cluster import arguments_of
+from tests.scenes import Scene
+
+pytestmark = pytest.mark.cluster
+ROOT = Path(__file__).parents[3]
+FRAMES = 6
+OPTIONS = ["--preset", "draft"]
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A scheduler's address, and its two workers."""
+    pytest.importorskip("distributed")
+    folder = tmp_path_factory.mktemp("dask")
+    told = folder / "scheduler.json"
+    environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    log = (folder / "log").open("wb")
+    running = [
+        subprocess.Popen(
+            [*scheduler, "--no-dashboard", "--scheduler-file", str(told)], stdout=log, stderr=log, env=environment
+        )
+    ]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told), "--no-nanny"]
+    worker += ["--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), "--host", "127.0.0.1"]
+    for _ in range(2):
+        running.append(subprocess.Popen(worker, stdout=log, stderr=log, cwd=ROOT, env=environment))
+    try:
+        from distributed import Client
+
+        while not told.exists():
+            assert running[0].poll() is None, (folder / "log").read_text()
+            time.sleep(0.1)
+        with Client(scheduler_file=str(told), set_as_default=False) as client:
+            address = client.scheduler.address
+            client.wait_for_workers(2, timeout=120)
+        yield address, running[1:]
+    finally:
+        for process in running[::-1]:
+            process.kill()
+            process.wait()
+        log.close()
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    return Scene(frames=FRAMES).write(tmp_path_factory.mktemp("shot") / "noisy")
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.glob("*.exr")}
+
+
+@pytest.fixture(scope="module")
+def whole(shot, tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "out"
+    assert main(["pseudoref", str(shot), "-o", str(out), *OPTIONS]) == 0
+    return contents(out)
+
+
+def test_options_are_passed_on_as_they_were_given():
+    seen = []
+    application = typer.Typer()
+
+    @application.command()
+    def denoise(
+        context: typer.Context,
+        shot: list[str],
+        output: Annotated[str, typer.Option("-o", "--output")],
+        layer: Annotated[list[str] | None, typer.Option()] = None,
+        resume: Annotated[bool, typer.Option("--resume")] = False,
+        scheduler: Annotated[str | None, typer.Option()] = None,
+    ) -> None:
+        seen.append(arguments_of(context, resume=True))
+
+    words = ["a", "-o", "-b", "--layer", "color=x", "--layer", "normal=y", "--scheduler", "tcp://here", "--", "-c"]
+    application(words, standalone_mode=False)
+    assert seen[0][1:] == ["--output=-b", "--layer=color=x", "--layer=normal=y", "--resume", "--", "a", "-c"]
+
+
+def test_a_shot_is_the_same_bytes_though_a_worker_dies(cluster, shot, whole, tmp_path, capsys):
+    address, workers = cluster
+    out = tmp_path / "out"
+
+    def kill() -> None:
+        while not any(out.glob("*.exr")):  # in the midst of it
+            time.sleep(0.05)
+        workers[0].send_signal(signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+    words = ["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--scheduler", address, "--chunk", "2"]
+    code = main(words)
+    err = capsys.readouterr().err
+    assert code == 0, err
+    assert "3 chunks for 2 workers" in err
+    assert f"{FRAMES} of {FRAMES} frames, 100 %" in err
+    workers[0].wait()
+    assert contents(out) == whole
+
+
+def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
+    folder, out = Scene(frames=8).write(tmp_path / "in"), tmp_path / "out"
+    victim = folder / "shot.1008.exr"
+    victim.write_bytes(victim.read_bytes()[:-2000])
+    words = ["pseudoref", str(folder), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "4"]
+    assert main(words) == 1
+    err = capsys.readouterr().err
+    assert "shot.1008.exr" in err
+    assert err.splitlines()[-1] == "error: 1 of 2 chunks were not made: 1005-1008"
+    assert {f"shot.{number}.exr" for number in range(1001, 1005)} <= contents(out).keys()
+
+
+def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_path):
+    out = tmp_path / "out"
+    words = ["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "1"]
+    run = subprocess.Popen([sys.executable, "-m", "hybrid.cli", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    while not any(out.glob("*.exr")):
+        assert run.poll() is None
+        time.sleep(0.05)
+    run.send_signal(signal.SIGINT)
+    _, err = run.communicate()
+    assert run.returncode == 130, err
+    assert "stopped: what is finished is kept" in err
+    assert len(contents(out)) < FRAMES
+
+
+def test_no_scheduler_is_one_line(shot, tmp_path, capsys):
+    pytest.importorskip("distributed")
+    words = ["pseudoref", str(shot), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main(words) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("error: no Dask scheduler answers at tcp://127.0.0.1:9")
