@@ -119,10 +119,32 @@ def judge_layers(shot: Shot) -> Judgement:
     -------
     Judgement
         Depends on the files and on the options that the shot was opened with, not on the frames asked for.
+
+    Notes
+    -----
+    A file that cannot be read is an error when its turn comes; until then the other pairs are looked at.
     """
+    pairs = _pair_numbers(shot)
+    try:
+        return _judge_pairs(shot, pairs)
+    except (ValueError, OSError):
+        readable = [pair for pair in pairs if all(_can_read(shot, number) for number in pair)]
+        if readable == pairs:
+            raise
+        return _judge_pairs(shot, readable) if readable else Judgement()
+
+
+def _can_read(shot: Shot, number: int) -> bool:
+    try:
+        shot.read(number)
+    except (ValueError, OSError):
+        return False
+    return True
+
+
+def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     layers = shot.layers(shot.available[0])
     evidence = _Evidence(layers)
-    pairs = _pair_numbers(shot)
     choice = None
     if layers.motion_convention is not None and pairs:
         vectors = _vector_pairs(shot, pairs, evidence.add)
