@@ -54,7 +54,7 @@ class Chunk:
     size: float
 
 
-def arguments_of(context: typer.Context, **changes: Any) -> list[str]:
+def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str]:
     """The words of this command with the options that were given, but for some changes."""
     words, positional = [str(context.info_name)], []
     for parameter in context.command.params:

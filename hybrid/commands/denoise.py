@@ -93,7 +93,8 @@ def pseudoref(
 
     With --estimate, pictures that are denoised already, each by itself, are made stable instead.
     """
-    if each_view(pseudoref, locals()):
+    given = dict(locals())
+    if each_view(pseudoref, given):
         return
     from hybrid.estimates import choose_estimate
     from hybrid.pipeline import Denoised
@@ -113,10 +114,11 @@ def pseudoref(
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
     if scheduler is not None:
-        _hand_out(context, shot, opened, output, scheduler, chunk)
+        _hand_out(context, given, opened, scheduler, chunk)
         _look(opened, output, preview, fps, contact)
         return
-    (opened, *others), judgement = judge_input(opened, strict=strict)
+    with _on_record(context, shot, opened, output):
+        (opened, *others), judgement = judge_input(opened, strict=strict)
     _expect_one(others, {"keep-estimates": keep_estimates})
     timings = Timings()
     source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
@@ -233,7 +235,8 @@ def denoise(
     chunk: ChunkOption = 10,
 ) -> None:
     """Denoise with the Robust Average network."""
-    if each_view(denoise, locals()):
+    given = dict(locals())
+    if each_view(denoise, given):
         return
     neural = import_neural()
     from rich.console import Console
@@ -250,10 +253,11 @@ def denoise(
     if scheduler is not None:
         if budget is not None or breakdown is not None:
             raise typer.BadParameter("--budget and --breakdown are of one machine, expected no --scheduler with them")
-        _hand_out(context, shot, opened, output, scheduler, chunk)
+        _hand_out(context, given, opened, scheduler, chunk)
         _look(opened, output, preview, fps, contact)
         return
-    (opened, *others), judgement = judge_input(opened, strict=strict)
+    with _on_record(context, shot, opened, output):
+        (opened, *others), judgement = judge_input(opened, strict=strict)
     alone = {"keep-estimates": keep_estimates, "breakdown": breakdown, "passes": passes if passes > 1 else None}
     _expect_one(others, alone)
     timings = Timings()
@@ -351,19 +355,38 @@ def _expect_one(others: Sequence[Shot], options: Mapping[str, object]) -> None:
         raise typer.BadParameter(f"--{given[0]} is of one picture, and the files have several: --layer color=NAME")
 
 
-def _hand_out(context: typer.Context, spec: str, shot: Shot, output: str, scheduler: str, size: int) -> None:
+def _hand_out(context: typer.Context, given: Mapping[str, object], shot: Shot, scheduler: str, size: int) -> None:
     """Let a cluster denoise the shot, a chunk of its frames at a time."""
     from hybrid.files.sequences import format_frames
 
     parts = [shot.numbers[start : start + size] for start in range(0, len(shot.numbers), size)]
     names = {format_frames(part): len(part) for part in parts}
     # A chunk that is run again, as a worker has died, leaves alone what was finished.
-    changes = {"shot": spec, "output": output, "resume": True}
-    chunks = {name: Chunk(arguments_of(context, frames=name, **changes), size) for name, size in names.items()}
+    chunks = {
+        name: Chunk(arguments_of(context, {**given, "frames": name, "resume": True}), count)
+        for name, count in names.items()
+    }
     run_on_cluster(scheduler, str(context.info_name), chunks)
     if shot.missing:
         LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
         raise typer.Exit(1)
+
+
+@contextmanager
+def _on_record(context: typer.Context, spec: str, shot: Shot, output: str) -> Iterator[None]:
+    """Leave a record of what has failed before the first frame."""
+    from hybrid.files.frames import output_path
+    from hybrid.records import Record, sequence_name
+    from hybrid.timing import Timings
+
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        with suppress(ValueError, OSError):  # what is wrong with the output, if anything, is not what is to be said
+            first = output_path(output, shot, shot.numbers[0])
+            record = Record(first.parent, sequence_name(first), shot.numbers, command=context.info_name, input=spec)
+            record.write(Timings(), "failed", error=one_line(error))
+        raise
 
 
 def _expect_all(shot: Shot, keep_going: bool) -> None:

@@ -139,7 +139,7 @@ def simulate(
             own = {"scene": shot.scene, "seed": shot.seed, "shots": 1, "output": folder}
             samples = sum(missing(shot, folder, frame) for frame in shot.frames)
             if samples:
-                chunks[folder.name] = Chunk(arguments_of(context, **own), samples)
+                chunks[folder.name] = Chunk(arguments_of(context, own), samples)
         run_on_cluster(scheduler, "rendering", chunks, "spp·frames")
         return
     _run_with_progress(asked, jobs, threads, python)

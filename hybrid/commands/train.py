@@ -158,7 +158,9 @@ def prepare(
     if scheduler is not None:
         frames_of = {name: len(next(iter(shot.values()))) for name, shot, _ in found}
         words = dict(zip(names, shots, strict=True))
-        chunks = {name: Chunk(arguments_of(context, shots=[words[name]]), count) for name, count in frames_of.items()}
+        chunks = {
+            name: Chunk(arguments_of(context, {"shots": [words[name]]}), count) for name, count in frames_of.items()
+        }
         run_on_cluster(scheduler, "prepare", chunks)
         return
     output.mkdir(parents=True, exist_ok=True)

@@ -86,7 +86,7 @@ def test_options_are_passed_on_as_they_were_given():
         resume: Annotated[bool, typer.Option("--resume")] = False,
         scheduler: Annotated[str | None, typer.Option()] = None,
     ) -> None:
-        seen.append(arguments_of(context, resume=True))
+        seen.append(arguments_of(context, {"resume": True}))
 
     words = ["a", "-o", "-b", "--layer", "color=x", "--layer", "normal=y", "--scheduler", "tcp://here", "--", "-c"]
     application(words, standalone_mode=False)
