@@ -193,7 +193,7 @@ def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, command):
     theirs = Path(shutil.copytree(shot_folder, tmp_path / "theirs"))
     before = {path: path.read_bytes() for path in theirs.iterdir()}
     words = (command, shot_folder, "--estimate", theirs, "-o", theirs)
-    assert "would overwrite a frame of the estimate" in one_line_error(capsys, *words)
+    assert "would overwrite an input: estimate" in one_line_error(capsys, *words)
     assert {path: path.read_bytes() for path in theirs.iterdir()} == before
 
 
