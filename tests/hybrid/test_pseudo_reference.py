@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,19 @@ def test_each_preset_beats_the_robust_average_and_final_the_noisy_frame_by_six_d
     for preset in CLASSICAL_PRESETS.values():
         assert psnr(filter_window(window, preset), truth) > robust + 1
     assert psnr(filter_window(window, FINAL), truth) > noisy + 6
+
+
+def test_draft_leaves_out_what_a_single_frame_shows(tmp_path):
+    """Its average is the robust one: a ghost in one of five frames is the maximum, and not averaged in."""
+    window = align(SCENE.write(tmp_path))
+    ghost = window.color.copy()
+    ghost[1, 12:28, 16:40] += 50
+    plain, haunted = (filter_window(replace(window, color=color), DRAFT) for color in (window.color, ghost))
+    inner = np.s_[14:26, 20:36]  # where four frames at least show the wall
+    assert (window.confidence[:, *inner] > 0.9).all()
+    # The ghost takes the place of what was the maximum before: a fifth of the noise, and not a fifth of 50.
+    assert np.abs(haunted - plain)[inner].max() < 1
+    assert np.abs(haunted - plain)[inner].max() > 0
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])

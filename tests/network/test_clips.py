@@ -252,6 +252,30 @@ def test_a_sample_is_a_function_of_seed_and_number(tmp_path: Path) -> None:
     assert not torch.equal(one[4]["color"], Samples(clips, SamplerConfig(crop=16), 4)[4]["color"])
 
 
+def test_samples_are_drawn_from_all_noise_levels_and_all_targets(tmp_path: Path) -> None:
+    """What a level is trained towards are all of its pairs, about equally often."""
+    clip = make_clip()
+    for level in range(3):  # told apart by their modulation, and by their target
+        clip.modulation[level] = level + 1
+        clip.noisy[level] = 10 * (level + 1)
+        clip.pseudo_reference[level] = 10 * (level + 1) + 5
+    write_shards(tmp_path, "s", SPP, [clip])
+    clips = open_clips(tmp_path)
+    samples = Samples(clips, PLAIN, 0)
+    drawn: dict[tuple[int, tuple[int, str]], int] = {}
+    for number in range(600):
+        sample = samples[number]
+        level = round(float(sample["modulation"][0, 0, 0])) - 1
+        value = 2 * float(sample["target"][0, 0, 0])  # over the last level's exposure, 2
+        target = round(value // 10) - 1, "noisy" if value % 10 < 2.5 else "pseudo_reference"
+        drawn[level, target] = drawn.get((level, target), 0) + 1
+    pairs = {(level, target) for level, targets in enumerate(noise_pairs(SPP)) for target in targets}
+    assert set(drawn) == pairs
+    for (level, _), count in drawn.items():
+        expected = 200 / len(noise_pairs(SPP)[level])
+        assert count == pytest.approx(expected, abs=4 * expected**0.5)  # four standard deviations
+
+
 def test_processes_that_read_make_the_same_batches(tmp_path: Path) -> None:
     samples = Samples(folder_of(tmp_path, {"a": 3}), SamplerConfig(crop=16), 0)
     batches = [next(iter(DataLoader(samples, batch_sampler=[[0, 1, 2]], num_workers=workers))) for workers in (0, 1)]

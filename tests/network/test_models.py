@@ -172,6 +172,66 @@ def test_only_robust_average_blocks_connect_the_frames(scales: tuple[int, ...]) 
     assert not torch.equal(seen[0][2], seen[1][2])
 
 
+def test_the_papers_network_is_wired_as_its_figure() -> None:
+    """Residual blocks, RA blocks where the configuration says, and a skip around each of the first sections.
+
+    A section is the blocks up to and with an RA block. Written down once more, without the model's own loop.
+    """
+    model = small_resnet()
+    with torch.no_grad():  # blocks that differ, or it would not matter which runs when
+        for number, parameter in enumerate(model.parameters()):
+            parameter.mul_(1 + 0.3 * (number % 3))
+    config, data = model.config, window()
+    assert (config.blocks, config.ra_after, config.skips) == (4, (1, 2, 4), 2)
+    features = network_inputs(**data, exposure=exposure(data["color"]))
+    with torch.no_grad():
+        start = model.stem(features.transpose(0, 1).flatten(0, 1))
+        first = model.average["1"](model.blocks[0](start), 3)
+        first = model.skip[0](torch.cat([first, start], 1))
+        second = model.average["2"](model.blocks[1](first), 3)
+        second = model.skip[1](torch.cat([second, first], 1))
+        third = model.average["4"](model.blocks[3](model.blocks[2](second)), 3)  # not skipped
+        torch.testing.assert_close(model.trunk(features), torch.relu(third))
+
+
+def test_the_paper_has_its_ra_blocks_where_its_figure_has_them() -> None:
+    """After blocks 3, 6, 9, 12, 15 and 24 of 24; the first four sections are skipped."""
+    model = paper()
+    order: list[str] = []
+    for name, module in model.named_modules():
+        if name.startswith(("blocks.", "average.", "skip.")) and name.count(".") == 1:
+            module.register_forward_hook(lambda *_, name=name: order.append(name))
+    data = window(t=5)
+    with torch.no_grad():
+        model.trunk(network_inputs(**data, exposure=exposure(data["color"])))
+    expected: list[str] = []
+    for block in range(1, 25):
+        expected.append(f"blocks.{block - 1}")
+        if block in (3, 6, 9, 12, 15, 24):
+            expected.append(f"average.{block}")
+        if block in (3, 6, 9, 12):
+            expected.append(f"skip.{block // 3 - 1}")
+    assert order == expected
+
+
+@pytest.mark.parametrize("scales", [(), (0,), (1,), (0, 2)])
+def test_the_u_nets_ra_blocks_are_at_their_scales(scales: tuple[int, ...]) -> None:
+    """Each sees features as large as its scale, of the encoder's residual block there."""
+    model = small_unet(ra_scales=scales)
+    seen: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+    outputs: dict[str, torch.Tensor] = {}
+    for scale in range(3):
+        model.encode[scale].register_forward_hook(lambda m, i, o, scale=scale: outputs.update({str(scale): o}))
+    for name, block in model.average.items():
+        block.register_forward_hook(lambda m, i, o, name=name: seen.update({name: (i[0], o)}))
+    run(model, window())
+    assert sorted(seen) == [str(scale) for scale in scales]
+    for name, (given, made) in seen.items():
+        assert given.shape[-2:] == (8 >> int(name), 12 >> int(name))
+        assert torch.equal(given, outputs[name])
+        assert not torch.equal(given, made)
+
+
 def test_the_baselines_frames_meet_in_its_temporal_module_only() -> None:
     model = small_tkpcn()
     before, after = [], []
