@@ -177,20 +177,18 @@ def test_the_papers_network_is_wired_as_its_figure() -> None:
 
     A section is the blocks up to and with an RA block. Written down once more, without the model's own loop.
     """
-    model = small_resnet()
-    with torch.no_grad():  # blocks that differ, or it would not matter which runs when
-        for number, parameter in enumerate(model.parameters()):
-            parameter.mul_(1 + 0.3 * (number % 3))
-    config, data = model.config, window()
-    assert (config.blocks, config.ra_after, config.skips) == (4, (1, 2, 4), 2)
+    torch.manual_seed(0)
+    model = RAResNet(RAResNetConfig(SMALL, width=4, blocks=6, ra_after=(2, 3, 6), skips=2))
+    data = window()
     features = network_inputs(**data, exposure=exposure(data["color"]))
+    blocks, average, skip = model.blocks, model.average, model.skip
     with torch.no_grad():
         start = model.stem(features.transpose(0, 1).flatten(0, 1))
-        first = model.average["1"](model.blocks[0](start), 3)
-        first = model.skip[0](torch.cat([first, start], 1))
-        second = model.average["2"](model.blocks[1](first), 3)
-        second = model.skip[1](torch.cat([second, first], 1))
-        third = model.average["4"](model.blocks[3](model.blocks[2](second)), 3)  # not skipped
+        first = average["2"](blocks[1](blocks[0](start)), 3)
+        first = skip[0](torch.cat([first, start], 1))
+        second = average["3"](blocks[2](first), 3)
+        second = skip[1](torch.cat([second, first], 1))
+        third = average["6"](blocks[5](blocks[4](blocks[3](second))), 3)  # not skipped
         torch.testing.assert_close(model.trunk(features), torch.relu(third))
 
 
