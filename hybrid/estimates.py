@@ -7,7 +7,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
+from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, denoise_oidn
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
@@ -49,10 +50,13 @@ class OfFrames:
         From a frame to its denoised radiance (H, W, 3), or None where it has none.
     holds : int
         Bytes that it takes for itself.
+    files : Shot or None
+        The finished sequence that it reads, if it does.
     """
 
     function: Callable[[Frame], Array | None]
     holds: int = 0
+    files: Shot | None = None
     from_noisy = False
 
     def reach(self, radius: int) -> int:
@@ -84,6 +88,7 @@ class OfGuidedFrames:
 
     function: Callable[[Frame, bool], Array]
     holds: int = 0
+    files = None
     from_noisy = False
 
     def reach(self, radius: int) -> int:
@@ -117,6 +122,7 @@ class OfWindows:
 
     preset: ClassicalPreset
     holds = 0
+    files = None
     from_noisy = True
 
     def reach(self, radius: int) -> int:
@@ -163,6 +169,7 @@ def choose_estimate(
     own: ClassicalPreset = FINAL,
     kept: str | None = None,
     mode: str = "oidn-clean",
+    forced: str = "",
     quicker: Callable[..., Array] | None = None,
 ) -> EstimateSource:
     """Find the estimates that are asked for.
@@ -181,8 +188,11 @@ def choose_estimate(
     mode : str
         Of OIDN, for "auto".
     kept : str, optional
-        Where OIDN's pictures are kept, and taken from if they are there: a pattern or a folder. Where none are
-        made, the reason says that none are kept.
+        Where OIDN's pictures are kept, and taken from if they are there and would be made the same: a pattern or a
+        folder. Where none are made, the reason says that none are kept.
+    forced : str
+        What the user has forced (`hybrid.plan.Rules.forced`), on which guides and fireflies depend: pictures are kept
+        for that.
     quicker : callable, optional
         What "auto" has in the place of `hybrid.oidn.denoise_oidn`, with the same parameters.
 
@@ -195,7 +205,8 @@ def choose_estimate(
     FileNotFoundError
         If there is no such sequence.
     """
-    source = _choose(spec, shot, own, kept, mode, quicker)
+    keep = None if kept is None else partial(Kept, shot, kept, forced)
+    source = _choose(spec, shot, own, mode, keep, quicker)
     if kept is not None and source.name not in OIDN_MODES:
         return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
     return source
@@ -205,8 +216,8 @@ def _choose(
     spec: str,
     shot: Shot,
     own: ClassicalPreset,
-    kept: str | None,
     mode: str,
+    keep: Callable[[str, bool], Kept] | None,
     quicker: Callable[..., Array] | None,
 ) -> EstimateSource:
     if spec == "auto":
@@ -214,8 +225,8 @@ def _choose(
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if _has_oidn():
             if quicker is not None:
-                return _oidn(mode, shot, kept, "OIDN is installed; its networks run in bfloat16", quicker)
-            return _oidn(mode, shot, kept, "OIDN is installed")
+                return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", quicker)
+            return _oidn(mode, keep, "OIDN is installed")
         return EstimateSource("nlm", OfWindows(own), "no denoised picture in the file, and pyoidn is not installed")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
@@ -224,12 +235,13 @@ def _choose(
     if spec in OIDN_MODES:
         if not _has_oidn():
             raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
-        return _oidn(spec, shot, kept, "asked for")
+        return _oidn(spec, keep, "asked for")
     sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
-    return EstimateSource("sequence", OfFrames(partial(_read_sequence, sequence)), "asked for", sequence)
+    read = OfFrames(partial(_read_sequence, sequence), files=sequence)
+    return EstimateSource("sequence", read, "asked for", sequence)
 
 
 def _has_oidn() -> bool:
@@ -237,16 +249,67 @@ def _has_oidn() -> bool:
 
 
 def _oidn(
-    mode: str, shot: Shot, kept: str | None, reason: str, denoise: Callable[..., Array] | None = None
+    mode: str,
+    keep: Callable[[str, bool], Kept] | None,
+    reason: str,
+    denoise: Callable[..., Array] | None = None,
 ) -> EstimateSource:
     run: Callable[..., Array] = partial(_run_mode, mode, denoise=denoise)
-    places: dict[int, Path] = {}
+    kept = None if keep is None else keep(mode, denoise is not None)
     if kept is not None:
-        # Of neighbours too that were not asked for.
-        places = {number: output_path(kept, shot, number, beside=True) for number in shot.files}
-        run = partial(_run_or_read, run=run, shot=shot, places=places)
+        run = partial(kept.read_or_run, run=run)
     estimates = OfGuidedFrames(run, HOLDS) if mode == "oidn-clean" else OfFrames(run, HOLDS)
-    return EstimateSource(mode, estimates, reason, kept=tuple(places.values()))
+    return EstimateSource(mode, estimates, reason, kept=() if kept is None else tuple(kept.places.values()))
+
+
+class Kept:
+    """OIDN's pictures on disk, each with a record of what it was made from.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    spec : str
+        Where they are: a pattern or a folder.
+    forced : str
+        As for `choose_estimate`.
+    mode : str
+        A key of `OIDN_MODES`.
+    quicker : bool
+        Whether OIDN's networks run elsewhere, less exactly.
+
+    Raises
+    ------
+    ValueError
+        If it is one name for several frames, neighbours among them, or would overwrite an input.
+    """
+
+    def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool) -> None:
+        # Of neighbours too that were not asked for.
+        self.places = {number: output_path(spec, shot, number, beside=True) for number in shot.files}
+        self._shot = shot
+        self._facts = {"estimate": mode, "quicker": quicker, "forced": forced, **versions("pyoidn")}
+        # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.
+        self._reach = 1 + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
+
+    def read_or_run(self, frame: Frame, *known: bool, run: Callable[..., Array]) -> Array:
+        """What an earlier run has left of this frame, if it would be the same now; else what is left there now.
+
+        Raises
+        ------
+        ValueError
+            If another file is there, which no run has left as an estimate.
+        """
+        path, shot = self.places[frame.number], self._shot
+        files = shot.states(shot.near(frame.number, self._reach))
+        made_from = describe_sources(files, layers=shot.taken(frame.number), **self._facts)
+        if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
+            if path.exists() and "estimate" not in sources_in(path):
+                raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shot.write(path, frame.number, {"color": run(frame, *known)}, attributes={MADE_FROM: made_from})
+        # Read back also what was just written, half as it may be: every run then sees the same.
+        return shot.remade({frame.number: path}).read(frame.number).color
 
 
 def _run_mode(
@@ -289,15 +352,3 @@ def _denoised(sequence: Shot, number: int) -> Array:
     """A finished frame; where Cycles has denoised, the file's color is the noisy image beside it."""
     found = sequence.read(number)
     return found.color if found.estimate is None else found.estimate
-
-
-def _run_or_read(
-    frame: Frame, *known: bool, run: Callable[..., Array], shot: Shot, places: Mapping[int, Path]
-) -> Array:
-    """What an earlier run has left on disk, or what is left there now."""
-    path = places[frame.number]
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shot.write(path, frame.number, {"color": run(frame, *known)})
-    # Read back also what was just written, half as it may be: every run then sees the same.
-    return shot.remade({frame.number: path}).read(frame.number).color

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
 from hybrid.estimates import EstimateSource
-from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
+from hybrid.files.sources import MADE_FROM, describe_sources, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.timing import Timings
 
@@ -64,6 +64,7 @@ class Finished:
     clamped: int = 0
     plan: Plan | None = None  # which stages ran, and why
     resumed: bool = False  # it was there already
+    again: str = ""  # why it was made again, if it was there and an earlier run was to be resumed
 
 
 def check_written(
@@ -138,7 +139,7 @@ def denoise_shot(
     rows : int, optional
         How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); all without. The result is the same.
     resume : bool
-        Leave frames alone that are there, whole, with these attributes, and no older than what they are made from.
+        Leave frames alone that are there, whole, and would be made the same: with these attributes, of the same files.
     keep_going : bool
         Where a frame cannot be made, or read, or written, go on with those after it.
     timings : Timings, optional
@@ -160,9 +161,9 @@ def denoise_shot(
     earlier processes have left half written is removed.
     """
     timings = timings or Timings()
+    all_pictures = ((shot, estimates), *others)
     aligner, *beside = (
-        Aligner(picture, rules, radius=radius, estimates=theirs, timings=timings)
-        for picture, theirs in ((shot, estimates), *others)
+        Aligner(picture, rules, radius=radius, estimates=theirs, timings=timings) for picture, theirs in all_pictures
     )
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
@@ -171,10 +172,12 @@ def denoise_shot(
     # What shines in one frame alone is told by the frames beside it.
     reach = 1 + (radius if estimates is None else estimates.reach(radius))
     for number, path in paths.items():
-        if resume and _is_finished(path, attributes or {}, _files_around(shot, number, reach)):
-            yield Finished(number, path, resumed=True)
-            continue
         try:
+            made_from = _made_from(all_pictures, number, reach)
+            again = why_stale(path, {**(attributes or {}), MADE_FROM: made_from}) if resume else ""
+            if again is None:
+                yield Finished(number, path, resumed=True)
+                continue
             denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
             counted, pictures = [aligned], []
             for (picture, _), other in zip(others, beside, strict=True):
@@ -184,8 +187,11 @@ def denoise_shot(
             plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
             with timings.stage("write"):
                 images = {"color": denoised.color, **denoised.aovs}
-                stages = {"ravg/stages": " ".join(sorted(plan.stages))}
-                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **stages}, pictures)
+                own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}
+                for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
+                    if read is not None:
+                        read.check_unchanged(n for n in shot.near(number, reach) if read.has(n))
+                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **own}, pictures)
             finished = Finished(
                 number=number,
                 path=path,
@@ -196,6 +202,7 @@ def denoise_shot(
                 outliers=sum(counts.outliers for counts in counted),
                 clamped=clamped,
                 plan=plan,
+                again=again,
             )
             del denoised, aligned, pictures  # or they would still be there while the next window is made
         except (ValueError, OSError) as error:
@@ -243,17 +250,12 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
     return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), counts
 
 
-def _files_around(shot: Shot, number: int, reach: int) -> list[Path]:
-    numbers = range(number - reach * shot.step, number + reach * shot.step + 1, shot.step)
-    return [path for n in numbers if shot.has(n) for path in shot.paths(n)]
-
-
-def _is_finished(path: Path, attributes: Mapping[str, str], sources: Iterable[Path]) -> bool:
-    """Whether a file is there, whole, with these attributes, and no older than any of its sources."""
-    try:
-        header = read_exr(path).parts[0].header
-        made = path.stat().st_mtime_ns
-        fresh = all(source.stat().st_mtime_ns <= made for source in sources)
-    except (OSError, ExrError):
-        return False
-    return fresh and all(header.get(name) == value for name, value in attributes.items())
+def _made_from(pictures: Sequence[tuple[Shot, Estimates | None]], number: int, reach: int) -> str:
+    """What a frame is made from: all files that its window reaches, and how each picture in them is read."""
+    shot = pictures[0][0]
+    near = shot.near(number, reach)
+    files = shot.states(near)
+    for _, estimates in pictures:
+        if estimates is not None and (given := estimates.files) is not None:
+            files |= given.states((n for n in near if given.has(n)), "estimate")
+    return describe_sources(files, layers=[p.taken(number) for p, _ in pictures], size=list(shot.shape))

@@ -144,6 +144,11 @@ class Rules:
         """The stages that may run on some frame."""
         return frozenset(STAGES) - self.off
 
+    @property
+    def forced(self) -> str:
+        """What the user has forced, in words: +warp -gate."""
+        return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
+
     def plan(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
         """Decide on a window by what its frames and its pairs of neighbours show."""
         return decide(frames, pairs).force(self.on, self.off)

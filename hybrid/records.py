@@ -14,19 +14,19 @@ import re
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from hybrid.files.replace import remove_leftovers, write_file
 from hybrid.files.sequences import format_frames
+from hybrid.files.sources import PACKAGES, versions
 from hybrid.timing import Timings, peak_memory
 
 FOLDER = "ravg"
 # The sequence whose files are called by their numbers alone.
 NAMELESS = "frames"
-# Packages that pixels may depend on.
-PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "OpenEXR", "pyoidn", "torch")
+# Packages that anything may depend on.
+ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")
 # A longer list of frames is named by its ends and a hash in the record's name.
 LONGEST = 60
 
@@ -60,14 +60,14 @@ class Record:
         self._start = time.time()
         self._written = False
         self._document: dict[str, Any] = {
-            "ravg": _versions().get("ravg", "unknown"),
+            "ravg": versions(*ALL_PACKAGES).get("ravg", "unknown"),
             **facts,
             "asked": list(numbers),
             "host": platform.node(),
             "process": os.getpid(),
             "python": platform.python_version(),
             "machine": platform.machine(),
-            "versions": _versions(),
+            "versions": versions(*ALL_PACKAGES),
             "started": self._start,
             "state": "running",
             "frames": {},
@@ -245,16 +245,6 @@ def _range(numbers: Sequence[int]) -> str:
     if len(text) <= LONGEST:
         return text
     return f"{numbers[0]}-{numbers[-1]}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def sequence_name(file: Path) -> str:

@@ -24,7 +24,7 @@ from flow.warp import warp
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
 from hybrid.alignment.prepare import ALPHA, PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.transfer import demodulate, measure_exposure, remodulate
-from hybrid.files.frames import Frame, Frames
+from hybrid.files.frames import Frame, Frames, Shot
 from hybrid.files.layers import Layers
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
@@ -171,6 +171,8 @@ class Estimates(Protocol):
     ----------
     holds : int
         Bytes that the denoiser takes for itself while it works.
+    files : Shot or None
+        The finished sequence that they are read from, if they are.
     from_noisy : bool
         Whether they are made from windows of noisy frames, for which the gate needs the light of each
         (`PreparedFrame.light`); else the gate compares the estimates.
@@ -179,6 +181,10 @@ class Estimates(Protocol):
     @property
     def holds(self) -> int:
         """Bytes that the denoiser takes for itself."""
+
+    @property
+    def files(self) -> Shot | None:
+        """The finished sequence that they are read from, if they are."""
 
     @property
     def from_noisy(self) -> bool:

@@ -121,7 +121,7 @@ def pseudoref(
         (opened, *others), judgement = judge_input(opened, strict=strict)
     _expect_one(others, {"keep-estimates": keep_estimates})
     timings = Timings()
-    source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates)
+    source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates, forced=rules.forced)
     beside = [(other, choose_estimate(estimate, other, own=chosen)) for other in others]
     _spare_inputs(opened, output, source, {"profile": profile}, preview=preview, contact=contact)
     if source.estimates is None:
@@ -264,8 +264,9 @@ def denoise(
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
     chosen: str = preset
+    rules = rules_of(stages, no_stages)
     if budget is not None:
-        chosen = _fitting(opened, budget, estimate, rules_of(stages, no_stages), precision)
+        chosen = _fitting(opened, budget, estimate, rules, precision)
     path = weights or neural.shipped_weights(chosen)
     if tile is None:
         tile = neural.TILE if max_memory is None else neural.SMALL_TILE
@@ -277,7 +278,7 @@ def denoise(
         made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
         quicker = neural.denoise_unet if denoiser.precision == "bfloat16" and neural.has_unet() else None
         choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker)
-        source = choose(made, kept=keep_estimates)
+        source = choose(made, kept=keep_estimates, forced=rules.forced)
         beside = [(other, choose(other)) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
@@ -308,7 +309,7 @@ def denoise(
         command="denoise",
         preset=chosen if weights is None else path.name,
         settings=settings,
-        rules=rules_of(stages, no_stages),
+        rules=rules,
         resume=resume,
         keep_going=keep_going,
         max_memory=max_memory,
@@ -520,7 +521,9 @@ def _denoise(job: Job, record: Record) -> None:
     """Denoise; say how far it has come, and what was met on the way."""
     from rich.table import Table
 
+    from hybrid.estimates import OIDN_MODES
     from hybrid.files.layers import summarize_layers
+    from hybrid.files.sources import PACKAGES, versions
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
     from hybrid.pipeline import Failed, denoise_shot
     from hybrid.plan import NEURAL_STAGES, Plan, merge
@@ -548,13 +551,17 @@ def _denoise(job: Job, record: Record) -> None:
     for words in (f"layers: {layers}", *taken.notes, *said):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
+    packages = [*PACKAGES, *(["torch"] if job.neural else []), *(["pyoidn"] if source.name in OIDN_MODES else [])]
+    # Not where things lie: what was read from there is told by the files and layers that each picture was made from.
+    elsewhere = ("profile", "estimate" if source.files else "")
+    settings = {name: value for name, value in job.settings.items() if name not in elsewhere}
     attributes = {
         "ravg/command": job.command,
         "ravg/preset": job.preset,
         "ravg/estimate": source.name,
-        "ravg/forced": " ".join([f"+{name}" for name in sorted(rules.on)] + [f"-{name}" for name in sorted(rules.off)]),
-        "ravg/layers": layers,
-        "ravg/settings": json.dumps(job.settings, sort_keys=True),
+        "ravg/forced": rules.forced,
+        "ravg/settings": json.dumps(settings, sort_keys=True),
+        "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
     }
     record.write(timings, layers=layers, judged=[vars(finding) for finding in job.judgement.findings])
     pixels, outliers = 0, 0
@@ -588,6 +595,8 @@ def _denoise(job: Job, record: Record) -> None:
         outliers += finished.outliers
         if finished.plan is not None:
             plans[finished.number] = finished.plan
+        if finished.again:
+            LOG.info(f"frame {finished.number} is made again: {printable(finished.again)}")
         if finished.fireflies:
             light = f"{finished.removed:.2%} of its light"
             LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {light}")

@@ -18,10 +18,11 @@ import numpy as np
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
-from hybrid.files.layers import Layers, find_colors, find_layers
+from hybrid.files.layers import Layers, find_colors, find_layers, summarize_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
+from hybrid.files.sources import Source, identify
 from nlm.variance import variance_from_halves
 
 
@@ -208,6 +209,7 @@ class Shot:
         self._keep = keep
         self._max_pixels = max_pixels
         self._held: OrderedDict[int, Frame] = OrderedDict()
+        self._states: dict[Path, Source] = {}
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -246,11 +248,15 @@ class Shot:
         """Whether this is one of the shot's files, asked for or not, by whatever name."""
         return not self._identities.isdisjoint(identities(path))
 
+    def near(self, number: int, reach: int) -> list[int]:
+        """The frames that are there up to `reach` steps before and after one, itself among them."""
+        numbers = range(number - reach * self.step, number + reach * self.step + 1, self.step)
+        return [n for n in numbers if n in self._files]
+
     def around(self, reach: int) -> Shot:
         """The same shot, asked also for the frames up to `reach` steps before and after, where they are there."""
-        near = {n + k * self.step for n in self.numbers for k in range(-reach, reach + 1)}
         wider = copy(self)
-        wider.numbers = tuple(sorted(near & self._files.keys()))
+        wider.numbers = tuple(sorted({near for number in self.numbers for near in self.near(number, reach)}))
         return wider
 
     def remade(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Shot:
@@ -310,6 +316,39 @@ class Shot:
             raise FileNotFoundError(f"frame {number} is not there; the shot has {format_frames(self._files)}")
         return self._files[number]
 
+    def states(self, numbers: Iterable[int], what: str = "frame") -> dict[str, Source]:
+        """The files of some frames as they were when they were read, or if they have not been yet, as they are now.
+
+        Parameters
+        ----------
+        numbers
+            Frame numbers.
+        what
+            What to call them: ``frame 1001``, with the name of the file where it holds a layer alone.
+        """
+        found = {}
+        for number in numbers:
+            for index, path in enumerate(self.paths(number)):
+                if path not in self._states:
+                    self._states[path] = identify(path)
+                found[f"{what} {number}{f' {path.name}' if index else ''}"] = self._states[path]
+        return found
+
+    def check_unchanged(self, numbers: Iterable[int]) -> None:
+        """Refuse to go on where a file is another than the one that was read.
+
+        Raises
+        ------
+        OSError
+            If one of them has been written again since, or is gone.
+        """
+        for path in (path for number in numbers for path in self.paths(number)):
+            if (state := self._states.get(path)) is None:
+                continue
+            status = path.stat()
+            if (status.st_size, round(status.st_mtime_ns / 1e9, 3)) != (state.size, state.modified):
+                raise OSError(f"{path} has changed since it was read; --resume makes again what was made from it")
+
     def source(self, number: int) -> ExrImage:
         """Everything in the file of a frame; not kept."""
         return self._read(self.path(number))
@@ -323,6 +362,11 @@ class Shot:
             If the file cannot be read, lacks a layer, or has another one where the first frame has its own.
         """
         return self._find(self.header(number))
+
+    def taken(self, number: int) -> str:
+        """What is taken for what of a frame, and how it is read, in words: where these differ, so does the picture."""
+        layers = self.layers(number)
+        return f"{summarize_layers(layers)}; motion {layers.motion_convention}; variance {layers.variance_scale}"
 
     @cached_property
     def profile(self) -> Profile:
@@ -412,6 +456,7 @@ class Shot:
             return self._held[number]
         image, layers = self._open(number)
         frame = _frame(image, layers, self._canvas, number, self._open_apart(number, layers))
+        self.check_unchanged([number])
         self._held[number] = frame
         while len(self._held) > self._keep:
             self._held.popitem(last=False)
@@ -420,6 +465,7 @@ class Shot:
     def read_color(self, number: int) -> np.ndarray:
         """The color alone of a frame, as `read` gives it, in half its time; not kept."""
         image, layers = self._open(number)
+        self.check_unchanged([number])
         return _pixels(image, layers.color, self._canvas)
 
     def write(
@@ -454,6 +500,7 @@ class Shot:
         int
             How many values were too large for a half channel.
         """
+        self.check_unchanged([number])
         source = self.source(number)
         replaced = self._replace(source, images)
         for other, theirs in others:
@@ -491,6 +538,7 @@ class Shot:
 
     def _open(self, number: int) -> tuple[ExrImage, Layers]:
         """The file of a frame, and what is taken for what; refuses one of another size than the first frame's."""
+        self.states([number])
         image = self.source(number)
         layers = self._find(image)
         size = _size(image.parts[layers.color.part])

@@ -19,6 +19,7 @@ from hybrid.files.exr import ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_layers
 from hybrid.files.pictures import encode_srgb
 from hybrid.files.sequences import find_files, parse_frames
+from hybrid.files.sources import MADE_FROM
 from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
 
@@ -125,7 +126,8 @@ class Sequence:
         path = self._path(number)
         image = read_exr(path, pixels=False)
         header = image.parts[0].header
-        made = {key.removeprefix("ravg/"): str(value) for key, value in header.items() if key.startswith("ravg/")}
+        own = {key: value for key, value in header.items() if key.startswith("ravg/") and key != MADE_FROM}
+        made = {key.removeprefix("ravg/"): str(value) for key, value in own.items()}
         with suppress(ValueError, AttributeError):  # options that were given stand in a header by themselves, as JSON
             settings = json.loads(made.get("settings", "{}")).items()
             made = {name: value for name, value in made.items() if name != "settings"}

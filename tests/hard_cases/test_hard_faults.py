@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import pytest
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.estimates import OfWindows
-from hybrid.files.exr import read_exr
+from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.interrupt import interruptible
@@ -78,6 +80,93 @@ def test_resume_makes_only_what_is_missing_damaged_or_outdated(tmp_path, capsys)
     later = time.time() + 5
     os.utime(folder / "shot.1003.exr", (later, later))
     assert len(made_again()) == 3
+
+
+def render_again(path, note, seconds=None):
+    """The same file but for a word in its header, with a time of its own."""
+    before = path.stat().st_mtime
+    write_exr(path, read_exr(path), {}, attributes={"note": note})
+    seconds = before if seconds is None else seconds
+    os.utime(path, (seconds, seconds))
+
+
+@pytest.mark.parametrize(
+    ("what", "again"),
+    [
+        ("an older frame", range(1001, 1008)),
+        ("a frame of the same size and time", range(1001, 1008)),
+        ("a frame that comes late", range(1005, 1009)),
+        ("a frame that is gone", range(1005, 1008)),
+        ("an estimate made again", range(1001, 1008)),
+        ("an older estimate", range(1001, 1008)),
+        ("other layers", range(1001, 1009)),
+        ("another version", range(1001, 1009)),
+        ("the project unpacked elsewhere", ()),
+    ],
+)
+def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, monkeypatch, what, again):
+    """Times alone were compared: what was older, or came late, or was no frame at all, was "finished already"."""
+    scene, out = Scene(height=24, width=32, frames=8), tmp_path / "out"
+    folder, estimates = scene.write(tmp_path / "in"), scene.write(tmp_path / "estimates", clean=True)
+    frame, estimate, last = folder / "shot.1004.exr", estimates / "shot.1004.exr", folder / "shot.1008.exr"
+    for path in (frame, estimate):
+        render_again(path, "first")
+    if what == "a frame that comes late":
+        last.rename(tmp_path / "late.exr")
+    more = []
+    assert draft(folder, out, "--estimate", str(estimates)) == 0
+    before = stamps(out)
+    if what == "an older frame":
+        render_again(frame, "again", 1e9)
+    elif what == "a frame of the same size and time":
+        render_again(frame, "other")
+    elif what == "a frame that comes late":
+        (tmp_path / "late.exr").rename(last)
+        os.utime(last, (1e9, 1e9))
+    elif what == "a frame that is gone":
+        last.unlink()
+    elif what == "an estimate made again":
+        render_again(estimate, "other")
+    elif what == "an older estimate":
+        render_again(estimate, "other", 1e9)
+    elif what == "other layers":
+        more = ["--layer", "normal=Denoising Albedo"]
+    elif what == "another version":
+        monkeypatch.setattr("hybrid.files.sources.version", lambda package: "1999")
+    else:
+        for path in (folder, estimates):
+            shutil.copytree(path, tmp_path / "elsewhere" / path.name)
+            for file in (tmp_path / "elsewhere" / path.name).iterdir():  # archives keep whole seconds
+                os.utime(file, (int(file.stat().st_mtime), int(file.stat().st_mtime)))
+        folder, estimates = tmp_path / "elsewhere" / "in", tmp_path / "elsewhere" / "estimates"
+    capsys.readouterr()
+    assert draft(folder, out, "--resume", "--estimate", str(estimates), *more) == 0
+    after = stamps(out)
+    assert {int(name.split(".")[1]) for name in after if after[name] != before.get(name)} == {*again}
+    reasons = re.findall(r"frame (\d+) is made again: (.+)", capsys.readouterr().err)
+    assert {int(number) for number, _ in reasons} == {n for n in again if f"shot.{n}.exr" in before}
+
+
+def test_a_frame_that_is_rendered_again_while_it_is_used_ends_the_run(tmp_path, capsys, monkeypatch):
+    """Half of what was written came from the old file, half from the new, and --resume found it finished."""
+    scene, out = Scene(height=24, width=32, frames=4), tmp_path / "out"
+    folder = scene.write(tmp_path / "in")
+    made = []
+
+    def filter_and_render(window, *args, **kwargs):
+        made.append(window.number)
+        if len(made) == 2:
+            render_again(folder / "shot.1003.exr", "again")
+        return filter_window(window, CLASSICAL_PRESETS["draft"])
+
+    monkeypatch.setattr("hybrid.pseudo_reference.filter_window", filter_and_render)
+    assert draft(folder, out) == 1
+    assert "shot.1003.exr has changed since it was read" in capsys.readouterr().err
+    assert set(stamps(out)) == {"shot.1001.exr"}
+    monkeypatch.undo()
+    before = stamps(out)
+    assert draft(folder, out, "--resume") == 0
+    assert stamps(out)["shot.1001.exr"] != before["shot.1001.exr"]  # whose window had the old one
 
 
 @pytest.mark.neural

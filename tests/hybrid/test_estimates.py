@@ -1,6 +1,8 @@
 """Per-frame estimates: where they come from, and what time makes of them."""
 
 import importlib.util
+import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
+from hybrid.files import sources
 from hybrid.files.frames import open_shot
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
@@ -277,6 +280,52 @@ def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
     assert (tmp_path / f"kept.{MIDDLE}.exr").is_file()
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_allclose(images[0], 0.5 * shot.read(MIDDLE).color, rtol=1e-3)
+
+
+def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_path, monkeypatch):
+    """Whatever file was there was taken: of another mode, of other frames, of other guides, or none of ours."""
+    made = []
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: made.append(mode) or 0.5 * color)
+    folder, kept = SCENE.write(tmp_path / "noisy"), tmp_path / "kept"
+
+    def run(mode="oidn", **more):
+        before = len(made)
+        shot = open_shot(folder, **more.pop("opened", {}))
+        choose_estimate(mode, shot, kept=str(kept), **more).estimates.function(shot.read(MIDDLE))
+        return len(made) - before
+
+    assert [run(), run()] == [1, 0]
+    assert run("oidn-fast") == 1
+    assert made[-1]["quality"] == "fast"
+    assert [run(), run()] == [1, 0]
+    assert run(forced="-fireflies") == 1
+    assert run(forced="-fireflies", opened={"layers": {"normal": "Denoising Albedo"}}) == 1
+    assert run() == 1
+    near = folder / f"shot.{MIDDLE + 1}.exr"  # by which fireflies are told
+    os.utime(near, (1e9, 1e9))
+    assert [run(), run()] == [1, 0]
+    monkeypatch.setattr(sources, "version", lambda package: "1999")
+    assert run() == 1
+    mine = kept / f"shot.{MIDDLE}.exr"
+    mine.write_bytes((folder / mine.name).read_bytes())
+    with pytest.raises(ValueError, match="is there, and no estimate that was kept"):
+        run()
+    assert mine.read_bytes() == (folder / mine.name).read_bytes()
+
+
+def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkeypatch, capfd):
+    """They took the place of the output, frame by frame, and the output theirs."""
+    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: 0.5 * color)
+    folder, out = SCENE.write(tmp_path / "noisy"), tmp_path / "out"
+    words = ["pseudoref", str(folder), "-o", str(out), "--estimate", "oidn", "--keep-estimates"]
+    for place in (out, tmp_path / "noisy" / ".." / "out", out / "shot.%04d.exr"):
+        assert main([*words, str(place)]) == 1
+        assert re.search("keep-estimates .* would overwrite output", capfd.readouterr().err)
+    assert main([*words, str(folder)]) == 1
+    assert "would overwrite an input" in capfd.readouterr().err
+    assert not out.exists()
 
 
 def test_pictures_are_kept_in_a_file_each(tmp_path, monkeypatch):
