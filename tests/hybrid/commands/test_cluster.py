@@ -14,6 +14,7 @@ import typer
 
 from hybrid.cli import main
 from hybrid.commands.cluster import arguments_of
+from tests.hybrid.test_docs import said, transcript
 from tests.scenes import Scene
 
 pytestmark = pytest.mark.cluster
@@ -91,6 +92,20 @@ def test_options_are_passed_on_as_they_were_given():
     words = ["a", "-o", "-b", "--layer", "color=x", "--layer", "normal=y", "--scheduler", "tcp://here", "--", "-c"]
     application(words, standalone_mode=False)
     assert seen[0][1:] == ["--output=-b", "--layer=color=x", "--layer=normal=y", "--resume", "--", "a", "-c"]
+
+
+def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    documented = "tcp://192.168.1.10:8786"
+    commands = [(words, answer) for (program, *words), answer in transcript("farm.md", "cluster") if program == "ravg"]
+    assert len(commands) == 2
+    for words, answer in commands:
+        assert main([cluster[0] if word == documented else word for word in words]) == 0
+        captured = capsys.readouterr()
+        lines = [said(line) for line in (captured.out + captured.err).splitlines()]
+        for line in answer:
+            assert said(line).replace(documented, cluster[0]) in lines
 
 
 def test_a_shot_is_the_same_bytes_though_a_worker_dies(cluster, shot, whole, tmp_path, capsys):
