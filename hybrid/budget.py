@@ -96,7 +96,19 @@ def measure_presets(
 
 
 def cut_out(shot: Frames, side: int) -> MappedShot:
-    """The same shot, of each frame only the middle, at most `side` pixels wide and high."""
+    """Cut the middle out of each frame of a shot.
+
+    Parameters
+    ----------
+    shot : Frames
+        Frames of H × W pixels.
+    side : int
+        Pixels, at most, that are left each way.
+
+    Returns
+    -------
+    MappedShot
+    """
     height, width = shot.shape
     top, left = max(0, height - side) // 2, max(0, width - side) // 2
     here = slice(top, top + side), slice(left, left + side)

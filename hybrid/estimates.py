@@ -185,16 +185,20 @@ def choose_estimate(
         The noisy shot.
     own : ClassicalPreset
         Of our own estimate.
-    mode : str
-        Of OIDN, for "auto".
     kept : str, optional
         Where OIDN's pictures are kept, and taken from if they are there and would be made the same: a pattern or a
         folder. Where none are made, the reason says that none are kept.
+    mode : str
+        Of OIDN, for "auto".
     forced : str
         What the user has forced (`hybrid.plan.Rules.forced`), on which guides and fireflies depend: pictures are kept
         for that.
     quicker : callable, optional
         What "auto" has in the place of `hybrid.oidn.denoise_oidn`, with the same parameters.
+
+    Returns
+    -------
+    EstimateSource
 
     Raises
     ------
@@ -334,9 +338,21 @@ def _from_file(frame: Frame) -> Array | None:
 
 
 def estimate_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
-    """Run OIDN, or what stands for it, on a frame with what guides it has; `mode` as for `denoise_oidn`.
+    """Run OIDN, or what stands for it, on a frame with what guides it has.
 
-    Pixels that are not finite are replaced.
+    Parameters
+    ----------
+    frame : Frame
+        Pixels that are not finite are replaced.
+    denoise : callable, optional
+        What stands for `denoise_oidn`, with the same parameters.
+    **mode : object
+        As for `denoise_oidn`.
+
+    Returns
+    -------
+    (H, W, 3) array of float32
+        Linear radiance.
     """
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone

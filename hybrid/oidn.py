@@ -34,27 +34,39 @@ def denoise_oidn(
 
     Parameters
     ----------
-    color : (H, W, 3) array, linear radiance, finite; OIDN counts negative values as 0.
-    albedo : (H, W, 3) array in [0, 1] (OIDN clips the rest), or None.
-    normal : (H, W, 3) array in [−1, 1], any fixed space, or None; OIDN takes it only beside an albedo.
-    quality : "high", "balanced" or "fast".
-    prefilter : denoise albedo and normal with filters of their own first, of this quality, and declare them clean
+    color : (H, W, 3) array
+        Linear radiance, finite; OIDN counts negative values as 0.
+    albedo : (H, W, 3) array, optional
+        In [0, 1]; OIDN clips the rest.
+    normal : (H, W, 3) array, optional
+        In [−1, 1], in any fixed space. OIDN takes it only beside an albedo.
+    quality : str
+        "high", "balanced" or "fast".
+    prefilter : str, optional
+        Denoise albedo and normal with filters of their own first, of this quality, and declare them clean
         (``cleanAux``). With "high" this is OIDN's best mode and Blender's default, at seven times the cost; with
         "balanced" it takes four times, for pictures that are 0.07 dB worse (mean over 13 shots of 4 to 54 samples).
-    clean : declare albedo and normal clean as they are.
-    scale : what color is multiplied by before the network sees it; measured by OIDN if not given. Part of a frame
-        needs the whole frame's (`hybrid.alignment.transfer.autoexposure`).
-    threads : 0 leaves the choice to OIDN (all cores).
+    clean : bool
+        Whether albedo and normal are declared clean as they are.
+    scale : float, optional
+        What color is multiplied by before the network sees it; measured by OIDN if not given. Part of a frame needs the
+        whole frame's (`hybrid.alignment.transfer.autoexposure`).
+    threads : int
+        0 leaves the choice to OIDN (all cores).
 
     Returns
     -------
-    (H, W, 3) float32 array, linear radiance.
+    (H, W, 3) array of float32
+        Linear radiance.
 
     Raises
     ------
-    ImportError : pyoidn is not installed.
-    ValueError : shapes that differ, values that are not finite, an unknown quality, a normal alone.
-    RuntimeError : OIDN reported an error.
+    ImportError
+        If pyoidn is not installed.
+    ValueError
+        If shapes differ, values are not finite, the quality is unknown, or there is a normal alone.
+    RuntimeError
+        If OIDN reports an error.
 
     References
     ----------

@@ -104,7 +104,21 @@ class Plan:
 
 
 def as_run(plan: Plan, stages: Collection[str]) -> Plan:
-    """Say of the plan of a window what ran: where there are estimates the gate compares them in any case."""
+    """Say of the plan of a window what ran.
+
+    Where there are estimates the gate compares them in any case.
+
+    Parameters
+    ----------
+    plan : Plan
+        Of a window.
+    stages : collection of str
+        That ran.
+
+    Returns
+    -------
+    Plan
+    """
     words = "estimates are compared in any case; measured: "
     return Plan(
         tuple(

@@ -125,7 +125,19 @@ def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
 
 
 def divide(left: Picture, right: Picture, position: float) -> Picture:
-    """Two pictures (H, W, 3) as one, with a white divider at `position`, from 0, where only `right` is seen, to 1."""
+    """Put two pictures together, with a white divider between.
+
+    Parameters
+    ----------
+    left, right : (H, W, 3) array
+        Pictures, alike.
+    position : float
+        Of the divider, from 0, where only `right` is seen, to 1.
+
+    Returns
+    -------
+    (H, W, 3) array
+    """
     width = left.shape[1]
     column = round(position * width)
     whole = np.concatenate([left[:, :column], right[:, column:]], axis=1)

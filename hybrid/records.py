@@ -158,7 +158,20 @@ class Status:
 
 
 def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The records of a folder of frames, or of one sequence in it, oldest first; files that are none are left out."""
+    """Read the records of a folder of frames.
+
+    Parameters
+    ----------
+    folder : Path
+        Of frames.
+    name : str, optional
+        Of one sequence in it; all without.
+
+    Yields
+    ------
+    (Path, dict)
+        A record and what it holds, oldest first. Files that are none are left out.
+    """
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
         paths = [path for path in paths if path.stem.rpartition(".")[0] == (name or NAMELESS)]

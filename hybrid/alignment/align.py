@@ -679,7 +679,24 @@ def planes_written(layers: Layers) -> float:
 
 
 def planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
-    """Count the float32 planes of the flows that an `Aligner` keeps while windows slide over so many frames."""
+    """Count the float32 planes of the flows that an `Aligner` keeps.
+
+    Parameters
+    ----------
+    layers : Layers
+        Of the shot: whether they have vectors.
+    stages : collection of str
+        That may run.
+    frames : int
+        Over which windows slide.
+    radius : int
+        Of the windows.
+
+    Returns
+    -------
+    float
+        Planes of the size of a frame, of four bytes a pixel.
+    """
     if "warp" not in stages:
         return 0.0
     made = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)

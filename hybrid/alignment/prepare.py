@@ -192,9 +192,19 @@ def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -
 
 
 def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
-    """Flow between neighbouring frames as the renderer gave it, or None where it gave none.
+    """Give the flow between neighbouring frames as the renderer gave it.
 
-    Vectors span one frame; where only every n-th frame was rendered they are taken n times as long.
+    Parameters
+    ----------
+    here, there : PreparedFrame
+        Neighbours. Vectors span one frame; where only every n-th frame was rendered they are taken n times as long.
+
+    Returns
+    -------
+    flow : (H, W, 2) array
+        Pixels, from `here` to `there`. None, and no mask, where the renderer gave none.
+    valid : (H, W) array of bool
+        True where it is known.
     """
     step = abs(there.number - here.number)
     forward = there.number > here.number

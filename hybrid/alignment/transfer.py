@@ -38,7 +38,20 @@ def demodulate(radiance: Array, albedo: Array) -> Array:
 
 
 def remodulate(irradiance: Array, albedo: Array) -> Array:
-    """Inverse of `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``."""
+    """Inverse of `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``.
+
+    Parameters
+    ----------
+    irradiance : (H, W, C) array
+        From `demodulate`.
+    albedo : (H, W, 3) array
+        In [0, 1]; its mean where C is not 3.
+
+    Returns
+    -------
+    (H, W, C) array
+        Linear radiance.
+    """
     return irradiance * _divisor(albedo, irradiance.shape[-1])
 
 
@@ -49,14 +62,44 @@ def _divisor(albedo: Array, channels: int) -> Array:
 
 
 def compress(radiance: Array, exposure: float) -> Array:
-    """Map [0, inf) to [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure`` (Reinhard et al. 2002, eq. 3)."""
+    """Map [0, inf) to [0, 1).
+
+    Parameters
+    ----------
+    radiance : (...) array
+        Linear radiance; negative values count as 0.
+    exposure : float
+        Radiance that becomes 1/2.
+
+    Returns
+    -------
+    (...) array of float32
+        In [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure``.
+
+    References
+    ----------
+    Reinhard et al. 2002, doi:10.1145/566654.566575, eq. 3
+    """
     light = np.asarray(np.maximum(radiance, 0), np.float32)
     # Not x / (1 + x): a spark over next to no exposure would be infinite.
     return light / (light + np.float32(exposure))
 
 
 def expand(compressed: Array, exposure: float) -> Array:
-    """Inverse of `compress`."""
+    """Inverse of `compress`.
+
+    Parameters
+    ----------
+    compressed : (...) array
+        In [0, 1), from `compress`.
+    exposure : float
+        The same.
+
+    Returns
+    -------
+    (...) array
+        Linear radiance.
+    """
     return compressed / (1 - compressed) * np.float32(exposure)
 
 

@@ -100,9 +100,21 @@ def families(results: Sequence[MethodResult]) -> list[str]:
 
 
 def lay_out(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> Chart | None:
-    """Lay out the chart of a metric against a cost; None where no method has a finite figure.
+    """Lay out the chart of a metric against a cost.
 
-    The cost axis is logarithmic. Better is always up, so the axis of an error points down.
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        Those without the figure are left out.
+    metric : Metric
+        Up the chart: better is always up, so the axis of an error points down.
+    cost : str
+        One of `COSTS`, across the chart, logarithmic.
+
+    Returns
+    -------
+    Chart, optional
+        None where no method has a finite figure.
     """
     drawn = [r for r in results if metric.key in r.metrics and math.isfinite(r.metrics[metric.key].mean)]
     if metric.logarithmic:
@@ -302,7 +314,20 @@ def to_svg(chart: Chart) -> Markup:
 
 
 def marker(family: int, size: float = RADIUS) -> str:
-    """The corners of a family's marker around the origin, as the points of an SVG polygon."""
+    """Give the corners of a family's marker around the origin.
+
+    Parameters
+    ----------
+    family : int
+        Index of the family.
+    size : float
+        Radius, in units of the chart.
+
+    Returns
+    -------
+    str
+        The points of an SVG polygon.
+    """
     return " ".join(f"{x * size:.2f},{y * size:.2f}" for x, y in SHAPES[family % len(SHAPES)])
 
 

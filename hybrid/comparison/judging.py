@@ -228,7 +228,17 @@ def _level(error: float | np.floating) -> str:
 
 
 def store_reference(store: FrameStore, halves: Sequence[Shot], numbers: Sequence[int]) -> None:
-    """Keep the reference of every frame: the mean of its halves, and the halves where there are two."""
+    """Keep the reference of every frame: the mean of its halves, and the halves where there are two.
+
+    Parameters
+    ----------
+    store : FrameStore
+        Where it is kept.
+    halves : sequence of Shot
+        One reference, or two independent ones.
+    numbers : sequence of int
+        Of the frames.
+    """
     for number in numbers:
         images = [half.read(number).color for half in halves]
         store.save(REFERENCE, number, np.mean(images, axis=0))
@@ -238,7 +248,22 @@ def store_reference(store: FrameStore, halves: Sequence[Shot], numbers: Sequence
 
 
 def store_flows(store: FrameStore, shot: Shot, numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Keep flow and validity of the pairs of neighbouring frames, once for all methods; name the pairs."""
+    """Keep flow and validity of the pairs of neighbouring frames, once for all methods.
+
+    Parameters
+    ----------
+    store : FrameStore
+        Where they are kept.
+    shot : Shot
+        Whose vectors lead from frame to frame.
+    numbers : sequence of int
+        Of the frames.
+
+    Returns
+    -------
+    list of (int, int)
+        The pairs that have a flow.
+    """
     pairs = []
     for a, b in pairwise(numbers):
         motion = motion_between(shot.read(a), shot.read(b)) if b == a + 1 else None

@@ -42,15 +42,23 @@ class Method:
 
     Attributes
     ----------
-    run : from a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process: a module's
+    run : callable
+        From a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process: a module's
         function, or a `functools.partial` of one. An `ImportError` lists it as absent.
-    family : what the chart draws alike.
-    maps : from a shot to (number, (H, W) maps in [0, 1] by title), to be looked at.
-    cost : seconds where they are not measured: 0 for what is there anyway, None where they are not known.
-    threads : how many the method may use; 0 leaves it to the machine.
-    given : the frames, where another denoiser has left them in files: they can be checked before anything runs.
-    settings : what the report tells of it; in a sweep, what differs from `base`.
-    sweep, base : what is varied, and the method that is varied.
+    family : str
+        What the chart draws alike.
+    maps : callable, optional
+        From a shot to (number, (H, W) maps in [0, 1] by title), to be looked at.
+    cost : float, optional
+        Seconds where they are not measured: 0 for what is there anyway, None where they are not known. NaN: measured.
+    threads : int
+        How many the method may use; 0 leaves it to the machine.
+    given : Shot, optional
+        The frames, where another denoiser has left them in files: they can be checked before anything runs.
+    settings : mapping of str to object
+        What the report tells of it; in a sweep, what differs from `base`.
+    sweep, base : str
+        What is varied, and the method that is varied.
     """
 
     run: Run
@@ -79,7 +87,20 @@ def noisy(shot: Shot) -> Iterator[tuple[int, Array]]:
 
 
 def finished(shot: Shot, *, other: Shot) -> Iterator[tuple[int, Array]]:
-    """The frames that another denoiser has left in files, as they are."""
+    """The frames that another denoiser has left in files, as they are.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    other : Shot
+        The finished frames.
+
+    Yields
+    ------
+    (int, (H, W, 3) array)
+        Number and linear radiance of each frame.
+    """
     for number in shot.numbers:
         if other.has(number):
             yield number, other.read(number).color
@@ -125,7 +146,22 @@ def _windows(
 
 
 def classical(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[tuple[int, Array]]:
-    """An estimate of every aligned window without a network; the rest goes to `_windows`."""
+    """Make an estimate of every aligned window without a network.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    denoise : callable
+        From an `AlignedWindow` to (H, W, 3) radiance.
+    **window : object
+        Settings of `_windows`, by name.
+
+    Yields
+    ------
+    (int, (H, W, 3) array)
+        Number and linear radiance of each frame.
+    """
     for aligned in _windows(shot, **window):
         yield aligned.number, denoise(aligned)
 
@@ -151,20 +187,71 @@ def _denoiser(preset: str, tile: int, precision: str, threshold: float | None) -
 def network(
     shot: Shot, *, preset: str, tile: int = 640, precision: str = "auto", threshold: float | None = None, **window: Any
 ) -> Iterator[tuple[int, Array]]:
-    """A network with the weights of a preset; the rest goes to `_windows`."""
+    """Run a network with the weights of a preset.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    preset : str
+        Whose weights it takes.
+    tile : int
+        Pixels on a side of what it works on at a time.
+    precision : str
+        Of its convolutions, as for `Denoiser`.
+    threshold : float, optional
+        Of its kernels, in units of 1/K; the weights' own without.
+    **window : object
+        Settings of `_windows`, by name.
+
+    Yields
+    ------
+    (int, (H, W, 3) array)
+        Number and linear radiance of each frame.
+    """
     denoiser = _denoiser(preset, tile, precision, threshold)
     for aligned in _windows(shot, radius=denoiser.radius, **window):
         yield aligned.number, denoiser(aligned).color
 
 
 def classical_maps(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
-    """Confidence, and temporal contribution of a classical estimate."""
+    """Map the confidence, and the temporal contribution to a classical estimate.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    denoise : callable
+        From an `AlignedWindow` to (H, W, 3) radiance.
+    **window : object
+        Settings of `_windows`, by name.
+
+    Yields
+    ------
+    (int, dict of str to (H, W) array)
+        Number and `window_maps` of each frame.
+    """
     for aligned in _windows(shot, **window):
         yield aligned.number, window_maps(aligned, denoise)
 
 
 def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
-    """The same of a network."""
+    """Map the confidence, and the temporal contribution to what a network gives.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    preset : str
+        Whose weights the network takes.
+    **window : object
+        Settings of `_windows`, by name.
+
+    Yields
+    ------
+    (int, dict of str to (H, W) array)
+        Number and `window_maps` of each frame.
+    """
     denoiser = _denoiser(preset, 640, "float32", None)  # the difference of two runs must not be rounding
     for aligned in _windows(shot, radius=denoiser.radius, **window):
         yield aligned.number, window_maps(aligned, lambda seen: denoiser(seen).color)
@@ -175,13 +262,16 @@ def window_maps(aligned: AlignedWindow, denoise: DenoiseWindow) -> dict[str, Arr
 
     Parameters
     ----------
-    aligned : of at least three frames.
-    denoise : from the window to (H, W, 3) radiance.
+    aligned : AlignedWindow
+        Of at least three frames.
+    denoise : callable
+        From the window to (H, W, 3) radiance.
 
     Returns
     -------
-    "Confidence": (H, W), the mean of the other frames' confidence; "Temporal contribution": (H, W), the share of the
-    result that comes from the other frames, both in [0, 1].
+    dict of str to (H, W) array
+        "Confidence": the mean of the other frames' confidence; "Temporal contribution": the share of the result that
+        comes from the other frames. Both in [0, 1].
 
     Notes
     -----
@@ -209,7 +299,20 @@ def window_maps(aligned: AlignedWindow, denoise: DenoiseWindow) -> dict[str, Arr
 
 
 def oidn(shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:
-    """OIDN on each frame by itself."""
+    """Run OIDN on each frame by itself.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy shot.
+    quality, prefilter : str
+        As for `denoise_oidn`.
+
+    Yields
+    ------
+    (int, (H, W, 3) array)
+        Number and linear radiance of each frame.
+    """
     for number in shot.numbers:
         yield number, estimate_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 

@@ -291,7 +291,24 @@ def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: 
 
 
 def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) -> float:
-    """Mean of the shots' means; `shots` tells how many of the values belong to each, all to one without."""
+    """Average the means of the shots.
+
+    Parameters
+    ----------
+    values : sequence of float
+        One per frame.
+    shots : sequence of int
+        How many of the values belong to each shot; all to one without.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError
+        If `shots` do not add up to the values.
+    """
     data = np.asarray(values, np.float64)
     return float(np.mean([part.mean() for part in _by_shot(data, shots)]))
 

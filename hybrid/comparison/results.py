@@ -154,8 +154,19 @@ def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
 
     Parameters
     ----------
-    values : N ≥ 1 figures, one per frame.
-    shots : how many of them belong to each shot, if to several. The mean is then that of the shots' means.
+    values : sequence of float
+        N ≥ 1 figures, one per frame.
+    shots : sequence of int
+        How many of them belong to each shot, if to several. The mean is then that of the shots' means.
+
+    Returns
+    -------
+    Statistic
+
+    Raises
+    ------
+    ValueError
+        If there are no values.
     """
     if len(values) == 0:
         raise ValueError("values must hold at least one frame, is empty")
@@ -173,8 +184,16 @@ def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
 def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
     """Put the results of several shots together: the methods that none of them lacks, points of sweeps left out.
 
-    Figures are means over shots, their intervals over frames and shots. Costs are means too (that of memory the
-    maximum), since shots call for different stages; worth is the geometric mean.
+    Parameters
+    ----------
+    comparisons : sequence of Comparison
+        Of the shots.
+
+    Returns
+    -------
+    list of MethodResult
+        Figures are means over shots, their intervals over frames and shots. Costs are means too (that of memory the
+        maximum), since shots call for different stages; worth is the geometric mean.
     """
     tables = [{r.name: r for r in c.results if r.absent_reason is None and not r.sweep} for c in comparisons]
     joined = []
@@ -208,10 +227,19 @@ def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
 def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
     """Name the best method by a measure, and those that cannot be told from it.
 
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        In any order.
+    metric : Metric
+        The measure.
+
     Returns
     -------
-    (best, ties)
-        The best mean, None where no method has one; the names whose difference to it is a tie.
+    best : str, optional
+        The best mean's; None where no method has one.
+    ties : set of str
+        Those whose difference to it is a tie.
 
     Notes
     -----
@@ -229,7 +257,18 @@ def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str 
 def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
     """Name the methods that no other beats at the same cost or less, by rising cost.
 
-    Methods whose cost is not known, or whose measure is not finite, are left out.
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        Those whose cost is not known, or whose measure is not finite, are left out.
+    metric : Metric
+        The measure.
+    cost : str
+        One of `COSTS`.
+
+    Returns
+    -------
+    list of str
     """
     points = [
         (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
@@ -261,7 +300,18 @@ class StageValue:
 
 
 def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
-    """What each stage buys and costs by the sweep named "Stages"; empty without one."""
+    """Find what each stage buys and costs.
+
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        With the points of a sweep named "Stages".
+
+    Returns
+    -------
+    list of StageValue
+        Empty without such a sweep.
+    """
     by_name = {r.name: r for r in results if r.absent_reason is None}
     values = []
     for variant in by_name.values():
@@ -302,7 +352,19 @@ def _tied(a: Statistic, b: Statistic) -> bool:
 
 
 def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list[Metric]:
-    """Return those of the metrics that at least one result has."""
+    """Return those of the metrics that at least one result has.
+
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        In any order.
+    metrics : sequence of Metric
+        Those to look for.
+
+    Returns
+    -------
+    list of Metric
+    """
     return [m for m in metrics if any(m.key in r.metrics for r in results)]
 
 
@@ -348,7 +410,20 @@ def to_plain_numbers(value: object) -> object:
 
 
 def to_json(document: object, indent: int | None = None) -> str:
-    """JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read."""
+    """Write JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read.
+
+    Parameters
+    ----------
+    document : object
+        Dicts, lists, text and numbers.
+    indent : int, optional
+        Spaces of a level; all on one line without.
+
+    Returns
+    -------
+    str
+        JSON.
+    """
     return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -363,6 +438,16 @@ def is_comparison(path: Path) -> bool:
 
 def read_comparison(path: Path) -> Comparison:
     """Read the ``results.json`` that `hybrid.comparison.report.write_report` has left.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Comparison
+        Settings as text.
 
     Raises
     ------

@@ -52,6 +52,18 @@ def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 
     The process is forked from a server and not from this one, whose peak memory Linux would count as its own.
 
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that it can travel.
+    *args, **kwargs : object
+        Its own.
+
+    Returns
+    -------
+    object
+        What it returns.
+
     Raises
     ------
     BrokenProcessPool

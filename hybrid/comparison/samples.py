@@ -19,9 +19,12 @@ class NoiseLaw:
 
     Attributes
     ----------
-    levels : (samples, error) pairs by rising samples; the first samples need not be the shot's own.
-    samples : those of the shot that was denoised.
-    floor : the reference's own part in every measured error, taken off by `worth`; 0 where halves did that.
+    levels : tuple of (float, float)
+        (samples, error) pairs by rising samples; the first samples need not be the shot's own.
+    samples : float
+        Those of the shot that was denoised.
+    floor : float
+        The reference's own part in every measured error, taken off by `worth`; 0 where halves did that.
     """
 
     levels: tuple[tuple[float, float], ...]
@@ -69,14 +72,37 @@ class NoiseLaw:
 
 
 def reference_floor(error: float, samples: float, reference_samples: float) -> float:
-    """The reference's part a/m in a measured error a/n + a/m, n and m being the samples of the two renders."""
+    """Find the reference's part in a measured error.
+
+    Parameters
+    ----------
+    error : float
+        Measured mean squared error a/n + a/m.
+    samples : float
+        n, of the render that is judged.
+    reference_samples : float
+        m, of the reference.
+
+    Returns
+    -------
+    float
+        a/m.
+    """
     return error * samples / (samples + reference_samples)
 
 
 def fit_floor(levels: Sequence[tuple[float, float]]) -> float:
-    """The constant b ≥ 0 of errors a/n + b, from two or more levels: what a reference of unknown samples adds.
+    """Find what a reference of unknown samples adds to every error.
 
-    Relative residuals are fitted, so that the noisiest level does not decide alone.
+    Parameters
+    ----------
+    levels : sequence of (float, float)
+        Two or more pairs of samples n and error a/n + b.
+
+    Returns
+    -------
+    float
+        b ≥ 0. Relative residuals are fitted, so that the noisiest level does not decide alone.
     """
     n, e = np.transpose(np.asarray(levels, np.float64))
     matrix = np.stack([1 / n, np.ones_like(n)], axis=1) / e[:, None]

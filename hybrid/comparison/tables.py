@@ -29,7 +29,19 @@ from hybrid.comparison.results import (
 
 
 def format_value(value: float, metric: Metric) -> str:
-    """Print a figure as its metric asks for, "–" for NaN."""
+    """Print a figure as its metric asks for, "–" for NaN.
+
+    Parameters
+    ----------
+    value : float
+        The figure.
+    metric : Metric
+        Which says how many digits.
+
+    Returns
+    -------
+    str
+    """
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
     text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
@@ -37,7 +49,19 @@ def format_value(value: float, metric: Metric) -> str:
 
 
 def format_change(value: float, metric: Metric) -> str:
-    """Print a difference of two figures, with its sign."""
+    """Print a difference of two figures, with its sign.
+
+    Parameters
+    ----------
+    value : float
+        The difference.
+    metric : Metric
+        Of the figures.
+
+    Returns
+    -------
+    str
+    """
     text = format_value(value, metric)
     return f"+{text}" if value > 0 else text
 

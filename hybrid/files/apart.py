@@ -60,7 +60,18 @@ def names_sequence(value: str) -> bool:
 
 
 def open_apart(role: str, value: str) -> Apart:
-    """Find the sequence that the user names for a layer, ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
+    """Find the sequence that the user names for a layer.
+
+    Parameters
+    ----------
+    role : str
+        Of the layer.
+    value : str
+        ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
+
+    Returns
+    -------
+    Apart
 
     Raises
     ------
@@ -105,11 +116,17 @@ def find_companions(files: Mapping[int, Path]) -> tuple[Profile | None, list[Apa
 
 
 def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] | None:
-    """A shot that lies in a folder as a sequence, or a folder, for each AOV, known by their names.
+    """Gather a shot that lies in a folder as a sequence, or a folder, for each AOV, known by their names.
+
+    Parameters
+    ----------
+    folder : Path
+        Of files.
 
     Returns
     -------
-    None where no sequence is known as the color by its name, else its files, whose names they are, and the others.
+    tuple of dict, Profile and list of Apart, optional
+        Its files, whose names they are, and the others. None where no sequence is known as the color by its name.
 
     Raises
     ------

@@ -665,8 +665,20 @@ def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list
 def open_beside(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
     """Open another sequence of the frames of a shot: a reference, or what another denoiser has made.
 
-    Where its own layers leave a choice, as between two view layers, the choice made for the shot holds for it too.
-    Parameters and errors are those of `open_shot`.
+    Errors are those of `open_shot`.
+
+    Parameters
+    ----------
+    spec : str or Path
+        As for `open_shot`.
+    shot : Shot
+        Where the other's own layers leave a choice, as between two view layers, the choice made for this one holds.
+    frames : str, optional
+        As for `open_shot`.
+
+    Returns
+    -------
+    Shot
     """
     opened = open_shot(spec, frames=frames, keep=0)
     with suppress(ExrError):

@@ -164,7 +164,23 @@ def find_layers(
 
 
 def fit_alone(image: ExrImage, role: str, name: str | None, profile: Profile) -> Layer:
-    """The layer of a file that is there for one role: the one with this name, with one of the role's, or that fits.
+    """Find the layer of a file that is there for one role.
+
+    Parameters
+    ----------
+    image : ExrImage
+        The file.
+    role : str
+        What it is there for.
+    name : str, optional
+        Of the layer.
+    profile : Profile
+        Of the renderer, with the names of the role.
+
+    Returns
+    -------
+    Layer
+        The one with this name, with one of the role's, or that fits.
 
     Raises
     ------
@@ -189,7 +205,18 @@ def _fit_file(image: ExrImage, role: str, layer: Layer) -> Layer | None:
 
 
 def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
-    """The colors of all the pictures in a file: of each stereo view, of each of its view layers.
+    """Find the colors of all the pictures in a file: of each stereo view, of each of its view layers.
+
+    Parameters
+    ----------
+    image : ExrImage
+        The file.
+    profile : Profile
+        Of the renderer.
+
+    Returns
+    -------
+    list of Layer
 
     Raises
     ------

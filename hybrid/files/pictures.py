@@ -21,7 +21,15 @@ def encode_srgb(linear: NDArray[Any]) -> Array:
 
 
 def write_png(path: Path, picture: NDArray[Any]) -> None:
-    """Write (H, W, 3), encoded, in [0, 1], with 8 bits; as a whole or not at all, and make the folder."""
+    """Write a picture with 8 bits, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file. Its folder is made.
+    picture : (H, W, 3) array
+        Encoded, in [0, 1].
+    """
     _, data = cv2.imencode(".png", np.round(picture[..., ::-1] * 255).astype(np.uint8))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, data.tobytes())

@@ -117,7 +117,17 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file as a whole or not at all, text as UTF-8; errors are those of `replace_file`."""
+    """Write a file whole or not at all.
+
+    Errors are those of `replace_file`.
+
+    Parameters
+    ----------
+    path : Path
+        The file to be written, in a folder that exists.
+    content : str or bytes
+        Text is written as UTF-8.
+    """
     with replace_file(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 

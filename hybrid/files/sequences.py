@@ -161,7 +161,20 @@ def find_views(spec: str) -> list[str]:
 
 
 def name_view(text: str, view: str) -> str:
-    """A pattern with the name of a view for %V, and its first letter for %v."""
+    """Put the name of a view into a pattern.
+
+    Parameters
+    ----------
+    text : str
+        A pattern.
+    view : str
+        The name of the view.
+
+    Returns
+    -------
+    str
+        The pattern with the name for %V, and its first letter for %v.
+    """
     return text.replace("%V", view).replace("%v", view[0])
 
 
@@ -235,9 +248,20 @@ def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
 
 
 def name_holes(numbers: Iterable[int], step: int) -> str:
-    """The frames that are not there between those that are, `step` apart, in words; "" where all are.
+    """Name the frames that are not there between those that are.
 
-    Only their ends are looked at: between two files that dates have numbered lie millions.
+    Parameters
+    ----------
+    numbers : iterable of int
+        Of the frames that are there.
+    step : int
+        From one to the next.
+
+    Returns
+    -------
+    str
+        "" where none are missing. Only the ends of holes are looked at: between two files that dates have numbered lie
+        millions.
     """
     holes = [range(a + step, b, step) for a, b in pairwise(sorted(numbers)) if b - a > step]
     names = [f"{h[0]}-{h[-1]}{f'x{step}' if step > 1 else ''}" if len(h) > 1 else f"{h[0]}" for h in holes]

@@ -231,7 +231,26 @@ def _pad(window: Array, multiple: int) -> Array:
 def tiles(
     rows: slice, height: int, width: int, tile: int, halo: int, multiple: int
 ) -> Iterator[tuple[Block, Block, Block]]:
-    """Cover some rows: where each tile's result goes, what it is computed from, and where in that the result is."""
+    """Cover some rows of an image with tiles.
+
+    Parameters
+    ----------
+    rows : slice
+        To be covered.
+    height, width : int
+        Of the image.
+    tile : int
+        Pixels on a side of a tile, rounded up to `multiple`.
+    halo : int
+        Pixels around a tile that its result depends on, rounded up to `multiple`.
+    multiple : int
+        Where tiles may start, so that each samples its coarse scales where the whole image would.
+
+    Yields
+    ------
+    tuple of three pairs of slices
+        Where a tile's result goes, what it is computed from, and where in that the result is.
+    """
     # The halo starts on a multiple, so that every tile samples its coarse scales where the whole image would.
     halo = -(-halo // multiple) * multiple
     tile = -(-tile // multiple) * multiple

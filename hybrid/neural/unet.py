@@ -33,8 +33,17 @@ def denoise_unet(
 ) -> Array:
     """Denoise one frame with OIDN's networks in bfloat16, 64 to 66 dB from OIDN's own picture.
 
-    Parameters and result are those of `hybrid.oidn.denoise_oidn`. Where its weights are not found it raises as
-    `network.trunk.load_oidn`; see `has_unet`.
+    Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
+
+    Parameters
+    ----------
+    color, albedo, normal, quality, prefilter, clean
+        As for `hybrid.oidn.denoise_oidn`.
+
+    Returns
+    -------
+    (H, W, 3) array of float32
+        Linear radiance.
     """
     layers = [_tensor(layer) for layer in (color, albedo, normal) if layer is not None]
     if prefilter is not None and albedo is not None:

@@ -42,6 +42,15 @@ def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
     Passes are chosen here, once: in Blender 5.0.1 a change of passes between two renders with persistent data
     leaves meshes with the wrong attributes, and pictures 5 to 15 % too bright or dark. The same care for motion
     blur, which goes on and off within a frame: without persistent data there.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    settings : dict of str to object
+        As for `apply`.
+    threads : int
+        That Cycles may use.
     """
     render, layer, cycles = scene.render, scene.view_layers[0], scene.cycles
     render.engine = "CYCLES"
@@ -64,7 +73,15 @@ def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
 
 
 def apply(scene: Any, settings: dict[str, Any]) -> None:
-    """Set properties named `cycles.x`, `render.x`, `layer.x`, `camera.x` or `world.x`."""
+    """Set properties named `cycles.x`, `render.x`, `layer.x`, `camera.x` or `world.x`.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    settings : dict of str to object
+        Values by name.
+    """
     roots = {"layer": scene.view_layers[0], "camera": scene.camera.data, "world": scene.world}
     for name, value in settings.items():
         root, *path, last = name.split(".")
@@ -77,7 +94,21 @@ def apply(scene: Any, settings: dict[str, Any]) -> None:
 
 
 def render_frame(scene: Any, path: Path, samples: int, seed: int, subset: tuple[int, int] | None = None) -> None:
-    """Render the scene's current frame to `path`; of its samples, only `subset` (offset, length) if given."""
+    """Render the scene's current frame to `path`; of its samples, only `subset` (offset, length) if given.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    path : Path
+        Of the file.
+    samples : int
+        Per pixel, of the whole frame.
+    seed : int
+        Of everything random.
+    subset : (int, int), optional
+        Offset and length of those that are rendered; all without.
+    """
     scene.cycles.samples, scene.cycles.seed = samples, seed
     scene.cycles.use_sample_subset = subset is not None
     if subset is not None:
@@ -93,7 +124,24 @@ def read_channels(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) -> dict[str, np.ndarray]:
-    """Render a pilot, at a scale at which the rendered region has about `PILOT_PIXELS`, with all passes."""
+    """Render a pilot, at a scale at which the rendered region has about `PILOT_PIXELS`, with all passes.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    settings : dict of str to object
+        As for `configure`.
+    samples : int
+        Per pixel.
+    seed : int
+        Of everything random.
+
+    Returns
+    -------
+    dict of str to array
+        Passes by name.
+    """
     render = scene.render
     fraction = 1.0
     if render.use_border:
@@ -116,7 +164,24 @@ def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) 
 
 
 def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) -> np.ndarray:
-    """Return small, quick pictures of some frames, one under the other: (H, W, 3) linear radiance."""
+    """Return small, quick pictures of some frames, one under the other: (H, W, 3) linear radiance.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    frames : list of int
+        Of the shot.
+    settings : dict of str to object
+        As for `configure`.
+    seed : int
+        Of everything random.
+
+    Returns
+    -------
+    (H, W, 3) array
+        Linear radiance, the frames one under the other.
+    """
     pictures = []
     for frame in frames:
         scene.frame_set(frame)
@@ -125,7 +190,22 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
 
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
-    """Make the scene of a shot in Blender, ready to be planned, and return its description."""
+    """Make the scene of a shot in Blender, ready to be planned, and return its description.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    attempt : int
+        Which of the shots of one seed.
+    threads : int
+        That Cycles may use.
+
+    Returns
+    -------
+    dict
+        Its description.
+    """
     if shot.scene in RANDOM:
         description = scenes.random_shot(shot, attempt)
     elif shot.scene.partition(":")[0] in FIXED:
@@ -143,6 +223,18 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
 
     A random shot that shows next to nothing is drawn again, and its exposure is chosen here: the geometric mean of
     the picture is put some stops around middle grey, since nobody lights a film by drawing watts.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    threads : int
+        That Cycles may use.
+
+    Returns
+    -------
+    dict
+        Description, facts, decisions and settings, for `meta.json`.
     """
     started = time.perf_counter()
     middle = shot.frames[len(shot.frames) // 2]
@@ -189,7 +281,21 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
 
 
 def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
-    """Render the current frame to `path`, with half buffers and an unblurred guide pass where called for."""
+    """Render the current frame to `path`, with half buffers and an unblurred guide pass where called for.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    shot : ShotSettings
+        What is asked for.
+    path : Path
+        Of the file.
+    samples : int
+        Per pixel.
+    seed : int
+        Of everything random.
+    """
     partial = _new_partial(path)
     try:
         if shot.halves:
@@ -231,7 +337,19 @@ def _new_partial(path: Path) -> Path:
 
 
 def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -> None:
-    """Render two independent halves of the reference, and their mean; of all only the colour is kept."""
+    """Render two independent halves of the reference, and their mean; of all only the colour is kept.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    shot : ShotSettings
+        What is asked for.
+    folder : Path
+        Where it goes.
+    frame : int
+        Its number.
+    """
     halves, half = [], max(shot.reference // 2, 1)
     for name in ("reference_a", "reference_b"):
         path = folder / f"{name}.{frame:04d}.exr"

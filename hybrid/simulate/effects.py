@@ -200,7 +200,20 @@ def _counted(effect: str, count: int, what: str, off: dict[str, Any]) -> Decisio
 
 
 def settings_of(decisions: Iterable[Decision], base: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return the Cycles settings that `decisions` ask for, over `base` (everything on)."""
+    """Return the Cycles settings that `decisions` ask for, over `base` (everything on).
+
+    Parameters
+    ----------
+    decisions : iterable of Decision
+        What the scene calls for.
+    base : dict, optional
+        What they change; everything on without.
+
+    Returns
+    -------
+    dict of str to object
+        Settings of Cycles by name.
+    """
     settings = dict(EVERYTHING if base is None else base)
     for decision in decisions:
         settings.update(decision.settings)
@@ -441,6 +454,20 @@ def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[An
     """Return where a grid of camera rays over the rendered region meets the scene, and which object it is.
 
     Blender's rays meet surfaces; hair they pass.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    across : int
+        Rays in a row.
+    down : int
+        Rows.
+
+    Returns
+    -------
+    list of (Vector, Object)
+        Where a ray meets the scene, in metres, and what it meets.
     """
     import bpy
 
@@ -465,7 +492,20 @@ def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[An
 
 
 def film_pixel(scene: Any, position: Any) -> np.ndarray:
-    """Return where a point in the world lies in the whole picture, in pixels; nan if behind the camera."""
+    """Return where a point in the world lies in the whole picture, in pixels; nan if behind the camera.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    position : Vector
+        In the world, in metres.
+
+    Returns
+    -------
+    (2,) array
+        Pixels, x right and y down; NaN behind the camera.
+    """
     from bpy_extras.object_utils import world_to_camera_view
 
     render = scene.render
@@ -480,6 +520,20 @@ def point_motion(scene: Any, frame: int, step: int = 1) -> np.ndarray:
     """Return how far what the camera sees at `frame` moves until `frame + step`: (N,) pixels.
 
     Points are carried by their objects' transforms; what deforms inside an object is not seen by this.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    frame : int
+        Where it begins.
+    step : int
+        Frames until it ends.
+
+    Returns
+    -------
+    (N,) array
+        Pixels.
     """
     scene.frame_set(frame)
     points = visible_points(scene)

@@ -44,7 +44,17 @@ WARM, COOL = (1.0, 0.62, 0.3), (0.62, 0.78, 1.0)
 
 
 def sky(name: str, strength: float, turn: float = 0.0) -> None:
-    """Light the scene by one of Blender's images of the sky."""
+    """Light the scene by one of Blender's images of the sky.
+
+    Parameters
+    ----------
+    name : str
+        Of the image.
+    strength : float
+        Factor on its light.
+    turn : float
+        Radians around z.
+    """
     scene = bpy.context.scene
     scene.world = bpy.data.worlds.new("world")
     scene.world.use_nodes = True
@@ -67,7 +77,23 @@ def dark() -> None:
 
 
 def swing(item: Any, frames: range, axis: str, reach: float, rate: float, phase: float = 0.0) -> None:
-    """Key a pendulum's turn around its origin: `reach` radians to each side, `rate` radians of phase a frame."""
+    """Key a pendulum's turn around its origin: `reach` radians to each side, `rate` radians of phase a frame.
+
+    Parameters
+    ----------
+    item : bpy.types.Object
+        What is meant.
+    frames : range
+        Of the shot.
+    axis : str
+        x, y or z.
+    reach : float
+        Radians to each side.
+    rate : float
+        Radians of phase a frame.
+    phase : float
+        Radians at the first frame.
+    """
     rest = getattr(item.rotation_euler, axis)
     for frame in frames:
         setattr(item.rotation_euler, axis, rest + reach * math.sin(phase + rate * (frame - frames[len(frames) // 2])))
@@ -75,7 +101,28 @@ def swing(item: Any, frames: range, axis: str, reach: float, rate: float, phase:
 
 
 def twig(rng: Rng, leaves: int, length: float, surface: Any, stem: Any, size: float) -> Any:
-    """Add a twig along x with leaves on both sides; return its stem, which the leaves go with."""
+    """Add a twig along x with leaves on both sides; return its stem, which the leaves go with.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    leaves : int
+        How many.
+    length : float
+        Metres.
+    surface : bpy.types.Material
+        Of the leaves.
+    stem : bpy.types.Material
+        What the stem is made of.
+    size : float
+        Of a leaf, in metres.
+
+    Returns
+    -------
+    bpy.types.Object
+        The stem, which the leaves go with.
+    """
     bend = [(length * t, 0, 0.08 * length * math.sin(2.5 * t)) for t in np.linspace(0, 1, 6)]
     made = wire(bend, 0.012 * size + 0.0008, stem, "twig")
     for k in range(leaves):
@@ -88,7 +135,15 @@ def twig(rng: Rng, leaves: int, length: float, surface: Any, stem: Any, size: fl
 
 
 def lens(rng: Rng, frames: range) -> None:
-    """Build a café table at dusk: a top that spins in focus, a marble that rolls through it, lights far behind."""
+    """Build a café table at dusk: a top that spins in focus, a marble that rolls through it, lights far behind.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     sky("night", 0.6, 1.0)
     boards = [wood(light=(0.34 * f, 0.17 * f, 0.07 * f)) for f in (0.7, 1.0, 0.85, 1.15)]
     for k in range(-4, 5):
@@ -176,7 +231,15 @@ def lens(rng: Rng, frames: range) -> None:
 
 
 def closeup(rng: Rng, frames: range) -> None:
-    """Build a close-up: a furry animal that turns its head, cut glass, and the wheels of a clockwork."""
+    """Build a close-up: a furry animal that turns its head, cut glass, and the wheels of a clockwork.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     sky("courtyard", 0.35, 2.2)
     leather = two_tone("leather", (0.05, 0.02, 0.012), (0.13, 0.05, 0.028), scale=300, detail=1, bump=0.0004,
                        roughness=(0.35, 0.6))  # fmt: skip
@@ -257,7 +320,15 @@ def closeup(rng: Rng, frames: range) -> None:
 
 
 def lamps(rng: Rng, frames: range) -> None:
-    """Build a bar at night: shelves of bottles in front of a mirror, lit by many small lamps; the camera pans."""
+    """Build a bar at night: shelves of bottles in front of a mirror, lit by many small lamps; the camera pans.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     dark()
     timber, oak = wood((0.03, 0.012, 0.006), (0.12, 0.05, 0.022)), wood()
     paper = two_tone("paper", (0.16, 0.035, 0.03), (0.34, 0.11, 0.075), scale=26, distortion=1.5, edges=(0.45, 0.5))
@@ -326,7 +397,15 @@ def lamps(rng: Rng, frames: range) -> None:
 
 
 def shadow(rng: Rng, frames: range) -> None:
-    """Build a sunlit corner: the light of a window wanders over wall and things, leaves sway and a clock swings."""
+    """Build a sunlit corner: the light of a window wanders over wall and things, leaves sway and a clock swings.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     sky("courtyard", 2.0, 0.6)
     plaster = two_tone("plaster", (0.62, 0.55, 0.44), (0.72, 0.66, 0.55), scale=14, bump=0.0012, Roughness=0.9,
                        roughness=(0.8, 0.95))  # fmt: skip
@@ -397,7 +476,15 @@ def shadow(rng: Rng, frames: range) -> None:
 
 
 def volume(rng: Rng, frames: range) -> None:
-    """Build a workshop full of smoke: a fan turns before the light, its beams sweep past pipes, chains and barrels."""
+    """Build a workshop full of smoke: a fan turns before the light, its beams sweep past pipes, chains and barrels.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     dark()
     concrete = two_tone("concrete", (0.12, 0.11, 0.1), (0.3, 0.28, 0.26), scale=2.5, bump=0.004, roughness=(0.6, 0.95))
     wet = two_tone("floor", (0.04, 0.04, 0.04), (0.12, 0.11, 0.1), scale=4, bump=0.002, roughness=(0.1, 0.6))

@@ -21,7 +21,19 @@ MARGIN = 4  # frames keyed before and after the shot, so that vectors are valid 
 
 
 def set_crop(render: Any, film: tuple[int, int], size: tuple[int, int], center: tuple[float, float]) -> None:
-    """Render only `size` pixels of a `film`-sized camera, around `center`, fractions with y down."""
+    """Render only `size` pixels of a `film`-sized camera, around `center`, fractions with y down.
+
+    Parameters
+    ----------
+    render : bpy.types.RenderSettings
+        Of the scene.
+    film : (int, int)
+        Pixels of the whole picture, across and down.
+    size : (int, int)
+        Pixels that are rendered, across and down.
+    center : (float, float)
+        Where in the film, as fractions, y down.
+    """
     (film_w, film_h), (w, h) = film, size
     left = min(max(round(center[0] * film_w - w / 2), 0), film_w - w)
     top = min(max(round(center[1] * film_h - h / 2), 0), film_h - h)
@@ -35,7 +47,22 @@ def set_crop(render: Any, film: tuple[int, int], size: tuple[int, int], center: 
 
 
 def aim_crop(rng: Rng, shot: ShotSettings, film: tuple[int, int]) -> tuple[float, float]:
-    """Choose where in the film to crop: of twenty places, the one that shows most things."""
+    """Choose where in the film to crop: of twenty places, the one that shows most things.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    film : (int, int)
+        Pixels of the whole picture, across and down.
+
+    Returns
+    -------
+    (float, float)
+        Its centre, as fractions, y down.
+    """
     scene = bpy.context.scene
     best, best_score = (0.5, 0.5), -1.0
     for _ in range(20):
@@ -50,7 +77,21 @@ def aim_crop(rng: Rng, shot: ShotSettings, film: tuple[int, int]) -> tuple[float
 
 
 def place_camera(rng: Rng, focus: Vector, eye: Vector) -> Any:
-    """Add a camera at `eye` that looks at `focus`; nearer, if something is right in front of the lens."""
+    """Add a camera at `eye` that looks at `focus`; nearer, if something is right in front of the lens.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    focus : Vector
+        What it looks at.
+    eye : Vector
+        Where it stands.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     scene = bpy.context.scene
     data = bpy.data.cameras.new("camera")
     data.lens, data.sensor_width, data.clip_start = log_uniform(rng, 18, 65), 36, 0.005
@@ -75,7 +116,20 @@ Pose = tuple[Vector, Euler, float]  # shift in camera space, in units of the dis
 
 
 def camera_path(rng: Rng, kind: str) -> Callable[[float], Pose]:
-    """Return a camera's pose after `step` frames, at unit speed: some hundredths of a radian a frame."""
+    """Return a camera's pose after `step` frames, at unit speed: some hundredths of a radian a frame.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    kind : str
+        Of the motion.
+
+    Returns
+    -------
+    callable
+        From a number of frames to the pose.
+    """
     direction = rng.normal(0, 1, 3)
     direction /= np.linalg.norm(direction)
     phase, rate = rng.uniform(0, 2 * np.pi, (5, 3)), rng.uniform(0.3, 1.6, (5, 3))
@@ -107,6 +161,22 @@ def move_camera(rng: Rng, shot: ShotSettings, kind: str, pixels: float) -> float
     """Key a camera path whose median motion in the rendered region is `pixels` a frame; return what it came to.
 
     The speed is bounded, so where what is seen is very near or far the motion may come out lower.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    kind : str
+        Of the motion.
+    pixels : float
+        Median motion that is asked for, a frame.
+
+    Returns
+    -------
+    float
+        What it came to.
     """
     scene = bpy.context.scene
     camera, middle = scene.camera, shot.frames[len(shot.frames) // 2]
@@ -151,7 +221,19 @@ def move_camera(rng: Rng, shot: ShotSettings, kind: str, pixels: float) -> float
 
 
 def screen_axes(scene: Any, position: Vector) -> tuple[Vector, Vector]:
-    """Return the world vectors that move a point one film pixel to the right, and one down."""
+    """Return the world vectors that move a point one film pixel to the right, and one down.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        Blender's scene.
+    position : Vector
+        Of the point, in metres.
+
+    Returns
+    -------
+    (Vector, Vector)
+    """
     camera = scene.camera
     right, up, back = (Vector(camera.matrix_world.to_3x3().col[k]) for k in range(3))
     depth = -(position - camera.matrix_world.translation).dot(back)
@@ -161,7 +243,23 @@ def screen_axes(scene: Any, position: Vector) -> tuple[Vector, Vector]:
 
 
 def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None, kind: str | None = None) -> Any:
-    """Add a thing that floats in the rendered region, between the camera and what lies behind."""
+    """Add a thing that floats in the rendered region, between the camera and what lies behind.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    surface : str, optional
+        Kind of its material; drawn without.
+    kind : str, optional
+        Of the thing; drawn without.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     scene = bpy.context.scene
     points = visible_points(scene)
     eye = scene.camera.matrix_world.translation
@@ -178,7 +276,24 @@ def spawn(rng: Rng, shot: ShotSettings, surface: str | None = None, kind: str | 
 
 
 def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None) -> dict[str, Any]:
-    """Key an object's motion: along a line, swinging, turning, deforming; a few pixels a frame, at most 40."""
+    """Key an object's motion: along a line, swinging, turning, deforming; a few pixels a frame, at most 40.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    item : bpy.types.Object
+        What is meant.
+    kind : str, optional
+        Of the motion; drawn without.
+
+    Returns
+    -------
+    dict
+        What the motion is.
+    """
     scene = bpy.context.scene
     middle = shot.frames[len(shot.frames) // 2]
     pixels = log_uniform(rng, 1, 20) if rng.random() < 0.85 else log_uniform(rng, 10, 40)
@@ -223,7 +338,20 @@ def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None
 
 
 def move_light(rng: Rng, shot: ShotSettings) -> dict[str, Any]:
-    """Key the motion of a lamp, of the sky, or of a lamp's power; a lamp is added where there is no light to move."""
+    """Key the motion of a lamp, of the sky, or of a lamp's power; a lamp is added where there is no light to move.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+
+    Returns
+    -------
+    dict
+        What the motion is.
+    """
     scene = bpy.context.scene
     first, last = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
     middle = shot.frames[len(shot.frames) // 2]
@@ -269,7 +397,22 @@ def move_light(rng: Rng, shot: ShotSettings) -> dict[str, Any]:
 
 
 def add_motion(rng: Rng, shot: ShotSettings, own_things: bool) -> dict[str, Any]:
-    """Set a shot in motion: draw what moves, and key it."""
+    """Set a shot in motion: draw what moves, and key it.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    own_things : bool
+        Whether things that float may be added.
+
+    Returns
+    -------
+    dict
+        What moves, and how.
+    """
     scene = bpy.context.scene
     kind = choose(rng, {"usual": 0.76, "still": 0.07, "light": 0.1, "mirror": 0.07})
     found: dict[str, Any] = {"motion": kind, "camera": "still", "movers": [], "lights": []}
@@ -295,7 +438,22 @@ def add_motion(rng: Rng, shot: ShotSettings, own_things: bool) -> dict[str, Any]
 
 
 def look(eye: Sequence[float], focus: Sequence[float], lens: float) -> Any:
-    """Stand the camera at `eye`, looking at `focus`."""
+    """Stand the camera at `eye`, looking at `focus`.
+
+    Parameters
+    ----------
+    eye : sequence of float
+        Where it stands, in metres.
+    focus : sequence of float
+        What it looks at.
+    lens : float
+        Focal length in millimetres.
+
+    Returns
+    -------
+    bpy.types.Object
+        The camera.
+    """
     camera = bpy.context.scene.camera
     camera.data.lens, camera.location = lens, eye
     camera.rotation_euler = (Vector(focus) - Vector(eye)).to_track_quat("-Z", "Y").to_euler()
@@ -303,7 +461,19 @@ def look(eye: Sequence[float], focus: Sequence[float], lens: float) -> Any:
 
 
 def move(item: Any, frames: range, velocity: Sequence[float] = (0, 0, 0), spin: Sequence[float] = (0, 0, 0)) -> None:
-    """Key steady motion, in metres and radians per frame; where the item stands now is where it is in the middle."""
+    """Key steady motion, in metres and radians per frame; where the item stands now is where it is in the middle.
+
+    Parameters
+    ----------
+    item : bpy.types.Object
+        What is meant.
+    frames : range
+        Of the shot.
+    velocity : sequence of float
+        Metres per frame along x, y and z.
+    spin : sequence of float
+        Radians per frame around x, y and z.
+    """
     place, turn, middle = Vector(item.location), Vector(item.rotation_euler), frames[len(frames) // 2]
     for frame in frames:
         item.location = place + Vector(velocity) * (frame - middle)

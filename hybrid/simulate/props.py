@@ -20,7 +20,21 @@ Color = tuple[float, float, float]
 
 
 def node(tree: Any, kind: str, **inputs: Any) -> Any:
-    """Add a shader node; `inputs` are values or sockets to link, their names with underscores for blanks."""
+    """Add a shader node; `inputs` are values or sockets to link, their names with underscores for blanks.
+
+    Parameters
+    ----------
+    tree : bpy.types.NodeTree
+        Where it is added.
+    kind : str
+        Its type, as Blender calls it.
+    **inputs : object
+        Values, or sockets to link, by name.
+
+    Returns
+    -------
+    bpy.types.Node
+    """
     made = tree.nodes.new(f"ShaderNode{kind}")
     for name, value in inputs.items():
         socket = made.inputs[name.replace("_", " ")]
@@ -32,7 +46,21 @@ def node(tree: Any, kind: str, **inputs: Any) -> Any:
 
 
 def plain(name: str, color: Sequence[float], **inputs: Any) -> Any:
-    """Make a material of one colour; `inputs` are those of the Principled shader, blanks as underscores."""
+    """Make a material of one colour; `inputs` are those of the Principled shader, blanks as underscores.
+
+    Parameters
+    ----------
+    name : str
+        What Blender calls it.
+    color : sequence of float
+        Linear.
+    **inputs : object
+        Of the Principled shader, by name.
+
+    Returns
+    -------
+    bpy.types.Material
+    """
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     shader = made.node_tree.nodes["Principled BSDF"]
@@ -59,6 +87,35 @@ def two_tone(
     """Make a material of noise between two colours, `scale` features a metre, with relief and uneven gloss.
 
     `stretch` divides the features along the axes: grain and brushing are noise stretched along one of them.
+
+    Parameters
+    ----------
+    name : str
+        What Blender calls it.
+    dark : tuple of float
+        Linear color.
+    light : tuple of float
+        Linear color.
+    scale : float
+        Features a metre.
+    stretch : sequence of float
+        Divides the features along x, y and z.
+    detail : float
+        Octaves of the noise.
+    distortion : float
+        Of the noise.
+    edges : (float, float)
+        Of the noise, between which one color becomes the other.
+    bump : float
+        Strength of the relief.
+    roughness : (float, float)
+        From and to.
+    **inputs : object
+        Of the Principled shader, by name.
+
+    Returns
+    -------
+    bpy.types.Material
     """
     made = plain(name, light, **inputs)
     tree = made.node_tree
@@ -80,13 +137,39 @@ def two_tone(
 
 
 def wood(dark: Color = (0.09, 0.035, 0.012), light: Color = (0.33, 0.16, 0.06), gloss: float = 0.35) -> Any:
-    """Make wood with its grain along x."""
+    """Make wood with its grain along x.
+
+    Parameters
+    ----------
+    dark : tuple of float
+        Linear color.
+    light : tuple of float
+        Linear color.
+    gloss : float
+        Roughness of its surface.
+
+    Returns
+    -------
+    bpy.types.Material
+    """
     return two_tone("wood", dark, light, scale=14, stretch=(14, 1, 1), distortion=1.2, edges=(0.3, 0.7),
                     bump=0.0006, roughness=(gloss + 0.15, gloss - 0.1))  # fmt: skip
 
 
 def printed(rng: Rng, roughness: float = 0.6) -> Any:
-    """Make a material of a painted image: labels, spines, pictures."""
+    """Make a material of a painted image: labels, spines, pictures.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    roughness : float
+        Of its surface.
+
+    Returns
+    -------
+    bpy.types.Material
+    """
     made = plain("printed", (1, 1, 1), Roughness=roughness)
     tree = made.node_tree
     image = node(tree, "TexImage", Vector=node(tree, "TexCoord").outputs["Generated"])
@@ -96,12 +179,42 @@ def printed(rng: Rng, roughness: float = 0.6) -> Any:
 
 
 def glow(color: Color, strength: float) -> Any:
-    """Make a surface that gives light."""
+    """Make a surface that gives light.
+
+    Parameters
+    ----------
+    color : tuple of float
+        Linear.
+    strength : float
+        Factor on the color.
+
+    Returns
+    -------
+    bpy.types.Material
+    """
     return plain("glow", (0, 0, 0), Emission_Color=(*color, 1), Emission_Strength=strength, Specular_IOR_Level=0)
 
 
 def bevelled(center: Sequence[float], size: Sequence[float], surface: Any, width: float, name: str = "box") -> Any:
-    """Add a box whose edges are rounded by `width`."""
+    """Add a box whose edges are rounded by `width`.
+
+    Parameters
+    ----------
+    center : sequence of float
+        Of the box, in metres.
+    size : sequence of float
+        Of the box along x, y and z, in metres.
+    surface : bpy.types.Material
+        What it is made of.
+    width : float
+        Of the rounding, in metres.
+    name : str
+        What Blender calls it.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     item = add_mesh(name, np.array(CUBE) * size, CUBE_FACES, surface, smooth=True)
     item.location = center
     bevel = item.modifiers.new("bevel", "BEVEL")
@@ -110,7 +223,23 @@ def bevelled(center: Sequence[float], size: Sequence[float], surface: Any, width
 
 
 def turned(profile: Sequence[tuple[float, float]], surface: Any, segments: int = 72, name: str = "turned") -> Any:
-    """Add a thing turned around z, from radii and heights; rounded where its outline bends by less than 35°."""
+    """Add a thing turned around z, from radii and heights; rounded where its outline bends by less than 35°.
+
+    Parameters
+    ----------
+    profile : sequence of (float, float)
+        Radii and heights, in metres.
+    surface : bpy.types.Material
+        What it is made of.
+    segments : int
+        Around the axis.
+    name : str
+        What Blender calls it.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     points = np.array(profile, float)
     chord = np.concatenate([[0], np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-9))])
     fine = np.unique(np.concatenate([np.linspace(a, b, 7) for a, b in pairwise(chord)]))
@@ -141,7 +270,25 @@ def turned(profile: Sequence[tuple[float, float]], surface: Any, segments: int =
 
 
 def gear(teeth: int, radius: float, depth: float, surface: Any, spokes: int = 5) -> Any:
-    """Add a spoked gear wheel around its own z axis, `radius` that of the middle of its teeth."""
+    """Add a spoked gear wheel around its own z axis, `radius` that of the middle of its teeth.
+
+    Parameters
+    ----------
+    teeth : int
+        How many.
+    radius : float
+        Of the middle of its teeth, in metres.
+    depth : float
+        Along the axis.
+    surface : bpy.types.Material
+        What it is made of.
+    spokes : int
+        How many.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     pitch, tooth = 2 * math.pi / teeth, 2.2 * radius / teeth
     outer = []
     for k in range(teeth):
@@ -168,7 +315,23 @@ def gear(teeth: int, radius: float, depth: float, surface: Any, spokes: int = 5)
 
 
 def wire(points: Sequence[Sequence[float]], radius: float, surface: Any, name: str = "wire") -> Any:
-    """Add a round wire through `points`."""
+    """Add a round wire through `points`.
+
+    Parameters
+    ----------
+    points : sequence of points
+        In metres.
+    radius : float
+        Of the wire.
+    surface : bpy.types.Material
+        What it is made of.
+    name : str
+        What Blender calls it.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     data = bpy.data.curves.new(name, "CURVE")
     data.dimensions, data.bevel_depth, data.bevel_resolution, data.use_fill_caps = "3D", radius, 4, True
     spline = data.splines.new("NURBS")
@@ -180,7 +343,25 @@ def wire(points: Sequence[Sequence[float]], radius: float, surface: Any, name: s
 
 
 def curtain(width: float, height: float, folds: int, depth: float, surface: Any) -> Any:
-    """Add cloth that hangs in folds, in the plane y = 0 around the origin, its top at `height`."""
+    """Add cloth that hangs in folds, in the plane y = 0 around the origin, its top at `height`.
+
+    Parameters
+    ----------
+    width : float
+        Metres.
+    height : float
+        Of its top.
+    folds : int
+        How many.
+    depth : float
+        Of a fold.
+    surface : bpy.types.Material
+        What it is made of.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     across, down = 40 * folds, 24
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, across), np.linspace(0, 1, down))
     y = np.sin(2 * math.pi * folds * (x + 0.015 * np.sin(9 * x + 2 * z)) + 0.6 * np.sin(5 * x))
@@ -191,7 +372,21 @@ def curtain(width: float, height: float, folds: int, depth: float, surface: Any)
 
 
 def leaf_shape(length: float, width: float, surface: Any) -> Any:
-    """Add a leaf along x from the origin, folded a little along its middle and bent down."""
+    """Add a leaf along x from the origin, folded a little along its middle and bent down.
+
+    Parameters
+    ----------
+    length : float
+        Metres.
+    width : float
+        Metres.
+    surface : bpy.types.Material
+        What it is made of.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     along, across = np.meshgrid(np.linspace(0, 1, 15), np.linspace(-1, 1, 7), indexing="ij")
     half = width / 2 * np.sin(math.pi * along**0.8) * (1 - 0.15 * along)
     x, y = along * length, across * half
@@ -218,18 +413,31 @@ def fur(
 
     Parameters
     ----------
-    rng
+    rng : numpy.random.Generator
         Where strands stand, how long they are and how they curl.
-    item
+    item : bpy.types.Object
         A mesh object, as its modifiers leave it.
-    strands, length, radius
-        How many, and metres.
-    lean
+    strands : int
+        How many.
+    length : float
+        Of a strand, in metres.
+    surface : bpy.types.Material
+        What it is made of.
+    radius : float
+        Of a strand, in metres.
+    lean : sequence of float
         What gravity and combing add to the way of a strand, in lengths, at its tip.
-    wave
+    wave : float
         How much a strand curls, in lengths.
-    clumps, clump
-        Tips gather around so many strands, by this share of the way.
+    clumps : int
+        Tips gather around so many strands.
+    clump : float
+        By this share of the way.
+
+    Returns
+    -------
+    bpy.types.Object
+        The hair.
     """
     graph = bpy.context.evaluated_depsgraph_get()
     mesh = item.evaluated_get(graph).to_mesh()
@@ -270,7 +478,21 @@ def fur(
 
 
 def hair_material(melanin: float, redness: float, roughness: float = 0.3) -> Any:
-    """Make Cycles' own hair, coloured by its pigments."""
+    """Make Cycles' own hair, coloured by its pigments.
+
+    Parameters
+    ----------
+    melanin : float
+        How dark, in [0, 1].
+    redness : float
+        How red, in [0, 1].
+    roughness : float
+        Of the hair.
+
+    Returns
+    -------
+    bpy.types.Material
+    """
     made = bpy.data.materials.new("hair")
     made.use_nodes = True
     tree = made.node_tree
@@ -295,6 +517,21 @@ def fill_with_smoke(
     """Fill a box with smoke that drifts upwards, from thin to thick, `density` per metre, `scale` clouds a metre.
 
     `forward` is the mean cosine of its phase. It keeps out of the way of `ray_cast`, which sees surfaces only.
+
+    Parameters
+    ----------
+    frames : range
+        Of the shot.
+    center : sequence of float
+        Of the box, in metres.
+    size : sequence of float
+        Of the box along x, y and z, in metres.
+    density : (float, float)
+        Per metre, from thin to thick.
+    scale : float
+        Clouds a metre.
+    forward : float
+        Mean cosine of its phase.
     """
     surface = bpy.data.materials.new("smoke")
     surface.use_nodes = True
@@ -313,7 +550,21 @@ def fill_with_smoke(
 
 
 def bottle(kind: int, surface: Any, label: Any = None) -> Any:
-    """Add one of five bottles, some 0.3 high, standing on the origin, with a label if given."""
+    """Add one of five bottles, some 0.3 high, standing on the origin, with a label if given.
+
+    Parameters
+    ----------
+    kind : int
+        Which of five.
+    surface : bpy.types.Material
+        What it is made of.
+    label : bpy.types.Material, optional
+        Of the label; none without.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     profiles = (
         [(0, 0), (0.036, 0), (0.037, 0.01), (0.037, 0.19), (0.016, 0.235), (0.014, 0.30), (0.016, 0.31), (0, 0.312)],
         [(0, 0), (0.042, 0), (0.044, 0.02), (0.044, 0.14), (0.03, 0.18), (0.014, 0.2), (0.013, 0.26), (0.017, 0.265),
@@ -332,6 +583,22 @@ def bottle(kind: int, surface: Any, label: Any = None) -> Any:
 
 
 def place(item: Any, location: Sequence[float], turn: Sequence[float] = (0, 0, 0), size: float = 1.0) -> Any:
-    """Put an item somewhere, turned and sized."""
+    """Put an item somewhere, turned and sized.
+
+    Parameters
+    ----------
+    item : bpy.types.Object
+        What is meant.
+    location : sequence of float
+        Metres.
+    turn : sequence of float
+        Radians around x, y and z.
+    size : float
+        Factor.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     item.location, item.rotation_euler, item.scale = Vector(location), turn, (size,) * 3
     return item

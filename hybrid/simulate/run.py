@@ -116,7 +116,21 @@ def simulate(
 
 
 def missing(shot: ShotSettings, out: Path, frame: int) -> int:
-    """Return how many samples per pixel of a frame are still to be rendered."""
+    """Return how many samples per pixel of a frame are still to be rendered.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    out : Path
+        Folder of the shot.
+    frame : int
+        Its number.
+
+    Returns
+    -------
+    int
+    """
     return sum(spp for name, spp in shot.pictures(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
 
 
@@ -211,6 +225,25 @@ def shots_of(
 
     One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` and `test` into `out/NAME`.
     Samples given as a range are drawn per shot.
+
+    Parameters
+    ----------
+    scene : str
+        Its name, or the path of a .blend file.
+    out : Path
+        Where the shots go.
+    count : int
+        How many.
+    spp : str
+        Samples per pixel, or LOW-HIGH.
+    levels : str
+        NAME=SAMPLES,…, where there are several.
+    first : ShotSettings
+        Of the first shot.
+
+    Returns
+    -------
+    list of (ShotSettings, Path)
     """
     if count < 1:
         raise ValueError(f"shots: got {count}, expected at least 1")
@@ -230,7 +263,20 @@ def shots_of(
 
 
 def parse_size(text: str, name: str) -> tuple[int, int]:
-    """Read `WIDTHxHEIGHT`."""
+    """Read `WIDTHxHEIGHT`.
+
+    Parameters
+    ----------
+    text : str
+        What was given.
+    name : str
+        Of the option, for the error.
+
+    Returns
+    -------
+    (int, int)
+        Pixels across and down.
+    """
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise ValueError(f"{name}: got {text!r}, expected WIDTHxHEIGHT")

@@ -112,7 +112,15 @@ def room_set(rng: Rng) -> View:
 
 
 def hang_picture(rng: Rng, position: Sequence[float]) -> None:
-    """Hang a framed picture, or now and then a mirror, on a wall that faces −y."""
+    """Hang a framed picture, or now and then a mirror, on a wall that faces −y.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    position : sequence of float
+        Of its middle, in metres.
+    """
     w, h = rng.uniform(0.3, 1.0), rng.uniform(0.3, 0.8)
     inside = material(rng, "mirror" if rng.random() < 0.2 else None)
     add_box(position, (w, 0.02, h), inside, "picture")
@@ -265,6 +273,18 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
 
     Every attempt with one seed is another shot: when the first shows nothing, the next is tried. A shot of `hard` is
     one of `random` with one to three of `HARD` in it.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    attempt : int
+        Which of the shots of one seed.
+
+    Returns
+    -------
+    dict
+        Its description.
     """
     rng = np.random.default_rng([shot.seed, attempt])
     # Drawn apart, so that the same seeds give the same random shots with what is hard and without.
@@ -309,7 +329,17 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
 
 
 def open_aperture(camera: Any, distances: Sequence[float], blur: float) -> None:
-    """Open the aperture until what is farthest out of focus is a disc of `blur` times the picture's width."""
+    """Open the aperture until what is farthest out of focus is a disc of `blur` times the picture's width.
+
+    Parameters
+    ----------
+    camera : bpy.types.Object
+        The camera.
+    distances : sequence of float
+        Of what is seen, in metres.
+    blur : float
+        Share of the picture's width.
+    """
     data = camera.data
     # The disc's diameter on the sensor is that of the aperture times lens · |1/focus − 1/distance|.
     apart = max((abs(1 / data.dof.focus_distance - 1 / distance) for distance in distances), default=0.0)
@@ -321,6 +351,20 @@ def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
     """Put one of `HARD` into a scene whose camera stands; return how what was added moves.
 
     An open aperture is up to `random_shot`; for it, things are added that float before and behind the focus.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    shot : ShotSettings
+        What is asked for.
+    name : str
+        One of `HARD`.
+
+    Returns
+    -------
+    list of dict
+        How what was added moves.
     """
     scene = bpy.context.scene
     first, last = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
@@ -393,7 +437,20 @@ def dim(rng: Rng) -> None:
 
 
 def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
-    """Draw the size of the whole picture: mostly that of a film, sometimes no more than what is rendered."""
+    """Draw the size of the whole picture: mostly that of a film, sometimes no more than what is rendered.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    size : (int, int)
+        Pixels that are rendered.
+
+    Returns
+    -------
+    (int, int)
+        Pixels across and down.
+    """
     drawn = choose(rng, {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18})
     width, height = map(int, drawn.split("x"))
     return max(width, size[0]), max(height, size[1])
@@ -443,7 +500,20 @@ def worth_rendering(passes: dict[str, np.ndarray]) -> str | None:
 
 
 def exposure(shot: ShotSettings, passes: dict[str, np.ndarray]) -> float:
-    """Return a factor that puts the picture's geometric mean some stops (σ 1.1, at most 2.5) around middle grey."""
+    """Return a factor that puts the picture's geometric mean some stops (σ 1.1, at most 2.5) around middle grey.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    passes : dict of str to array
+        Of a pilot, from `cycles.render_small`.
+
+    Returns
+    -------
+    float
+        The factor.
+    """
     rng = np.random.default_rng([shot.seed, 99])
     radiance = np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1)
     # Blocks, because single pixels of a few samples are black or very bright by chance.

@@ -82,7 +82,22 @@ class ShotSettings:
 
 
 def frame_seed(seed: int, level: str, frame: int) -> int:
-    """Return the seed of one picture, in [0, 2³¹): unrelated to that of any other frame, level or shot."""
+    """Return the seed of one picture, in [0, 2³¹): unrelated to that of any other frame, level or shot.
+
+    Parameters
+    ----------
+    seed : int
+        Of the shot.
+    level : str
+        Its name.
+    frame : int
+        Its number.
+
+    Returns
+    -------
+    int
+        In [0, 2³¹).
+    """
     digest = hashlib.sha256(f"{seed} {level} {frame}".encode()).digest()
     return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
 
@@ -121,7 +136,20 @@ def parse_levels(text: str, samples: int) -> dict[str, int]:
 
 
 def spp_of(text: str, seed: int) -> int:
-    """Read samples per pixel: a number, or `LOW-HIGH`, from which the seed draws (uniformly in the logarithm)."""
+    """Read samples per pixel: a number, or `LOW-HIGH`, from which the seed draws (uniformly in the logarithm).
+
+    Parameters
+    ----------
+    text : str
+        A number, or `LOW-HIGH`.
+    seed : int
+        Of the draw.
+
+    Returns
+    -------
+    int
+        Samples per pixel.
+    """
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
     if match is None or int(match[1]) < 1 or (match[2] is not None and int(match[2]) < int(match[1])):
         raise ValueError(f"spp: got {text!r}, expected a number or LOW-HIGH, from 1 up")

@@ -20,18 +20,57 @@ SKIES = ("city", "forest", "interior", "studio", "sunrise", "sunset")
 
 
 def choose(rng: Rng, weights: dict[str, float]) -> str:
-    """Draw a key with probability proportional to its value."""
+    """Draw a key with probability proportional to its value.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    weights : dict of str to float
+        What may be drawn, and how often.
+
+    Returns
+    -------
+    str
+    """
     values = np.array(list(weights.values()))
     return str(rng.choice(list(weights), p=values / values.sum()))
 
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
-    """Draw from [low, high], uniformly in the logarithm."""
+    """Draw from [low, high], uniformly in the logarithm.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    low : float
+        Above 0.
+    high : float
+        At least `low`.
+
+    Returns
+    -------
+    float
+    """
     return float(np.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def color(rng: Rng, brightness: float | None = None) -> tuple[float, float, float, float]:
-    """Draw a linear color: mostly muted, its largest component `brightness`, by default 0.04 to 0.85."""
+    """Draw a linear color: mostly muted, its largest component `brightness`, by default 0.04 to 0.85.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    brightness : float, optional
+        Largest component; 0.04 to 0.85 without.
+
+    Returns
+    -------
+    tuple of four floats
+        Linear, with alpha.
+    """
     hue, saturation = rng.random(), rng.beta(1.2, 2.6)
     rgb = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     rgb = (1 - saturation + saturation * rgb) * (log_uniform(rng, 0.04, 0.85) if brightness is None else brightness)
@@ -39,7 +78,19 @@ def color(rng: Rng, brightness: float | None = None) -> tuple[float, float, floa
 
 
 def painted_image(rng: Rng, size: int = 512) -> Any:
-    """Draw an image texture: spectral noise, stripes, plaid, patches or rows of marks like writing."""
+    """Draw an image texture: spectral noise, stripes, plaid, patches or rows of marks like writing.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    size : int
+        Pixels each way.
+
+    Returns
+    -------
+    bpy.types.Image
+    """
     y, x = np.mgrid[:size, :size] / size
     kind = choose(rng, {"spectral": 3, "stripes": 1, "plaid": 1, "patches": 2, "writing": 2})
     if kind == "spectral":
@@ -75,7 +126,24 @@ def painted_image(rng: Rng, size: int = 512) -> Any:
 
 
 def texture(rng: Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, Any]:
-    """Add a texture; return its color and its scalar socket. `scale` is features per unit of the coordinates."""
+    """Add a texture; return its color and its scalar socket. `scale` is features per unit of the coordinates.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    tree : bpy.types.NodeTree
+        Where it is added.
+    coordinates : bpy.types.NodeSocket
+        Where it lies.
+    scale : float
+        Features per unit of the coordinates.
+
+    Returns
+    -------
+    two bpy.types.NodeSocket
+        Color and scalar.
+    """
     nodes, links = tree.nodes, tree.links
     kind = choose(rng, {"Noise": 4, "Voronoi": 2, "Wave": 1.5, "Checker": 1, "Brick": 1.5, "Magic": 0.5, "Image": 3})
     node = nodes.new(f"ShaderNodeTex{kind}")
@@ -128,6 +196,19 @@ def material(rng: Rng, surface: str | None = None, in_world: bool = False) -> An
 
     With `in_world` its texture sits in the world, 1 to 60 features per metre: for what stands still. Otherwise it
     goes with the object, 2 to 60 features across it.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    surface : str, optional
+        Its kind; drawn without.
+    in_world : bool
+        Whether its texture stands still in the world.
+
+    Returns
+    -------
+    bpy.types.Material
     """
     surface = surface or choose(rng, SURFACES)
     made = bpy.data.materials.new(surface)
@@ -192,7 +273,25 @@ def material(rng: Rng, surface: str | None = None, in_world: bool = False) -> An
 
 
 def add_mesh(name: str, vertices: Any, faces: Any, surface: Any, smooth: bool = False) -> Any:
-    """Add an object from vertices and faces."""
+    """Add an object from vertices and faces.
+
+    Parameters
+    ----------
+    name : str
+        What Blender calls it.
+    vertices : (N, 3) sequence of float
+        Metres.
+    faces : sequence of sequences of int
+        Indices of vertices.
+    surface : bpy.types.Material
+        What it is made of.
+    smooth : bool
+        Whether its faces are shaded as one.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata([tuple(map(float, v)) for v in vertices], [], [tuple(map(int, f)) for f in faces])
     mesh.update()
@@ -202,7 +301,21 @@ def add_mesh(name: str, vertices: Any, faces: Any, surface: Any, smooth: bool = 
 
 
 def add_object(name: str, data: Any, surface: Any) -> Any:
-    """Add an object of some data and give it a material."""
+    """Add an object of some data and give it a material.
+
+    Parameters
+    ----------
+    name : str
+        What Blender calls it.
+    data : bpy.types.ID
+        A mesh, a curve, a light or a volume.
+    surface : bpy.types.Material
+        What it is made of.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     item = bpy.data.objects.new(name, data)
     bpy.context.scene.collection.objects.link(item)
     if data is not None and surface is not None and hasattr(data, "materials"):
@@ -216,14 +329,42 @@ CUBE_FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 
 
 
 def add_box(center: Sequence[float], size: Sequence[float], surface: Any, name: str = "box") -> Any:
-    """Add an axis-aligned box."""
+    """Add an axis-aligned box.
+
+    Parameters
+    ----------
+    center : sequence of float
+        Of the box, in metres.
+    size : sequence of float
+        Of the box along x, y and z, in metres.
+    surface : bpy.types.Material
+        What it is made of.
+    name : str
+        What Blender calls it.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     item = add_mesh(name, np.array(CUBE) * size, CUBE_FACES, surface)
     item.location = center
     return item
 
 
 def fill_with_fog(center: Sequence[float], size: Sequence[float], density: float, forward: float) -> None:
-    """Fill a box with a thin scattering volume, `density` per metre; `forward` is the mean cosine of its phase."""
+    """Fill a box with a thin scattering volume, `density` per metre; `forward` is the mean cosine of its phase.
+
+    Parameters
+    ----------
+    center : sequence of float
+        Of the box, in metres.
+    size : sequence of float
+        Of the box along x, y and z, in metres.
+    density : float
+        Per metre.
+    forward : float
+        Mean cosine of its phase.
+    """
     surface = bpy.data.materials.new("fog")
     surface.use_nodes = True
     tree = surface.node_tree
@@ -235,7 +376,19 @@ def fill_with_fog(center: Sequence[float], size: Sequence[float], density: float
 
 
 def add_turned(rng: Rng, surface: Any) -> Any:
-    """Add a turned thing about one unit high: a vase, a bottle, a bowl, a pawn."""
+    """Add a turned thing about one unit high: a vase, a bottle, a bowl, a pawn.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    surface : bpy.types.Material
+        What it is made of.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     heights = np.linspace(-0.5, 0.5, 40)
     radius = 0.12 + 0.3 * rng.random() * np.abs(np.sin(heights * rng.uniform(1, 6) + rng.uniform(0, 6)))
     radius += 0.08 * rng.random() * np.sin(heights * rng.uniform(5, 30))
@@ -255,7 +408,21 @@ def add_turned(rng: Rng, surface: Any) -> Any:
 
 
 def add_thing(rng: Rng, surface: Any, kind: str | None = None) -> Any:
-    """Add a thing of about unit size at the origin."""
+    """Add a thing of about unit size at the origin.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    surface : bpy.types.Material
+        What it is made of.
+    kind : str, optional
+        Of the thing; drawn without.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     kind = kind or choose(
         rng,
         {"box": 1.5, "sphere": 1, "cylinder": 1, "cone": 0.5, "torus": 1, "monkey": 1, "turned": 2.5, "blob": 1.5,
@@ -315,7 +482,19 @@ def add_thing(rng: Rng, surface: Any, kind: str | None = None) -> Any:
 
 
 def add_fur(rng: Rng, surface: Any) -> Any:
-    """Add a ball of hair: strands over a unit sphere, bent by gravity."""
+    """Add a ball of hair: strands over a unit sphere, bent by gravity.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    surface : bpy.types.Material
+        What it is made of.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     strands, points = 3000, 5
     root = rng.standard_normal((strands, 3))
     root *= 0.32 / np.linalg.norm(root, axis=1, keepdims=True)
@@ -333,7 +512,19 @@ def add_fur(rng: Rng, surface: Any) -> Any:
 
 
 def scatter(rng: Rng, count: int, place: Callable[[], tuple[Sequence[float], float]], kinds: int = 3) -> None:
-    """Add `count` instances of a few things; `place` draws a position and a size."""
+    """Add `count` instances of a few things; `place` draws a position and a size.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    count : int
+        How many.
+    place : callable
+        Draws a position in metres, and a size.
+    kinds : int
+        Of things.
+    """
     originals = [add_thing(rng, material(rng)) for _ in range(kinds)]
     for number in range(count):
         source = originals[number % kinds]
@@ -348,7 +539,21 @@ def scatter(rng: Rng, count: int, place: Callable[[], tuple[Sequence[float], flo
 def clutter(
     rng: Rng, center: Sequence[float], half: tuple[float, float], count: int, sizes: tuple[float, float]
 ) -> None:
-    """Put things on a plane around `center`, the larger ones spread first, sitting on it and not in each other."""
+    """Put things on a plane around `center`, the larger ones spread first, sitting on it and not in each other.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    center : sequence of float
+        Of the plane, in metres.
+    half : (float, float)
+        Half of its size along x and y.
+    count : int
+        How many things.
+    sizes : (float, float)
+        From and to, in metres.
+    """
     placed: list[tuple[float, float, float]] = []
     surfaces = [material(rng) for _ in range(max(count // 2, 4))]
     for size in sorted((log_uniform(rng, *sizes) for _ in range(count)), reverse=True):
@@ -372,7 +577,27 @@ def clutter(
 def add_lamp(
     kind: str, position: Sequence[float], power: float, size: float, target: Sequence[float], tint: Any
 ) -> Any:
-    """Add a lamp of `kind` (POINT, AREA, SPOT, SUN), aimed at `target`."""
+    """Add a lamp of `kind` (POINT, AREA, SPOT, SUN), aimed at `target`.
+
+    Parameters
+    ----------
+    kind : str
+        POINT, AREA, SPOT or SUN.
+    position : sequence of float
+        Metres.
+    power : float
+        Watts; of a SUN, watts per square metre.
+    size : float
+        Metres; of a SUN, radians.
+    target : sequence of float
+        What it is aimed at.
+    tint : sequence of float
+        Linear color.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     data = bpy.data.lights.new(kind.lower(), kind)
     data.energy, data.color = power, tint[:3]
     if kind == "AREA":
@@ -398,7 +623,17 @@ def warm(rng: Rng) -> tuple[float, float, float]:
 
 
 def set_world(rng: Rng, kind: str, strength: float) -> None:
-    """Give the scene a world: none, constant, image (Blender's or painted) or sky."""
+    """Give the scene a world: none, constant, image (Blender's or painted) or sky.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    kind : str
+        none, constant, image or sky.
+    strength : float
+        Factor on its light.
+    """
     scene = bpy.context.scene
     scene.world = bpy.data.worlds.new("world")
     if kind == "image":
@@ -433,7 +668,19 @@ def set_world(rng: Rng, kind: str, strength: float) -> None:
 
 
 def painted_sky(rng: Rng, height: int = 128) -> Any:
-    """Draw a sky image: a gradient over a ground, and some bright windows or blobs."""
+    """Draw a sky image: a gradient over a ground, and some bright windows or blobs.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    height : int
+        Pixels.
+
+    Returns
+    -------
+    bpy.types.Image
+    """
     y, x = np.mgrid[:height, : 2 * height] / height
     up = (np.array(color(rng, 0.8))[:3], np.array(color(rng, 0.15))[:3])
     pixels = np.where(y[..., None] > 0.5, up[0] * y[..., None], up[1])

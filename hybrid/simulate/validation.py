@@ -29,13 +29,37 @@ from hybrid.simulate.things import (
 
 
 def put(item: Any, place: Sequence[float], size: float, turn: float = 0.0) -> Any:
-    """Place a thing of unit size."""
+    """Place a thing of unit size.
+
+    Parameters
+    ----------
+    item : bpy.types.Object
+        Of unit size.
+    place : sequence of float
+        Metres.
+    size : float
+        Factor.
+    turn : float
+        Radians around z.
+
+    Returns
+    -------
+    bpy.types.Object
+    """
     item.location, item.scale, item.rotation_euler.z = place, (size,) * 3, turn
     return item
 
 
 def table(rng: Rng, frames: range) -> None:
-    """Build a table in a closed room: one lamp turned to the ceiling, one small and bright."""
+    """Build a table in a closed room: one lamp turned to the ceiling, one small and bright.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     wall = plain("wall", (0.75, 0.72, 0.66), Specular_IOR_Level=0)
     for center, size in (
         ((0, 0, 2.6), (5, 5, 0.1)), ((0, 0, -0.85), (5, 5, 0.1)), ((0, 2.45, 0.9), (5, 0.1, 3.6)),
@@ -64,7 +88,15 @@ def table(rng: Rng, frames: range) -> None:
 
 
 def night(rng: Rng, frames: range) -> None:
-    """Build a street at night: sixty bulbs, fog, a mirror, a wet floor, and something that passes by."""
+    """Build a street at night: sixty bulbs, fog, a mirror, a wet floor, and something that passes by.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     add_box((0, 4, -0.05), (24, 24, 0.1), plain("wet", (0.05, 0.05, 0.06), Roughness=0.15))
     add_box((0, 9, 2), (24, 0.2, 6), material(rng, "diffuse", True))
     stone = material(rng, "diffuse", True)
@@ -90,7 +122,15 @@ def night(rng: Rng, frames: range) -> None:
 
 
 def garden(rng: Rng, frames: range) -> None:
-    """Build a bush of cut-out leaves and grass under sky and sun, with things that fly and bend."""
+    """Build a bush of cut-out leaves and grass under sky and sun, with things that fly and bend.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Where all chance comes from.
+    frames : range
+        Of the shot.
+    """
     add_box((0, 4, -0.05), (30, 30, 0.1), material(rng, "diffuse", True))
     add_box((1.5, 5, 1), (5, 0.3, 2), material(rng, "diffuse", True))
     leaf = plain("leaf", (0.16, 0.34, 0.06), Roughness=0.5)

@@ -211,7 +211,19 @@ def _on_display_window(image: ExrImage, layer: Layer) -> NDArray[np.float32]:
 
 
 def encode_picture(picture: Picture, suffix: str) -> bytes:
-    """A picture as a browser takes it: exact as "png", or small and quick as "jpg"."""
+    """Encode a picture as a browser takes it.
+
+    Parameters
+    ----------
+    picture : (H, W, 3) array of uint8
+        Red, green and blue.
+    suffix : str
+        "png", which is exact, or "jpg", which is small and quick.
+
+    Returns
+    -------
+    bytes
+    """
     settings = {
         "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
         "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],

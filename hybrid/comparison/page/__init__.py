@@ -52,8 +52,8 @@ def render(template: str, **values: object) -> Markup:
     ----------
     template : str
         The name of its file.
-    **values
-        What it asks for. Text is escaped unless it is `markupsafe.Markup`.
+    **values : object
+        What it asks for, by name. Text is escaped unless it is `markupsafe.Markup`.
 
     Returns
     -------
