@@ -79,7 +79,20 @@ def identify(path: Path) -> Source:
 
 
 def describe_sources(files: Mapping[str, Source], **facts: object) -> str:
-    """The string for the header: the same for the same files and facts, to the byte."""
+    """Describe what a frame was made from, for its header.
+
+    Parameters
+    ----------
+    files : mapping of str to Source
+        What a frame was made from, by what it is.
+    **facts : object
+        What else its pixels depend on, by name.
+
+    Returns
+    -------
+    str
+        JSON: the same for the same files and facts, to the byte.
+    """
     listed = {what: [s.name, s.size, s.modified, s.hash] for what, s in files.items()}
     return json.dumps({**facts, "files": listed}, sort_keys=True)
 
