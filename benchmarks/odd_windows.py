@@ -68,6 +68,7 @@ class Layers:
     normal: np.ndarray
     alpha: np.ndarray
     burnt: np.ndarray  # what single samples add
+    astray: np.ndarray  # what the albedo that is written differs by from that of the picture
 
 
 def make_shot(event: str, rng: np.random.Generator) -> tuple[Shot, int]:
@@ -96,6 +97,7 @@ def make_shot(event: str, rng: np.random.Generator) -> tuple[Shot, int]:
             normal=np.broadcast_to(np.float32([0, 0, 1]), (*SIZE, 3)).copy(),
             alpha=np.ones(SIZE, np.float32),
             burnt=np.zeros((*SIZE, 1), np.float32),
+            astray=np.zeros((*SIZE, 3), np.float32),
         )
         EVENTS[event](layers, index, odd, strength, place, rng)
         picture = (layers.light * layers.albedo).astype(np.float32)
@@ -108,7 +110,7 @@ def make_shot(event: str, rng: np.random.Generator) -> tuple[Shot, int]:
             Frame(
                 number=index,
                 color=picture * grain + layers.burnt,
-                albedo=layers.albedo,
+                albedo=(layers.albedo + layers.astray).clip(0.02, 1),
                 normal=layers.normal,
                 alpha=layers.alpha,
                 motion=motion if vectors else None,
@@ -164,8 +166,7 @@ def coverage(layers: Layers, index: int, odd: int, strength: float, place: tuple
 def lens(layers: Layers, index: int, odd: int, strength: float, place: tuple, rng: np.random.Generator) -> None:
     """Noise in the guides of three frames."""
     if abs(index - odd) <= 1:
-        layers.albedo += rng.normal(0, 0.05, layers.albedo.shape).astype(np.float32)
-        layers.albedo.clip(0.02, 1, out=layers.albedo)
+        layers.astray += rng.normal(0, 0.05, layers.astray.shape).astype(np.float32)
 
 
 EVENTS: dict[str, Event] = {
