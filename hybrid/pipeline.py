@@ -81,7 +81,7 @@ def check_written(
     shot : Shot
         What is denoised.
     output : str or Path
-        As for `denoise_shot`.
+        As for `denoise_frames`.
     source : EstimateSource
         Whose files are read, or kept.
     inputs, others : mapping of str to Path or None
@@ -101,7 +101,7 @@ def check_written(
     check_outputs(written, read)
 
 
-def denoise_shot(
+def denoise_frames(
     shot: Shot,
     output: str | Path,
     denoise: DenoiseWindow,

@@ -63,7 +63,7 @@ def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = R
     shot : Shot
         The input.
     output : str or Path
-        Where its denoised frames are (`hybrid.pipeline.denoise_shot`).
+        Where its denoised frames are (`hybrid.pipeline.denoise_frames`).
     path : Path
         A .png has the middle frame, noisy on the left and denoised on the right. A .mp4 or .webp plays the shot with a
         divider that moves: noisy to the left of it, denoised to the right. Both sides of all frames are exposed alike,

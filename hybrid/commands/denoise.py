@@ -525,7 +525,7 @@ def _denoise(job: Job, record: Record) -> None:
     from hybrid.files.layers import summarize_layers
     from hybrid.files.sources import PACKAGES, versions
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
-    from hybrid.pipeline import Failed, denoise_shot
+    from hybrid.pipeline import Failed, denoise_frames
     from hybrid.plan import NEURAL_STAGES, Plan, merge
 
     shot, source, timings = job.shot, job.source, job.timings
@@ -567,7 +567,7 @@ def _denoise(job: Job, record: Record) -> None:
     pixels, outliers = 0, 0
     plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))
-    frames = denoise_shot(
+    frames = denoise_frames(
         shot,
         job.output,
         job.denoise,

@@ -59,7 +59,7 @@ def has_bfloat16() -> bool:
 
 
 class Denoiser:
-    """Runs a Robust Average network on aligned windows; an estimator for `hybrid.pipeline.denoise_shot`.
+    """Runs a Robust Average network on aligned windows; an estimator for `hybrid.pipeline.denoise_frames`.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from hybrid.estimates import OfFrames
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import open_shot
-from hybrid.pipeline import Denoised, denoise_shot
+from hybrid.pipeline import Denoised, denoise_frames
 from hybrid.plan import STAGES, Rules, plan_shot
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
 from tests.scenes import Scene
@@ -95,7 +95,7 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
     def run(name, frames):
         shot = open_shot(folder, frames=frames)
         estimates = OfFrames(lambda frame: frame.color)
-        for _ in denoise_shot(
+        for _ in denoise_frames(
             shot, tmp_path / name, lambda w: Denoised(gated_average(w)), Rules(), estimates=estimates
         ):
             pass
@@ -120,7 +120,7 @@ def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_ov
         return whole(path, pixels=pixels, **options)
 
     monkeypatch.setattr(frames_module, "read_exr", counted)
-    for _ in denoise_shot(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
+    for _ in denoise_frames(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
         pass
     assert len(read) == 16
     assert {read.count(name) for name in read} == {2}

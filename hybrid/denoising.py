@@ -1,0 +1,105 @@
+"""Denoise a shot from another program, as the command does."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import partial
+from pathlib import Path
+
+from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
+from hybrid.files.frames import Shot
+from hybrid.pipeline import Denoised, DenoiseWindow, Failed, Finished, check_written, denoise_frames
+from hybrid.plan import NEURAL_STAGES, Rules
+from hybrid.plausibility import judge_layers
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
+
+
+def denoise_shot(
+    shot: Shot,
+    output: str | Path,
+    *,
+    preset: str = "fast",
+    weights: Path | None = None,
+    estimate: str | None = None,
+    stages: Collection[str] = (),
+    no_stages: Collection[str] = (),
+    resume: bool = False,
+    keep_going: bool = False,
+) -> Iterator[Finished | Failed]:
+    """Denoise every frame of a shot and write it, with the network or without.
+
+    Parameters
+    ----------
+    shot : Shot
+        From `hybrid.open_shot`. Of files with several pictures (stereo, view layers) the first is denoised, or the one
+        that was opened as color.
+    output : str or Path
+        ``OUT.####.exr``, or a folder.
+    preset : str
+        Of the network: "fast", "balanced", "quality" or "tkpcn". Without one, and without torch: "draft", "standard"
+        or "final".
+    weights : Path, optional
+        A weights file of your own, instead of a preset.
+    estimate : str, optional
+        Which denoised single frames are made stable (`hybrid.estimates.choose_estimate`). Without: "auto" with the
+        network, "none" without one.
+    stages, no_stages : collection of str
+        Stages that run, or do not, whatever was measured.
+    resume : bool
+        Leave frames alone that are there and would be made the same.
+    keep_going : bool
+        Where a frame cannot be made, go on with those after it.
+
+    Yields
+    ------
+    Finished or Failed
+        After each frame.
+
+    Raises
+    ------
+    ValueError
+        An option that does not exist; a file that is damaged, or would be overwritten.
+    OSError
+        If a file cannot be read or written.
+    ImportError
+        If the network is asked for and torch is not installed, or OIDN and pyoidn is not.
+
+    Examples
+    --------
+    >>> from hybrid import denoise_shot, open_shot
+    >>> shot = open_shot("examples/shot/noisy.####.exr", frames="8-10")
+    >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr", preset="draft")]
+    ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
+    """
+    shot = judge_layers(shot).apply(shot)
+    off = set(no_stages)
+    denoise: DenoiseWindow
+    if weights is None and preset in CLASSICAL_PRESETS:
+        radius, own = 2, CLASSICAL_PRESETS[preset]
+        off |= NEURAL_STAGES
+        source = choose_estimate(estimate or "none", shot, own=own)
+        make = partial(filter_window, preset=own) if source.estimates is None else gated_average
+        denoise = lambda aligned: Denoised(make(aligned))  # noqa: E731 - as the command has it
+    else:
+        from hybrid.neural.denoiser import Denoiser, shipped_weights
+
+        network = Denoiser(weights or shipped_weights(preset))
+        denoise, radius = network, network.radius
+        if network.takes_estimate:
+            mode = MODE_OF[preset] if weights is None else "oidn-clean"
+            source = choose_estimate(estimate or "auto", shot, mode=mode)
+        else:
+            source = EstimateSource("none", None, "this network takes none")
+    check_written(shot, str(output), source, {"weights": weights}, {})
+    attributes = {"ravg/command": "denoise_shot", "ravg/preset": preset, "ravg/estimate": source.name}
+    yield from denoise_frames(
+        shot,
+        output,
+        denoise,
+        Rules(on=frozenset(stages), off=frozenset(off)),
+        radius=radius,
+        estimates=source.estimates,
+        attributes=attributes,
+        resume=resume,
+        keep_going=keep_going,
+    )
