@@ -10,10 +10,8 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks.cpu_time import measure
 from flow.confidence import estimate_confidence, mix_centre
 from flow.guide import make_guide, pair_guides
 from flow.motion import CYCLES, compose_flow, forward_backward_error, invert_flow, normalize_motion
@@ -37,16 +36,6 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
     return parser.parse_args(argv)
-
-
-def measure(function: Callable[[], object], repeats: int) -> dict[str, float]:
-    function()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        seconds.append(time.process_time() - start)
-    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
 
 
 def make_pair(width: int, height: int) -> dict[str, np.ndarray]:

@@ -11,10 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from torch.nn import functional
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks.cpu_time import measure
 from hybrid.memory import keep_freed_memory
 from network.blocks import RobustAverage, outermost_first, ravg
 from network.kernels import apply_kernels, predict_kernel, threshold_kernel
@@ -41,16 +40,6 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--tile", type=int, default=256)
     parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["fast"], help="paper takes a minute")
     return parser.parse_args(argv)
-
-
-def measure(function: Callable[[], object], repeats: int) -> dict[str, float]:
-    function()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        seconds.append(time.process_time() - start)
-    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
 
 
 def naive_ravg(frames: list[Tensor]) -> Tensor:

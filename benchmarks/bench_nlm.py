@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import statistics
 import sys
-import time
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numba
@@ -22,6 +21,9 @@ import numpy as np
 import skimage
 from skimage.restoration import denoise_nl_means
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from benchmarks.cpu_time import measure
 from nlm.average import average, reject_outliers, robust_average
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
@@ -29,17 +31,6 @@ from nlm.nonlocal_means import joint_nlm
 from nlm.variance import prefilter_guide, variance_from_window
 
 FRAMES, FEATURES, SEED = 5, 7, 0
-
-
-def measure(function: Callable[[], object], repeat: int) -> dict[str, float]:
-    """Median and spread (largest less smallest) of the CPU seconds of a call, after one to warm up."""
-    function()
-    seconds = []
-    for _ in range(repeat):
-        start = time.process_time()
-        function()
-        seconds.append(time.process_time() - start)
-    return {"median": statistics.median(seconds), "spread": max(seconds) - min(seconds)}
 
 
 def make_window(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -64,7 +55,8 @@ def run(height: int, width: int, repeat: int) -> dict[str, dict[str, float]]:
 
     def add(name: str, function: Callable[[], object]) -> None:
         results[name] = measure(function, repeat)
-        print(f"{name:44} {results[name]['median']:8.3f} ± {results[name]['spread']:.3f} CPU-s", file=sys.stderr)
+        median, least, most = (results[name][key] for key in ("median", "min", "max"))
+        print(f"{name:44} {median:8.3f} CPU-s ({least:.3f} to {most:.3f})", file=sys.stderr)
 
     def nlm(radius: int) -> Callable[[], object]:
         return lambda: joint_nlm(window, variance, features, confidence=confidence, radius=radius)

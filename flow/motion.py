@@ -136,11 +136,11 @@ def normalize_motion(
 
     Parameters
     ----------
-    vectors
-        (H, W, C) float as the renderer wrote them, C at least `convention.channels`; what is beyond is not looked at.
-    convention
+    vectors : (H, W, C) array of float
+        As the renderer wrote them, C at least `convention.channels`; what is beyond is not looked at.
+    convention : MotionConvention
         What they mean.
-    resolution
+    resolution : (int, int), optional
         Height and width, pixels, of the whole picture, which NDC units are fractions of. Missing: those of `vectors`.
 
     Returns
@@ -196,17 +196,16 @@ def compose_flow(
 
     Parameters
     ----------
-    first, second
-        (H, W, 2) float, finite, pixels; `second` belongs to the frame that `first` points to.
-    first_valid, second_valid
-        (H, W) bool; missing: all True.
+    first, second : (H, W, 2) array of float
+        Finite, pixels; `second` belongs to the frame that `first` points to.
+    first_valid, second_valid : (H, W) array of bool, optional
+        Missing: all True.
 
     Returns
     -------
-    flow
-        (H, W, 2) float32.
-    valid
-        (H, W) bool: `first` is valid, lands in the frame, and every vector of `second` it mixes is valid.
+    flow : (H, W, 2) array of float32
+    valid : (H, W) array of bool
+        `first` is valid, lands in the frame, and every vector of `second` it mixes is valid.
 
     Raises
     ------
@@ -268,21 +267,21 @@ def invert_flow(
 
     Parameters
     ----------
-    flow
-        (H, W, 2) float, pixels, finite, of frame b.
-    valid
-        (H, W) bool, of frame b; invalid vectors are left out.
-    depth
-        (H, W) float > 0, of frame b, smaller is nearer. Where several pixels arrive at one place the nearest
+    flow : (H, W, 2) array of float
+        Pixels, finite, of frame b.
+    valid : (H, W) array of bool, optional
+        Of frame b; invalid vectors are left out.
+    depth : (H, W) array of float, optional
+        Above 0, of frame b, smaller is nearer. Where several pixels arrive at one place the nearest
         wins. Without it the fastest does: what moves most in the picture tends to be in front.
 
     Returns
     -------
-    inverse
-        (H, W, 2) float32, of frame a. Where nothing arrives (hidden in b), the mean of the neighbours where
+    inverse : (H, W, 2) array of float32
+        Of frame a. Where nothing arrives (hidden in b), the mean of the neighbours where
         there are some within two pixels, else 0.
-    valid
-        (H, W) bool: something arrived.
+    valid : (H, W) array of bool
+        Something arrived.
     """
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
@@ -314,16 +313,16 @@ def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: 
 
     Parameters
     ----------
-    flow, reverse
-        (H, W, 2) float, pixels, finite: centre to neighbour, and neighbour to centre. `flow` may be of some of the
+    flow, reverse : (H, W, 2) array of float
+        Pixels, finite: centre to neighbour, and neighbour to centre. `flow` may be of some of the
         rows only.
-    first_row
+    first_row : int
         The frame's row that the first row of `flow` belongs to.
 
     Returns
     -------
-    numpy.ndarray
-        (H, W) float32, pixels: |f(x) + r(x + f(x))|; outside the frame r has its edge value.
+    (H, W) array of float32
+        Pixels: |f(x) + r(x + f(x))|; outside the frame r has its edge value.
     """
     loop, _ = warp(reverse, flow, first_row=first_row)
     loop += flow

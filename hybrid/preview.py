@@ -92,8 +92,10 @@ def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
 
     Parameters
     ----------
-    shot, output
+    shot : Shot
         As for `write_preview`, exposed as there.
+    output : str or Path
+        The same.
     path : Path
         Of the PNG: at most `SHEET_FRAMES` frames with their numbers, row by row, from the first to the last.
 

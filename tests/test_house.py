@@ -126,8 +126,10 @@ def test_docstrings_name_the_parameters_that_there_are(package):
         if found is None:
             assert len(wanted) < 2, f"{name}: {node.name} has no section of its parameters"
             continue
-        heads = [line.partition(" : ")[0] for line in found[1].splitlines() if line and not line.startswith(" ")]
-        assert ", ".join(heads).split(", ") == wanted, f"{name}: {node.name}"
+        heads = [line for line in found[1].splitlines() if line and not line.startswith(" ")]
+        names = ", ".join(line.partition(" : ")[0] for line in heads)
+        assert names.split(", ") == wanted, f"{name}: {node.name}"
+        assert all(" : " in line for line in heads), f"{name}: {node.name}: expected name : type"
 
 
 def test_the_core_imports_no_peer_at_start():

@@ -48,8 +48,10 @@ def open_levels(
         so is left out), or one sequence.
     samples : dict of str to float, optional
         Levels to take, and their samples per pixel. Without: all there are, and what Cycles wrote in their headers.
-    frames, layers
+    frames : str, optional
         As for `hybrid.files.frames.open_shot`.
+    layers : dict of str to str, optional
+        The same.
 
     Returns
     -------

@@ -301,11 +301,11 @@ def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIX
 
     Parameters
     ----------
-    path
+    path : str or Path
         The file.
-    pixels
+    pixels : bool
         False reads the headers only; the channels' names are there, their pixels are not.
-    max_pixels
+    max_pixels : int
         The largest data window accepted. Memory is bounded by 64 bytes for each of these pixels.
 
     Raises
@@ -443,17 +443,17 @@ def write_exr(
 
     Parameters
     ----------
-    path
+    path : str or Path
         The file to write; may be the source itself. Nothing is there before all of it is.
-    source
+    source : ExrImage
         What to write, from `read_exr`.
-    replaced
+    replaced : mapping of str to array
         Qualified channel name → (H, W), of the size of its part's data window. Converted to the pixel type
         the channel has in the source.
-    extra
+    extra : mapping of str to array, optional
         Layers to add: name → (H, W) or (H, W, C), of the size of some part's data window; float16, float32 or
         uint32, written as such.
-    attributes
+    attributes : mapping of str to str, optional
         Strings to add to the header of the first part.
 
     Returns
@@ -524,15 +524,15 @@ def write_layers(
 
     Parameters
     ----------
-    path
+    path : str or Path
         The file to write.
-    layers
+    layers : mapping of str to array
         Name → (H, W) or (H, W, C ≤ 4), C components named R G B A; X Y Z W where the name ends in normal,
         vector, motion or position; Z for depth; Y for other single channels. "" writes bare R, G, B, A.
-    half
+    half : bool
         Store R, G, B, A and Y as half. X, Y, Z, W and depth stay float32, as in Blender: half has three
         digits, too few for a motion of 100 pixels.
-    attributes
+    attributes : mapping of str to str, optional
         Strings for the header.
 
     Returns

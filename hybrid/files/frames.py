@@ -32,22 +32,21 @@ class Frame:
 
     Attributes
     ----------
-    number
+    number : int
         Frame number.
-    color
-        (H, W, 3) float32, linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
-    albedo, normal, variance, estimate
-        (H, W, 3) float32 or None. Variance is that of the color's mean, in squared radiance.
-    depth, alpha
-        (H, W) float32 or None.
-    motion
-        (H, W, C) float32 as the renderer wrote it, C at least 2, or None; `motion_convention` says what it means.
-    resolution
+    color : (H, W, 3) array of float32
+        Linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
+    albedo, normal, variance, estimate : (H, W, 3) array of float32, optional
+        Variance is that of the color's mean, in squared radiance.
+    depth, alpha : (H, W) array of float32, optional
+    motion : (H, W, C) array of float32, optional
+        As the renderer wrote it, C at least 2; `motion_convention` says what it means.
+    resolution : (int, int), optional
         Height and width, pixels, of the whole picture, which NDC units of the motion are fractions of; without,
         those of `color`.
-    aovs
-        Name → (H, W, C) float32, those that were asked for.
-    source
+    aovs : mapping of str to (H, W, C) array of float32
+        By name, those that were asked for.
+    source : Path, optional
         The file, if there is one.
     """
 
@@ -148,14 +147,14 @@ class Shot:
 
     Attributes
     ----------
-    numbers
+    numbers : tuple of int
         The frames that were asked for and are there, ascending.
-    step
+    step : int
         Distance between neighbouring frames: 1, or 2 where only every second frame was rendered. A renderer's
         motion vectors usually span one frame, whatever the step.
-    missing
+    missing : tuple of int
         The frames that were asked for and are not there.
-    warnings
+    warnings : list of str
         One line each.
 
     Notes
@@ -290,11 +289,11 @@ class Shot:
 
         Parameters
         ----------
-        left_out
+        left_out : collection of str
             Roles of layers that are not read.
-        convention
+        convention : MotionConvention, optional
             What the motion vectors mean; None: as the profile says.
-        variance_scale
+        variance_scale : float, optional
             What the variance is multiplied by; None: as the profile says.
         """
         other = copy(self)
@@ -321,9 +320,9 @@ class Shot:
 
         Parameters
         ----------
-        numbers
+        numbers : iterable of int
             Frame numbers.
-        what
+        what : str
             What to call them: ``frame 1001``, with the name of the file where it holds a layer alone.
         """
         found = {}
@@ -481,18 +480,18 @@ class Shot:
 
         Parameters
         ----------
-        path
+        path : str or Path
             The file to write.
-        number
+        number : int
             Frame number.
-        images
+        images : mapping of str to array
             "color", "alpha" or the name of one of `aovs` → (H, W, C) or (H, W), of the size of `Frame.color`.
             "color" goes where the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
-        extra
+        extra : mapping of str to array, optional
             Layers to add; name → (H, W, C) or (H, W), of the same size.
-        attributes
+        attributes : mapping of str to str, optional
             Strings for the header.
-        others
+        others : iterable of (Shot, mapping of str to array)
             Further `pictures` of the same files, and what replaces layers of theirs.
 
         Returns
@@ -604,23 +603,23 @@ def open_shot(
 
     Parameters
     ----------
-    spec
+    spec : str or Path
         A sequence as `hybrid.files.sequences.find_files` takes it: ``shot.####.exr``, a folder, one file, ….
-    frames
+    frames : str, optional
         A range such as ``1001-1010x2``; else the one that `spec` names, or all.
-    layers
+    layers : mapping of str to str or Layer, optional
         Role → name of a layer in the files (`hybrid.files.layers.find_layers`), or a sequence that holds it:
         ``path/alb.####.exr``, ``path/alb.####.exr:layer``.
-    profile
+    profile : Profile, optional
         Whose names and conventions to take; without, the one that fits the files.
-    motion
+    motion : str, optional
         What vectors mean, where the profile does not say so or is wrong (`hybrid.files.profile.Profile.with_motion`);
         "none": they are not used.
-    aovs
+    aovs : sequence of str
         Names of further layers to load into `Frame.aovs`.
-    keep
-        How many frames to hold in memory; `Shot.window` holds as many as it needs.
-    max_pixels
+    keep : int
+        How many frames to hold in memory; whoever aligns windows keeps what is made of a frame.
+    max_pixels : int
         Of the largest frame that is read, see `hybrid.files.exr.read_exr`.
 
     Raises
@@ -696,14 +695,14 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
 
     Parameters
     ----------
-    pattern
+    pattern : str or Path
         ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (one that is
         there, or any name without ``.exr``), which keeps the input's file names.
-    shot
+    shot : Shot
         The shot.
-    number
+    number : int
         Frame number.
-    beside
+    beside : bool
         Frames that were not asked for get files too.
 
     Raises

@@ -83,16 +83,16 @@ def find_layers(
 
     Parameters
     ----------
-    image
+    image : ExrImage
         From `read_exr`; pixels are not needed.
-    overrides
+    overrides : mapping of str to str or Layer, optional
         Role → name of a layer, as `ExrImage.layer` takes it, or a layer that was found in such a file before; goes
         before what would be found.
-    profile
+    profile : Profile, optional
         Whose names to look for; without, that of the renderer that the file seems to be from.
-    aovs
+    aovs : collection of str
         Names of further layers that are to be denoised along.
-    elsewhere
+    elsewhere : mapping of str to Layer, optional
         Role → layer of another file, which goes before what would be found.
 
     Raises

@@ -37,7 +37,7 @@ def denoise_unet(
 
     Parameters
     ----------
-    color, albedo, normal, quality, prefilter, clean
+    color, albedo, normal, quality, prefilter, clean : array, str or bool
         As for `hybrid.oidn.denoise_oidn`.
 
     Returns

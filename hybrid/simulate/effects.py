@@ -101,7 +101,7 @@ def effects_of(facts: SceneFacts) -> list[Decision]:
 
     Parameters
     ----------
-    facts
+    facts : SceneFacts
         What is in the scene.
 
     Returns
@@ -230,12 +230,12 @@ def needed_bounces(
 
     Parameters
     ----------
-    render
+    render : callable
         `render(settings, seed)` gives a small picture, (H, W, 3) float32 linear radiance, of `samples` samples per
         pixel. The same seed must give the same paths.
-    settings
+    settings : dict of str to object
         As `settings_of` returns them.
-    samples, target_samples
+    samples, target_samples : int
         Samples per pixel of the pilot, and of the cleanest picture that is going to be rendered.
 
     Returns
@@ -325,11 +325,11 @@ def facts_of(scene: Any, frames: Iterable[int], blur_asked: bool = False) -> Sce
 
     Parameters
     ----------
-    scene
-        A `bpy.types.Scene` with a camera.
-    frames
+    scene : bpy.types.Scene
+        With a camera.
+    frames : iterable of int
         The frames that will be rendered.
-    blur_asked
+    blur_asked : bool
         Whether motion blur is wanted, if anything moves.
     """
     frames = list(frames)

@@ -54,16 +54,16 @@ def simulate(
 
     Parameters
     ----------
-    shots
+    shots : sequence of (ShotSettings, Path)
         Settings and folder of each. A folder holds `LEVEL.####.exr` and `meta.json`; frames that are there are left
         alone, and a folder made with other settings is refused.
-    jobs
+    jobs : int
         Blender processes at a time. When there are fewer shots than jobs, the frames of a shot are shared out.
-    threads
+    threads : int, optional
         Of each process; None divides the machine's cores between the jobs.
-    python
+    python : str, optional
         An interpreter that has bpy; None: this one.
-    on_event
+    on_event : callable
         Called as `on_event(kind, shot folder, message)`, kind being `plan` or `frame`.
 
     Raises

@@ -107,10 +107,10 @@ def parse_levels(text: str, samples: int) -> dict[str, int]:
 
     Parameters
     ----------
-    text
+    text : str
         Levels, with commas between; each a number, `n`, or `n/NUMBER` (`e` being Euler's), with or without a name.
         Levels without a name are called `noisy` if there is one, `a`, `b`, `c`, … otherwise.
-    samples
+    samples : int
         n, samples per pixel.
 
     Returns
