@@ -1,9 +1,8 @@
-"""What a comparison runs: methods give finite frames nearer to the truth, and sweeps vary what they say."""
+"""What a comparison runs: methods give finite frames nearer to the truth."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,9 +13,8 @@ from hybrid.alignment.align import Aligner
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
-from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 from hybrid.files.frames import Shot, open_shot
-from hybrid.plan import STAGES, Rules, plan_shot
+from hybrid.plan import Rules
 from hybrid.pseudo_reference import filter_window
 from nlm.average import average
 from tests.scenes import Scene
@@ -76,58 +74,6 @@ class TestMaps:
         trusted = replace(aligned, confidence=np.ones_like(aligned.confidence))
         maps = window_maps(trusted, lambda window: average(window.estimate, window.confidence))
         np.testing.assert_allclose(maps["Temporal contribution"], 2 / 3, atol=2e-4)
-
-
-class TestSweep:
-    def test_every_decision_is_turned_once(self, shot: Shot) -> None:
-        plan = plan_shot(shot)
-        swept = sweep_methods(plan)
-        stages = {next(iter(m.settings)): m for m in swept.values() if m.sweep == "Stages"}
-        assert set(STAGES) - {"alpha"} <= set(stages)
-        for decision in plan.decisions:
-            if decision.stage in stages:
-                assert stages[decision.stage].settings[decision.stage] == ("off" if decision.on else "on")
-        assert {m.sweep for m in swept.values()} == {
-            "Stages", "Window", "TV-L1", "NLM", "Kernel threshold", "Precision", "Tile", "Threads",
-        }  # fmt: skip
-        assert {m.base for m in swept.values()} == {CLASSICAL, NETWORK}
-
-    def test_variants_run_and_differ_from_their_base_where_they_should(self, shot: Shot) -> None:
-        swept = sweep_methods(plan_shot(shot))
-
-        def first(name: str) -> np.ndarray:
-            return next(swept[name].run(shot))[1]
-
-        base = next(METHODS[CLASSICAL].run(shot))[1]
-        np.testing.assert_array_equal(first("standard, window 5"), base)
-        np.testing.assert_array_equal(first("standard, radius 3 patch 2"), base)
-        for name in (
-            "window 1",
-            "demodulate off",
-            "warp off",
-            "dense-flow on",
-            "guided filter off",
-            "radius 7 patch 2",
-        ):
-            assert not np.array_equal(first(f"standard, {name}"), base), name
-
-    def test_settings_of_the_solver_reach_it(self, shot: Shot, monkeypatch: pytest.MonkeyPatch) -> None:
-        seen = []
-
-        def spy(*arguments: np.ndarray, **settings: object) -> np.ndarray:
-            seen.append(settings)
-            return arguments[1]
-
-        monkeypatch.setattr(methods, "refine_flow", spy)
-        run = partial(METHODS[CLASSICAL].run, solver={"scales": 1, "warps": 2, "iterations": 10})
-        next(run(shot))
-        assert seen
-        assert all({"scales": 1, "warps": 2, "iterations": 10}.items() <= settings.items() for settings in seen)
-
-    def test_a_threshold_changes_the_network(self, shot: Shot) -> None:
-        pytest.importorskip("torch")
-        low, high = (next(partial(METHODS[NETWORK].run, threshold=t)(shot))[1] for t in (0.0, 0.75))
-        assert not np.array_equal(low, high)
 
 
 def test_estimators_of_methods_are_those_of_the_library(shot: Shot) -> None:
