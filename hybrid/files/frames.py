@@ -209,6 +209,7 @@ class Shot:
         self._max_pixels = max_pixels
         self._held: OrderedDict[int, Frame] = OrderedDict()
         self._states: dict[Path, Source] = {}
+        self._known: dict[object, Layers] = {}
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -383,8 +384,11 @@ class Shot:
         return layers
 
     def _find_alone(self, image: ExrImage) -> Layers:
-        found = find_layers(image, self._overrides, self.profile, self._aovs, self._elsewhere)
-        found = found.without(self._left_out)
+        # Files of the same channels have the same layers: found once, not with every header that is read.
+        kind = tuple((part.name, part.view, tuple(part.channels)) for part in image.parts)
+        if kind not in self._known:
+            self._known[kind] = find_layers(image, self._overrides, self.profile, self._aovs, self._elsewhere)
+        found = self._known[kind].without(self._left_out)
         if found.motion is not None and self._convention is not None:
             found = replace(found, motion_convention=self._convention)
         return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)
@@ -421,7 +425,7 @@ class Shot:
         other = copy(self)
         for name in ("_first_layers", "_size", "_canvas", "pictures"):
             other.__dict__.pop(name, None)
-        other._held = OrderedDict()
+        other._held, other._known = OrderedDict(), {}
         other._overrides = {**self._overrides, "color": color}
         return other
 
