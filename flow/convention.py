@@ -37,7 +37,8 @@ LEAST = 0.02
 GOOD = 0.25
 # Where nothing is known of the scale, other lengths are tried unless a plain one leaves less than this share.
 EXACT = 0.05
-# What overrules what was stated leaves less than this share of what that leaves.
+# What overrules what was stated leaves less than this share of what that leaves; or, where no motion explains much
+# of the change (reflections, what was hidden), that explains less than this share of what it does.
 OVERRULES = 0.5
 # Vectors explain at least this share of what a flow found in the pictures does, where that explains as much.
 WORTH = 0.5
@@ -117,6 +118,11 @@ class Choice:
     trials: tuple[Trial, ...]
     unrelated: tuple[int, ...] = ()
 
+    @property
+    def certain(self) -> bool:
+        """Whether something changes, and the reading leaves next to nothing of it."""
+        return self.still > LEAST and self.unexplained <= max(GOOD * self.still, LEAST)
+
 
 def choose_convention(
     pairs: Iterable[FramePair], assumed: MotionConvention, settled: Collection[str] = PARTS
@@ -160,8 +166,7 @@ def choose_convention(
     harms = trials.clearly_better(None, chosen)
     if settled and (harms or not trials.good(chosen)):
         other = trials.best(assumed, frozenset())
-        clearly = trials.clearly_better(other, chosen) and trials.clearly_better(other, None)
-        if clearly and trials.left(other) <= OVERRULES * trials.left(chosen):
+        if trials.overrules(other, chosen):
             chosen, harms = other, trials.clearly_better(None, other)
     believed, found = not harms, None
     if believed and not trials.good(chosen):
@@ -333,6 +338,12 @@ class _Trials:
         enough = len(difference) >= INSIDE * len(self.costs(None))
         return enough and float(difference.mean()) > CLEARLY * float(difference.std()) / np.sqrt(len(difference))
 
+    def overrules(self, other: MotionConvention, stated: MotionConvention) -> bool:
+        """Whether another reading leaves half of what the stated one does, or that explains half of what this does."""
+        clearly = self.clearly_better(other, stated) and self.clearly_better(other, None)
+        gain, stated_gain = (self.left(None) - self.left(reading) for reading in (other, stated))
+        return clearly and (self.left(other) <= OVERRULES * self.left(stated) or stated_gain <= OVERRULES * gain)
+
     def best(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
         """The reading that leaves least, or one that is preferred to it and not clearly worse."""
         readings = self._readings(assumed, settled)
@@ -342,7 +353,7 @@ class _Trials:
         least = min(readings, key=self.mean)
         if "scale" not in settled:
             fitted = self._fit_scale(least if self.good(least, EXACT) else self._fit_length(assumed, settled))
-            if self.clearly_better(fitted, least) and self.left(fitted) <= OVERRULES * self.left(least):
+            if self.overrules(fitted, least):
                 return fitted
         return next(reading for reading in readings if not self.clearly_better(least, reading))
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.convention import LEAST, PARTS, Choice, FramePair, choose_convention
+from flow.convention import PARTS, Choice, FramePair, choose_convention
 from flow.guide import median_luminance, tone_map
 from hybrid.files.frames import Frame, Shot
 from hybrid.files.layers import Layers
@@ -147,7 +147,7 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     layers, pairs = shot.layers(shot.available[0]), _pair_numbers(shot)
     if layers.motion_convention is None or layers.settled >= set(PARTS):
         first = _judge(shot, layers, pairs[:1])
-        if not first.findings and (first.motion is None or first.motion.still > LEAST):
+        if not first.findings and (first.motion is None or first.motion.certain):
             return first  # one pair has shown that all is as it is said to be
         if len(pairs) < 2:
             return first
