@@ -45,6 +45,13 @@ def draft(folder, out, *more):
     return main(["pseudoref", str(folder), "-o", str(out), "--preset", "draft", *more])
 
 
+def contents(folder):
+    """Bytes of the frames in a folder, of which there is one at least."""
+    found = {path.name: path.read_bytes() for path in folder.glob("*.exr")}
+    assert found
+    return found
+
+
 def stamps(folder):
     return {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
 
@@ -180,8 +187,7 @@ def test_resume_of_the_network_gives_the_same_bytes(tmp_path):
     kept = stamps(tmp_path / "parts")
     assert main([*words, str(tmp_path / "parts"), "--resume"]) == 0
     assert kept.items() <= stamps(tmp_path / "parts").items()
-    for path in (tmp_path / "whole").glob("*.exr"):
-        assert path.read_bytes() == (tmp_path / "parts" / path.name).read_bytes()
+    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
 
 
 BUSY = """
@@ -371,13 +377,7 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
     assert draft(tall, tmp_path / "whole") == 0
     monkeypatch.setattr("hybrid.memory.plan_rows", lambda *_, **__: 64)
     assert draft(tall, tmp_path / "parts", "--max-memory", "1G") == 0
-    for path in (tmp_path / "whole").glob("*.exr"):
-        np.testing.assert_array_equal(
-            *(
-                read_exr(folder / path.name).pixels(("ViewLayer.Combined.R",))
-                for folder in (path.parent, tmp_path / "parts")
-            )
-        )
+    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
 
 
 FAULTS = """
@@ -408,5 +408,4 @@ def test_one_thread_or_two_give_the_same_bytes(tmp_path):
         words = ["-m", "hybrid.cli", "pseudoref", str(folder), "-o", str(tmp_path / count), "--effects", "refine"]
         done = run_alone(*words, NUMBA_NUM_THREADS=count, OMP_NUM_THREADS=count)
         assert done.returncode == 0, done.stderr
-    for path in (tmp_path / "1").glob("*.exr"):
-        assert path.read_bytes() == (tmp_path / "2" / path.name).read_bytes()
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")

@@ -103,7 +103,9 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
     run("whole", None)
     for part in ("1001-1004", "1005", "1006-1008", "1009-1012"):
         run("parts", part)
-    for path in sorted((tmp_path / "whole").glob("*.exr")):
+    whole = sorted((tmp_path / "whole").glob("*.exr"))
+    assert len(whole) == 12
+    for path in whole:
         one, other = read_exr(path), read_exr(tmp_path / "parts" / path.name)
         assert one.parts[0].header["ravg/stages"] == other.parts[0].header["ravg/stages"]
         for name in one.channel_names:

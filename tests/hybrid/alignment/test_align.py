@@ -62,7 +62,7 @@ def test_without_refinement_nothing_is_refined(fast_folder):
     def fail(guides, start):
         raise AssertionError("refined")
 
-    flow_error(fast_folder, STAGES, refine=fail)
+    assert flow_error(fast_folder, STAGES, refine=fail) == pytest.approx(1.5, abs=0.01)
 
 
 def window(folder, **options):

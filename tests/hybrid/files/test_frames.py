@@ -200,8 +200,9 @@ def test_frames_that_are_kept_are_read_once_and_no_more_are_held(tmp_path, monke
 
     monkeypatch.setattr(frames_module, "read_exr", counted)
     for number in shot.numbers:
-        for near in neighbours(shot, number, 2):
-            assert near is None or shot.read(near).number == near
+        there = [near for near in neighbours(shot, number, 2) if near is not None]
+        assert len(there) >= 3
+        assert [shot.read(near).number for near in there] == there
         assert len(shot._held) <= 5
     assert sorted(opened) == [shot.path(number) for number in shot.numbers]
 
