@@ -7,13 +7,13 @@ convention, guides of another frame. What does not make sense is left out, and a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.convention import PARTS, Choice, FramePair, choose_convention
+from flow.convention import PARTS, SCALES, Choice, FramePair, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from hybrid.files.frames import Frame, Shot
 from hybrid.files.layers import Layers
@@ -90,11 +90,22 @@ class Judgement:
         return tuple(finding.message for finding in self.findings if finding.warning)
 
     def readings(self) -> list[tuple[str, str, str]]:
-        """What was tried for the motion, the best first: "taken" or "", how vectors are read, and what that leaves."""
+        """What was tried for the motion, the best first: "taken" or "", how vectors are read, and what that leaves.
+
+        The one that is taken, or else the best, is always among them; of scales that were fitted only the best is.
+        """
         if self.motion is None:
             return []
-        tried = [(trial.convention, str(trial.convention), trial.unexplained) for trial in self.motion.trials[:SHOWN]]
-        rows = [(convention == self.motion.convention, said, share) for convention, said, share in tried]
+        chosen = self.motion.convention
+        kept: list[Trial] = []
+        for trial in self.motion.trials:
+            plain = replace(trial.convention, scale=1.0)
+            fitted = trial.convention.scale not in SCALES and any(
+                plain == replace(k.convention, scale=1.0) for k in kept
+            )
+            if trial.convention == chosen or (not fitted and len(kept) < SHOWN):
+                kept.append(trial)
+        rows = [(trial.convention == chosen, str(trial.convention), trial.unexplained) for trial in kept]
         rows.append((False, "no motion", self.motion.still))
         if self.motion.found is not None:
             rows.append((self.motion.convention is None, "found in the pictures", self.motion.found))

@@ -246,3 +246,10 @@ def test_a_cut_is_noticed(tmp_path) -> None:
     judgement = judge_layers(open_shot(write(tmp_path, edit)))
     assert judgement.warnings == ("frames 9 and 10 show something else: a cut, or another light?",)
     assert not judgement.findings[0].left_out  # the vectors are as good as they were
+
+
+def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales() -> None:
+    rows = judge_layers(open_shot(SHOT / "noisy.####.exr")).readings()
+    assert [said for taken, said, _ in rows if taken] == ["cycles,pixels,y-up"]
+    assert rows[-1][1] in ("no motion", "found in the pictures")
+    assert len([said for _, said, _ in rows if said.startswith("cycles,pixels,y-up,scale=0.9")]) <= 1
