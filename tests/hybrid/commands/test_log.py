@@ -136,3 +136,11 @@ def test_terminals_that_know_only_ascii(shot_folder, environment):
     assert done.returncode == 0, done.stderr
     assert b"56x40" in done.stdout
     assert done.stdout.isascii()
+
+
+def test_the_first_run_says_that_it_compiles_and_later_ones_do_not(shot_folder, tmp_path):
+    cache = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command, options = ravg("pseudoref", shot_folder, "-o", tmp_path / "out", "--preset", "draft", env=cache)
+    said = [subprocess.run(command, **options, capture_output=True, text=True, check=True).stderr for _ in range(2)]
+    assert ["compiling for this processor" in words for words in said] == [True, False]
+    assert said[0].count("compiling") == 1
