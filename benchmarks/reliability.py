@@ -28,6 +28,7 @@ NAMES = {
     "test_hard_stages": "every stage of flow and nlm (drawn at random)",
     "test_hard_network": "kernels, losses, gradients, metrics",
     "test_hard_weights": "weights files, damaged and hostile",
+    "test_hard_checks": "absurd values, estimates and pictures that cannot be right",
     "test_hard_files": "EXR files and the names in them",
     "test_hard_faults": "resume, interrupts, memory, threads",
 }

@@ -21,6 +21,7 @@ from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, denoise_oidn
+from hybrid.plausibility import LOST, find_lost_light
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
 
@@ -328,9 +329,18 @@ def _checked(found: Array | None, frame: Frame) -> Array | None:
     """An estimate that fits its frame and is finite."""
     if found is None:
         return None
+    what = f"the estimate of frame {frame.number}"
     if found.shape != frame.color.shape:
-        raise ValueError(f"the estimate of frame {frame.number} has shape {found.shape}, expected {frame.color.shape}")
-    return np.maximum(replace_nonfinite(found)[0], 0)
+        raise ValueError(f"{what} has shape {found.shape}, expected {frame.color.shape}")
+    filled, lost = replace_nonfinite(found)
+    noisy, bad = replace_nonfinite(frame.color)
+    # What the renderer has lost as well counts for nothing.
+    if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
+        raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
+    filled = np.maximum(filled, 0)
+    if fault := find_lost_light(filled, noisy, ~bad):
+        raise ValueError(f"{what}: {fault}")
+    return filled
 
 
 def _from_file(frame: Frame) -> Array | None:

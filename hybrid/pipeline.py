@@ -15,6 +15,7 @@ from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, describe_sources, why_stale
 from hybrid.plan import Plan, Rules, as_run
+from hybrid.plausibility import find_lost_light, find_nonfinite
 from hybrid.timing import Timings
 
 Array = NDArray[np.float32]
@@ -153,7 +154,8 @@ def denoise_frames(
     Raises
     ------
     ValueError
-        If a frame would be written over its own input.
+        If a frame would be written over its own input, or its picture cannot be right: it is not finite, or its light
+        is not that of the noisy frame (`hybrid.plausibility.find_lost_light`).
 
     Notes
     -----
@@ -185,8 +187,12 @@ def denoise_frames(
                 pictures.append((picture, {"color": theirs.color, **theirs.aovs}))
                 counted.append(counts)
             plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
-            with timings.stage("write"):
+            with timings.stage("check"):
                 images = {"color": denoised.color, **denoised.aovs}
+                _check_picture(images, aligner, number)
+                for (_, layers), other in zip(pictures, beside, strict=True):
+                    _check_picture(layers, other, number)
+            with timings.stage("write"):
                 own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}
                 for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
                     if read is not None:
@@ -248,6 +254,23 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
         del aligned, part, named
     kinds = {kind: {name: layer for (k, name), layer in whole.items() if k == kind} for kind in ("aovs", "extra")}
     return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), counts
+
+
+def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -> None:
+    """Raise ValueError for a picture that cannot be right: whatever made it so, no file is better than this one."""
+    for name, layer in images.items():
+        if fault := find_nonfinite(layer):
+            raise ValueError(f"frame {number}, {name}: {fault}; it was not written")
+    frame = aligner.frame(number)
+    if frame is None:
+        return
+
+    def around() -> float:
+        near = (aligner.frame(n) for n in aligner.around(number, aligner.radius))
+        return max(float(other.radiance.mean(dtype=np.float64)) for other in near if other is not None)
+
+    if fault := find_lost_light(images["color"], frame.radiance, frame.valid, around):
+        raise ValueError(f"frame {number}: {fault}; it was not written")
 
 
 def _made_from(pictures: Sequence[tuple[Shot, Estimates | None]], number: int, reach: int) -> str:

@@ -38,6 +38,12 @@ LENGTH = 1.1
 EDGES = 0.05
 # The variance may differ from what the picture shows by this factor: the third quartile of their ratio was 1.3 to 1.7.
 VARIANCE = 4.0
+# The mean of a denoised picture may differ from that of the noisy one by this factor. What single bright samples carry
+# is uncertain: so it must differ by so many standard errors too (of independent pixels, where a renderer's filter and
+# denoisers make neighbours alike), and by a share of the brightest frame around it, whose light leaks into a dark one.
+LIGHT, ERRORS, LEAK = 2.5, 10.0, 0.05
+# Share of its pixels that an estimate may have lost.
+LOST = 0.01
 # So many readings of the vectors are shown.
 SHOWN = 6
 # Two pictures of which so many pixels are equal are one.
@@ -393,3 +399,51 @@ def _judge_motion(layers: Layers, choice: Choice, pairs: Sequence[tuple[int, int
     elif choice.open:
         words = f"{name}: the pictures do not tell {', '.join(choice.open)}: taken as {choice.convention}"
         yield Finding("motion", words, warning=False, left_out=False)
+
+
+def find_nonfinite(picture: Array) -> str | None:
+    """Say how many pixels of a picture (H, W) or (H, W, C) are not finite; None where all are."""
+    if np.isfinite(picture.sum(dtype=np.float64)):
+        return None
+    lost = np.count_nonzero(~np.isfinite(picture.reshape(*picture.shape[:2], -1)).all(axis=-1))
+    return f"{lost} of {picture.shape[0] * picture.shape[1]} pixels are not finite" if lost else None
+
+
+def find_lost_light(
+    picture: Array, noisy: Array, valid: NDArray[np.bool_], around: Callable[[], float] = lambda: 0.0
+) -> str | None:
+    """Say by how much a denoised picture differs in brightness from the noisy one; None where it does not.
+
+    Parameters
+    ----------
+    picture, noisy : (H, W, 3) array
+        Radiance, finite.
+    valid : (H, W) bool array
+        Where the noisy picture has been rendered.
+    around : callable
+        Gives the mean of the brightest picture whose light may have been mixed in; asked only in doubt.
+
+    Returns
+    -------
+    str or None
+        The channel's share of the light, in words.
+
+    Notes
+    -----
+    With means a of the picture and b of the noisy one, a channel is at fault where |a − b| exceeds `ERRORS` standard
+    errors of b and `LEAK` of what is around, and a > `LIGHT`·b or b > `LIGHT`·a.
+    """
+    if (count := np.count_nonzero(valid)) == 0:
+        return None
+    mask = valid.astype(np.uint8)
+    a, b = (np.array(cv2.mean(image, mask)[:3]) for image in (picture, noisy))  # summed in float64
+    if ((a <= LIGHT * b) & (b <= LIGHT * a)).all():
+        return None
+    error = cv2.meanStdDev(noisy, mask=mask)[1].ravel() / np.sqrt(count)
+    leak = LEAK * around()
+    far = np.abs(a - b) > np.maximum(ERRORS * error, leak)
+    faulty = far & ((a > LIGHT * b) | (b > LIGHT * a)) & ((b > 0) | (leak > 0))
+    for index in np.flatnonzero(faulty):
+        share = f"{a[index] / b[index]:.2g} times the light" if b[index] > 0 else "light where none was rendered"
+        return f"it has {share} in channel {'RGB'[index]}, expected at most {LIGHT:g} times more or less"
+    return None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,7 +14,6 @@ from typing import Any, TypeVar, cast
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
 
 from network.models import (
     TKPCN,
@@ -37,6 +38,16 @@ VERSION = 3
 LARGEST = 256
 
 
+#: The greatest weight that is read: a thousand times that of any network here. What is heavier makes NaN of pictures.
+HEAVIEST = 5e3
+#: Bounds of single numbers in it, two to four times what any network here has.
+BOUNDS = {"frames": 15, "size": 21, "conv_size": 15, "scales": 8, "blocks": 64, "temporal_blocks": 16}
+#: How deep they may lie: a network within scales, its configuration, that of its kernels, a list.
+DEEPEST = 5
+#: How many weights a network may have: twenty times those of the largest here.
+PARAMETERS = 10**8
+#: Characters of a description, or of the notes on a training of weeks; and what a message quotes of them.
+LONGEST, QUOTED = 2**24, 160
 #: Networks by name, with their configurations.
 CLASSES: dict[str, tuple[Any, Any]] = {
     "RAUNet": (RAUNet, RAUNetConfig),
@@ -85,6 +96,8 @@ def build(description: Mapping[str, Any]) -> Model:
     try:
         name = description["model"]
         if name == "MultiScale":
+            if description["base"]["model"] == "MultiScale":
+                raise ValueError("expected scales of a network that has one, got scales of scales")
             base = cast(RAUNet | RAResNet, build(description["base"]))
             return MultiScale(MultiScaleConfig(base.config, description["scales"]))
         if name not in CLASSES:
@@ -123,12 +136,12 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
     Raises
     ------
     ValueError
-        If a weight is not finite in half precision.
+        If a weight is not finite, or more than `HEAVIEST`.
     """
     tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in model.state_dict().items()}
     for name, value in tensors.items():
-        if not bool(torch.isfinite(value).all()):
-            raise ValueError(f"{name}: expected finite weights in half precision, got NaN or infinity")
+        if not bool((value.abs() <= HEAVIEST).all()):
+            raise ValueError(f"{name}: expected finite weights up to {HEAVIEST:g}, got others")
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),
@@ -183,35 +196,55 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         If the file is cut short, no safetensors file, not ours, of another version, or its weights are not
         those of the model it names.
     """
-    metadata, tensors = _read(path)
     where = f"weights {os.fspath(path)!r}"
-    try:
-        description = json.loads(metadata["description"])
-        _refuse_huge(description)
-        model = build(description)
-    except (KeyError, ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: {error}") from error
-    wanted = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if wanted != found:
-        name = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
-        raise ValueError(f"{where}: {name}: expected shape {wanted.get(name)}, got {found.get(name)}")
+    with _open(path) as (file, metadata):
+        try:
+            description = _parse(metadata, "description")
+            _refuse_huge(description)
+            with torch.device("meta"):  # shapes alone, which take no memory
+                wanted = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
+        except (KeyError, ValueError, RecursionError) as error:
+            raise ValueError(f"{where}: {_short(error)}") from error
+        found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        if wanted != found:
+            name = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
+            got = f"expected shape {wanted.get(name)}, got {found.get(name)}"
+            raise ValueError(f"{where}: {_short(name)}: {got}")
+        if (count := sum(math.prod(shape) for shape in found.values())) > PARAMETERS:
+            raise ValueError(f"{where}: expected at most {PARAMETERS:g} parameters, got {count}")
+        tensors = {name: file.get_tensor(name) for name in found}
     for name, value in tensors.items():
-        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
-            raise ValueError(f"{where}: {name}: expected finite numbers, got {value.dtype} with others among them")
+        if not value.is_floating_point() or not bool((value.abs() <= HEAVIEST).all()):
+            raise ValueError(f"{where}: {name}: expected finite numbers up to {HEAVIEST:g}, got others")
+    model = build(description)
     model.load_state_dict({name: value.float() for name, value in tensors.items()})
     return model
 
 
-def _refuse_huge(value: Any) -> None:
-    """Raise ValueError for a description that would take all memory, or for ever, to build."""
+def _refuse_huge(value: Any, name: str = "", depth: int = 0) -> None:
+    """Raise ValueError for a description that would take all memory, or for ever, to build or to run."""
     if isinstance(value, Mapping | list):
+        if depth == DEEPEST:
+            raise ValueError(f"model description: expected values within at most {DEEPEST} others, got more")
         if len(value) > LARGEST:
             raise ValueError(f"model description: expected at most {LARGEST} values together, got {len(value)}")
-        for item in value.values() if isinstance(value, Mapping) else value:
-            _refuse_huge(item)
-    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
-        raise ValueError(f"model description: expected numbers up to {LARGEST}, got {value}")
+        for key, item in value.items() if isinstance(value, Mapping) else ((name, item) for item in value):
+            _refuse_huge(item, key, depth + 1)
+    elif isinstance(value, int | float) and not abs(value) <= (bound := BOUNDS.get(name, LARGEST)):
+        raise ValueError(f"model description: {name}: expected a number up to {bound}, got {_short(value)}")
+
+
+def _parse(metadata: Mapping[str, str], name: str) -> Any:
+    """The JSON value of an entry of a file's metadata."""
+    if len(text := metadata[name]) > LONGEST:
+        raise ValueError(f"{name}: expected at most {LONGEST} characters, got {len(text)}")
+    return json.loads(text)
+
+
+def _short(words: object) -> str:
+    """What a message quotes of a file: a line at most."""
+    text = " ".join(str(words).split())
+    return text if len(text) <= QUOTED else f"{text[:QUOTED]}…"
 
 
 def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -232,27 +265,27 @@ def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
     FileNotFoundError, ValueError
         As `load_model`.
     """
-    metadata, _ = _read(path)
-    try:
-        notes: dict[str, Any] = json.loads(metadata["notes"])
-    except (KeyError, ValueError, RecursionError) as error:
-        raise ValueError(f"weights {os.fspath(path)!r}: {error!r}") from error
+    with _open(path) as (_, metadata):
+        try:
+            notes: dict[str, Any] = _parse(metadata, "notes")
+        except (KeyError, ValueError, RecursionError) as error:
+            raise ValueError(f"weights {os.fspath(path)!r}: {_short(repr(error))}") from error
     return notes
 
 
-def _read(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a file, if it is one of ours."""
+@contextmanager
+def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
+    """A file and its metadata, if it is one of ours; nothing else has been read yet."""
     where = f"weights {os.fspath(path)!r}"
     if not Path(path).is_file():
         raise FileNotFoundError(f"{where}: no such file")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            if metadata.get("format") != FORMAT:
+                raise ValueError(f"{where}: expected format {FORMAT!r}, got {_short(repr(metadata.get('format')))}")
+            if metadata.get("version") != str(VERSION):
+                raise ValueError(f"{where}: expected version {VERSION}, got {_short(metadata.get('version'))}")
+            yield file, metadata
     except SafetensorError as error:
-        raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
-    if metadata.get("format") != FORMAT:
-        raise ValueError(f"{where}: expected format {FORMAT!r}, got {metadata.get('format')!r}")
-    if metadata.get("version") != str(VERSION):
-        raise ValueError(f"{where}: expected version {VERSION}, got {metadata.get('version')}")
-    return metadata, tensors
+        raise ValueError(f"{where}: no safetensors file, or cut short ({_short(error)})") from error

@@ -145,11 +145,16 @@ def print_table(table: Any, **facts: object) -> None:
     LOG.info("", extra={"table": table, "facts": facts})
 
 
+# Of a message that quotes a file more characters tell nobody more.
+LONGEST = 2000
+
+
 def one_line(error: BaseException) -> str:
     """What an error says, without line breaks and without what would command a terminal."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return printable(f"{error.filename}: {error.strerror}")
-    return printable(" ".join(str(error).split()))
+    words = printable(" ".join(str(error).split()))
+    return words if len(words) <= LONGEST else f"{words[:LONGEST]}…"
 
 
 def printable(words: str) -> str:

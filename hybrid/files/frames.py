@@ -25,6 +25,11 @@ from hybrid.files.sequences import find_files, format_frames, name_holes, parse_
 from hybrid.files.sources import Source, identify
 from nlm.variance import variance_from_halves
 
+# No light is brighter: the squares of so much, summed over all pixels of the largest frame, still fit float32. One
+# pixel of 1e30 made NaN of all frames around it.
+LARGEST = 1e14
+LIMITED = frozenset({"color", "albedo", "normal", "variance", "half_a", "half_b", "estimate"})
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -768,6 +773,8 @@ def _frame(
     if following is not None and layers.motion_convention is not None:
         one = layers.motion_convention.channels // 2
         taken["motion"] = np.concatenate([taken["motion"][..., :one], following[..., :one]], axis=-1)
+    for role in LIMITED & taken.keys():
+        taken[role] = _limited(taken[role], LARGEST**2 if role == "variance" else LARGEST)
     halves = taken.pop("half_a", None), taken.pop("half_b", None)
     if "variance" not in taken and halves[0] is not None and halves[1] is not None:
         taken["variance"] = variance_from_halves(halves[0], halves[1])
@@ -779,6 +786,12 @@ def _frame(
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
         source=image.path,
     )
+
+
+def _limited(layer: np.ndarray, largest: float) -> np.ndarray:
+    """A layer whose values beyond these bounds are NaN, as lost as those that are not finite."""
+    beyond = (layer > largest) | (layer < -largest)
+    return np.where(beyond, np.float32(np.nan), layer) if beyond.any() else layer
 
 
 def _pixels(image: ExrImage, layer: Layer, canvas: tuple[int, int, int, int]) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import tracemalloc
 from contextlib import suppress
 
 import pytest
@@ -16,7 +17,7 @@ from safetensors.torch import save_file  # noqa: E402
 
 from hybrid.cli import main  # noqa: E402
 from hybrid.neural.denoiser import shipped_weights  # noqa: E402
-from network.checkpoint import VERSION, describe, load_model, save_model  # noqa: E402
+from network.checkpoint import VERSION, describe, load_model, load_notes, save_model  # noqa: E402
 from network.models import fast, paper, unet  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -151,8 +152,58 @@ def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
         load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+def nested(depth):
+    described = describe(unet())
+    for _ in range(depth):
+        described = {"model": "MultiScale", "scales": 2, "base": described}
+    return described
+
+
+@pytest.mark.parametrize("depth", [2, 10, 400])
+def test_descriptions_that_nest_are_refused_before_anything_is_built(tmp_path, depth):
+    """986 bytes of scales of scales took 22 GB."""
+    path = write(tmp_path / "x.safetensors", description=json.dumps(nested(depth)))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"scales of scales|values within at most") as caught:
+        load_model(path)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "word"),
+    [
+        (paper, {"conv_size": 99}, "conv_size: expected a number up to 15, got 99"),
+        (paper, {"blocks": 255}, "blocks: expected a number up to 64"),
+        (paper, {"width": 10**400}, "width: expected a number up to 256, got 1000"),
+        (fast, {"frames": 255}, "frames: expected a number up to 15, got 255"),
+        (unet, {"widths": [256] * 250}, "expected shape|widths"),
+        (unet, {"kernel": {"frames": 5, "size": 255, "threshold": 0.5, "activation": "relu"}}, "size: expected"),
+    ],
+    ids=["conv_size", "blocks", "digits", "frames", "widths", "size"],
+)
+def test_what_would_take_for_ever_to_run_is_refused_too(tmp_path, model, changes, word):
+    described = describe(model())
+    described["config"] |= changes
+    with pytest.raises(ValueError, match=word) as caught:
+        load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("entry", ["format", "version", "description", "notes"])
+def test_a_message_quotes_no_more_than_a_line(tmp_path, capsys, entry):
+    """An entry of a megabyte stood in the message, line by line."""
+    path = write(tmp_path / "x.safetensors", **{entry: "x\n" * 500_000})
+    read = load_notes if entry == "notes" else load_model
+    with pytest.raises(ValueError, match="weights") as caught:
+        read(path)
+    assert len(str(caught.value)) < 600
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 6e4, -6e4])
+def test_weights_that_are_not_finite_or_absurd_are_refused(tmp_path, value):
     """They made every picture NaN."""
     model = fast()
     with torch.no_grad():

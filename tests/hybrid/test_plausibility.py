@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import open_shot
-from hybrid.plausibility import judge_layers
+from hybrid.plausibility import find_lost_light, find_nonfinite, judge_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 
@@ -253,3 +254,48 @@ def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales()
     assert [said for taken, said, _ in rows if taken] == ["cycles,pixels,y-up"]
     assert rows[-1][1] in ("no motion", "found in the pictures")
     assert len([said for _, said, _ in rows if said.startswith("cycles,pixels,y-up,scale=0.9")]) <= 1
+
+
+# --- what comes out
+
+
+def test_a_picture_of_another_brightness_is_found_and_noise_is_not():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.5, 2, (40, 56, 3)).astype(np.float32)
+    noisy = truth * rng.gamma(0.2, 5, (40, 56, 1)).astype(np.float32)  # four samples a pixel of a hard light, say
+    valid = np.ones((40, 56), bool)
+    assert find_lost_light(truth, noisy, valid) is None
+    for scale, said in ((3, "[23].* times the light in channel R"), (0.3, "0.[23].* times the light in channel R")):
+        assert re.search(said, find_lost_light(np.float32(scale) * truth, noisy, valid))
+    red = truth.copy()
+    red[..., 1] = 0
+    assert "channel G" in find_lost_light(red, noisy, valid)
+    for scale in (1e-12, 1e12):
+        assert find_lost_light(np.float32(scale) * truth, np.float32(scale) * noisy, valid) is None
+        assert find_lost_light(np.float32(4 * scale) * truth, np.float32(scale) * noisy, valid) is not None
+
+
+def test_what_one_sample_carries_is_no_lost_light():
+    """A firefly of a million times the light of all others together."""
+    noisy = np.ones((40, 56, 3), np.float32)
+    noisy[3, 4] = 1e6
+    assert find_lost_light(np.ones_like(noisy), noisy, np.ones((40, 56), bool)) is None
+
+
+def test_light_is_looked_for_only_where_it_was_rendered():
+    noisy, valid = np.ones((8, 8, 3), np.float32), np.zeros((8, 8), bool)
+    assert find_lost_light(5 * noisy, noisy, valid) is None
+    valid[0] = True
+    assert find_lost_light(5 * noisy, noisy, valid) is not None
+    dark = np.zeros_like(noisy)
+    valid[:] = True
+    assert find_lost_light(noisy, dark, valid, lambda: 100.0) is None  # a hundredth of what is beside it
+    assert "light where none was rendered" in find_lost_light(noisy, dark, valid, lambda: 2.0)
+
+
+def test_pixels_that_are_not_finite_are_counted():
+    picture = np.ones((4, 5, 3), np.float32)
+    assert find_nonfinite(picture) is None
+    assert find_nonfinite(np.full((4, 5), 3e38, np.float32)) is None
+    picture[0, :2, 1], picture[1, 1] = np.inf, np.nan
+    assert find_nonfinite(picture) == "3 of 20 pixels are not finite"
