@@ -94,6 +94,39 @@ def test_the_extension_for_blender_imports_blender_and_nothing_else():
         assert imports(path) - {"bpy"} <= sys.stdlib_module_names, path.name
 
 
+# Modules that are tested by others' files so far. None may join them.
+WITHOUT_TESTS_OF_THEIR_OWN = {
+    "hybrid/alignment/measure.py",
+    "hybrid/alignment/prepare.py",
+    "hybrid/breakdown.py",
+    "hybrid/commands/denoise.py",
+    "hybrid/commands/inspect.py",
+    "hybrid/commands/options.py",
+    "hybrid/commands/simulate.py",
+    "hybrid/commands/status.py",
+    "hybrid/interrupt.py",
+    "hybrid/memory.py",
+    "hybrid/neural/train.py",
+    "hybrid/pipeline.py",
+    "hybrid/simulate/evaluation.py",
+    "hybrid/simulate/fixed.py",
+    "hybrid/simulate/motion.py",
+    "hybrid/simulate/props.py",
+    "hybrid/simulate/scenes.py",
+    "hybrid/simulate/shot.py",
+    "hybrid/simulate/things.py",
+    "hybrid/simulate/validation.py",
+}
+
+
+@pytest.mark.parametrize("package", sorted(OURS))
+def test_a_modules_tests_are_where_anyone_would_look(package):
+    modules = [path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py"]
+    assert len(modules) > 5
+    without = {str(path) for path in modules if not (ROOT / "tests" / path.parent / f"test_{path.name}").is_file()}
+    assert without <= WITHOUT_TESTS_OF_THEIR_OWN
+
+
 def test_compiled_loops_leave_the_order_of_arithmetic_alone():
     """With fastmath a process that had compiled a loop gave other last digits than one that found it in the cache."""
     loops = 0

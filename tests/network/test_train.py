@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from dataclasses import replace
@@ -16,28 +15,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 import network.train
 from network import losses
-from network.checkpoint import build, describe, load_model, load_notes, save_model
+from network.checkpoint import load_model, load_notes
 from network.clips import Clip, Clips, Samples, open_clips, split_by_shot, write_shards
-from network.models import (
-    TKPCN,
-    KernelConfig,
-    Model,
-    MultiScale,
-    MultiScaleConfig,
-    RAResNet,
-    RAResNetConfig,
-    RAUNet,
-    RAUNetConfig,
-    TKPCNConfig,
-)
-from network.stabilizer import Stabilizer, StabilizerConfig
+from network.models import Model
 from network.train import batch_loss, image_loss, train, validate
 from network.train_config import LOSSES, SamplerConfig, TrainConfig
+from tests.network.small import MODELS, make_model, make_stabilizer
 
 pytestmark = pytest.mark.neural
 
@@ -83,17 +69,6 @@ def sets(clips: Clips) -> tuple[Clips, Clips]:
 CONFIG = TrainConfig(
     steps=6, batch=2, rate=3e-3, warmup=3, ema=0.9, bfloat16=False, device="cpu", sampler=SamplerConfig(crop=16, sets=1)
 )
-
-
-def make_model(seed: int = 0) -> RAUNet:
-    torch.manual_seed(seed)
-    kernel = KernelConfig(frames=3, size=3, threshold=0)
-    return RAUNet(RAUNetConfig(kernel, widths=(8, 8), ra_scales=(1,)))
-
-
-def make_stabilizer() -> Stabilizer:
-    torch.manual_seed(0)
-    return Stabilizer(StabilizerConfig(3, 2, (4, 8), (0, 1)))
 
 
 def a_batch(clips: Clips, config: TrainConfig, count: int) -> dict[str, torch.Tensor]:
@@ -157,16 +132,6 @@ def test_a_compiled_network_trains_alike(
     monkeypatch.setattr(torch, "compile", lambda model: compiling(model, backend="eager", fullgraph=True))
     traced = train(sets[0], sets[0].of([]), make_model(), replace(CONFIG, steps=2, compile=True), tmp_path / "b")
     assert traced == pytest.approx(plain, rel=1e-4)  # operations may be grouped otherwise
-
-
-SMALL = KernelConfig(frames=3, size=3)
-MODELS = {
-    "resnet": lambda: RAResNet(RAResNetConfig(SMALL, width=4, blocks=2, ra_after=(1, 2), skips=1)),
-    "tkpcn": lambda: TKPCN(TKPCNConfig(SMALL, width=4, blocks=1)),
-    "multi-scale": lambda: MultiScale(MultiScaleConfig(make_model().config, scales=3)),
-    "softmax": lambda: RAUNet(RAUNetConfig(replace(SMALL, activation="softmax"), (4, 4), (1,))),
-    "stabilizer": make_stabilizer,
-}
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -310,112 +275,3 @@ def test_the_learning_rate_warms_up_and_falls() -> None:
     assert max(rates) == pytest.approx(rates[99]) == pytest.approx(1, abs=0.03)
     assert all(b < a for a, b in pairwise(rates[99:]))
     assert rates[-1] == pytest.approx(0.01, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"steps": None}, "steps, minutes: expected at least one limit"),
-        ({"steps": 0}, "steps: expected a positive"),
-        ({"batch": 0}, "batch: expected a positive"),
-        ({"rate": -1.0}, "rate: expected a positive"),
-        ({"ema": 1.0}, "ema: expected 0 <= ema < 1"),
-        ({"loss": "l3"}, "loss: expected one of"),
-        ({"terms": "all"}, "terms: expected one of"),
-        ({"device": "tpu"}, "device: expected one of"),
-        ({"loss": "perceptual"}, "vgg: expected weights with the perceptual loss"),
-        ({"slope": 0.5}, "whole, slope: expected"),
-    ],
-)
-def test_configurations_say_what_is_wrong(change: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        replace(CONFIG, **change)
-
-
-# Weights
-
-
-def test_weights_come_back(tmp_path: Path) -> None:
-    path, model = tmp_path / "w.safetensors", make_model()
-    save_model(path, model, {"hours": 0.5})
-    loaded = load_model(path)
-    assert loaded.config == model.config
-    for (name, value), other in zip(model.named_parameters(), loaded.parameters(), strict=True):
-        assert other.dtype == torch.float32, name
-        assert torch.equal(other, value.half().float())
-    assert load_notes(path) == {"hours": 0.5}
-    assert [p.name for p in tmp_path.iterdir()] == ["w.safetensors"]
-
-
-def test_every_model_is_built_from_its_description() -> None:
-    for model in (make_model(), *(make() for make in MODELS.values())):
-        again = build(json.loads(json.dumps(describe(model))))
-        assert type(again) is type(model)
-        assert again.config == model.config
-
-
-@pytest.mark.parametrize(
-    "description",
-    [
-        {},
-        {"model": "RAUNet"},
-        {"model": "Transformer", "config": {"kernel": {}}},
-        {"model": "RAUNet", "config": {"kernel": {"frames": 5}, "depth": 3}},
-        {"model": "RAUNet", "config": {"kernel": {"frames": 4}}},
-    ],
-)
-def test_a_description_of_something_else_is_an_error(description: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="model description"):
-        build(description)
-
-
-def test_weights_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
-    model = make_model()
-    torch.nn.init.constant_(model.stem.bias, 1e6)  # too large for a half
-    with pytest.raises(ValueError, match=r"stem\.bias: expected finite weights"):
-        save_model(tmp_path / "w.safetensors", model)
-    assert not list(tmp_path.iterdir())
-
-
-def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
-    path, bad = tmp_path / "w.safetensors", tmp_path / "bad.safetensors"
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        load_model(path)
-    save_model(path, make_model())
-    whole = path.read_bytes()
-    for length in (0, 5, 200, len(whole) - 1):
-        bad.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"bad\.safetensors.*no safetensors file, or cut short"):
-            load_model(bad)
-
-    with safe_open(path, framework="pt") as file:
-        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    for change, message in [
-        ({"format": "other"}, "expected format 'ravg-network', got 'other'"),
-        ({"version": "99"}, "expected version 3, got 99"),
-        ({"description": "{"}, "bad.safetensors"),
-        ({"description": json.dumps(describe(RAResNet(RAResNetConfig(width=4))))}, "expected shape"),
-    ]:
-        save_file(tensors, bad, {**metadata, **change})
-        with pytest.raises(ValueError, match=message):
-            load_model(bad)
-    save_file(tensors, bad)
-    with pytest.raises(ValueError, match="expected format 'ravg-network', got None"):
-        load_model(bad)
-    del tensors["stem.bias"]
-    save_file(tensors, bad, metadata)
-    with pytest.raises(ValueError, match=r"stem\.bias: expected shape \(8,\), got None"):
-        load_model(bad)
-
-
-def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path) -> None:
-    """The name to write to first is known to everybody; a link of that name led elsewhere."""
-    precious = tmp_path / "precious"
-    precious.write_text("precious")
-    path = tmp_path / "w.safetensors"
-    path.with_name("w.safetensors.part").symlink_to(precious)
-    save_model(path, make_model())
-    assert precious.read_text() == "precious"
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["precious", "w.safetensors"]
-    with pytest.raises(OSError, match="is there and no file"):
-        save_model(tmp_path, make_model())

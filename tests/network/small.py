@@ -1,0 +1,43 @@
+"""Small networks of every kind, for tests that train, write or read them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from network.models import (
+    TKPCN,
+    KernelConfig,
+    Model,
+    MultiScale,
+    MultiScaleConfig,
+    RAResNet,
+    RAResNetConfig,
+    RAUNet,
+    RAUNetConfig,
+    TKPCNConfig,
+)
+from network.stabilizer import Stabilizer, StabilizerConfig
+
+
+def make_model(seed: int = 0) -> RAUNet:
+    torch.manual_seed(seed)
+    kernel = KernelConfig(frames=3, size=3, threshold=0)
+    return RAUNet(RAUNetConfig(kernel, widths=(8, 8), ra_scales=(1,)))
+
+
+def make_stabilizer() -> Stabilizer:
+    torch.manual_seed(0)
+    return Stabilizer(StabilizerConfig(3, 2, (4, 8), (0, 1)))
+
+
+SMALL = KernelConfig(frames=3, size=3)
+MODELS: dict[str, Callable[[], Model]] = {
+    "resnet": lambda: RAResNet(RAResNetConfig(SMALL, width=4, blocks=2, ra_after=(1, 2), skips=1)),
+    "tkpcn": lambda: TKPCN(TKPCNConfig(SMALL, width=4, blocks=1)),
+    "multi-scale": lambda: MultiScale(MultiScaleConfig(make_model().config, scales=3)),
+    "softmax": lambda: RAUNet(RAUNetConfig(replace(SMALL, activation="softmax"), (4, 4), (1,))),
+    "stabilizer": make_stabilizer,
+}

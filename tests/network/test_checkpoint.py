@@ -1,0 +1,107 @@
+"""Weights in files: they come back, and what is no such file is refused."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from network.checkpoint import build, describe, load_model, load_notes, save_model
+from network.models import RAResNet, RAResNetConfig
+from tests.network.small import MODELS, make_model
+
+pytestmark = pytest.mark.neural
+
+
+def test_weights_come_back(tmp_path: Path) -> None:
+    path, model = tmp_path / "w.safetensors", make_model()
+    save_model(path, model, {"hours": 0.5})
+    loaded = load_model(path)
+    assert loaded.config == model.config
+    for (name, value), other in zip(model.named_parameters(), loaded.parameters(), strict=True):
+        assert other.dtype == torch.float32, name
+        assert torch.equal(other, value.half().float())
+    assert load_notes(path) == {"hours": 0.5}
+    assert [p.name for p in tmp_path.iterdir()] == ["w.safetensors"]
+
+
+def test_every_model_is_built_from_its_description() -> None:
+    for model in (make_model(), *(make() for make in MODELS.values())):
+        again = build(json.loads(json.dumps(describe(model))))
+        assert type(again) is type(model)
+        assert again.config == model.config
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        {},
+        {"model": "RAUNet"},
+        {"model": "Transformer", "config": {"kernel": {}}},
+        {"model": "RAUNet", "config": {"kernel": {"frames": 5}, "depth": 3}},
+        {"model": "RAUNet", "config": {"kernel": {"frames": 4}}},
+    ],
+)
+def test_a_description_of_something_else_is_an_error(description: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="model description"):
+        build(description)
+
+
+def test_weights_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
+    model = make_model()
+    torch.nn.init.constant_(model.stem.bias, 1e6)  # too large for a half
+    with pytest.raises(ValueError, match=r"stem\.bias: expected finite weights"):
+        save_model(tmp_path / "w.safetensors", model)
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
+    path, bad = tmp_path / "w.safetensors", tmp_path / "bad.safetensors"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        load_model(path)
+    save_model(path, make_model())
+    whole = path.read_bytes()
+    for length in (0, 5, 200, len(whole) - 1):
+        bad.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"bad\.safetensors.*no safetensors file, or cut short"):
+            load_model(bad)
+
+    with safe_open(path, framework="pt") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for change, message in [
+        ({"format": "other"}, "expected format 'ravg-network', got 'other'"),
+        ({"version": "99"}, "expected version 3, got 99"),
+        ({"description": "{"}, "bad.safetensors"),
+        ({"description": json.dumps(describe(RAResNet(RAResNetConfig(width=4))))}, "expected shape"),
+    ]:
+        save_file(tensors, bad, {**metadata, **change})
+        with pytest.raises(ValueError, match=message):
+            load_model(bad)
+    save_file(tensors, bad)
+    with pytest.raises(ValueError, match="expected format 'ravg-network', got None"):
+        load_model(bad)
+    del tensors["stem.bias"]
+    save_file(tensors, bad, metadata)
+    with pytest.raises(ValueError, match=r"stem\.bias: expected shape \(8,\), got None"):
+        load_model(bad)
+
+
+def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path) -> None:
+    """The name to write to first is known to everybody; a link of that name led elsewhere."""
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    path = tmp_path / "w.safetensors"
+    path.with_name("w.safetensors.part").symlink_to(precious)
+    save_model(path, make_model())
+    assert precious.read_text() == "precious"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["precious", "w.safetensors"]
+    with pytest.raises(OSError, match="is there and no file"):
+        save_model(tmp_path, make_model())
