@@ -1,5 +1,6 @@
 """A Dask cluster: a real scheduler and two workers, one of which dies."""
 
+import json
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import typer
 
 from hybrid.cli import main
 from hybrid.commands.cluster import arguments_of
+from tests.hybrid.simulate.test_run import STUB
 from tests.hybrid.test_docs import said, transcript
 from tests.scenes import Scene
 
@@ -106,6 +108,34 @@ def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
         lines = [said(line) for line in (captured.out + captured.err).splitlines()]
         for line in answer:
             assert said(line).replace(documented, cluster[0]) in lines
+
+
+def test_random_shots_are_rendered_by_the_workers(cluster, tmp_path, capsys):
+    """By a stand-in for Blender, which writes frames that say who has made them."""
+    script, python = tmp_path / "stub.py", tmp_path / "python"
+    script.write_text(STUB.format(found=0, fail="False"))
+    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
+    python.chmod(0o755)
+    out = tmp_path / "shots"
+    words = ["simulate", "random", "-o", str(out), "--shots", "3", "--seed", "5", "--frames", "1-2", "--levels", "n"]
+    assert main([*words, "--python", str(python), "--scheduler", cluster[0]]) == 0, capsys.readouterr().err
+    assert {path.name for path in out.iterdir()} == {"random_0005", "random_0006", "random_0007"}
+    for folder in out.iterdir():
+        assert {path.name for path in folder.glob("*.exr")} == {"noisy.0001.exr", "noisy.0002.exr"}
+        assert json.loads((folder / "meta.json").read_text())["shot"]["seed"] == int(folder.name[-4:])
+    assert "96 of 96 spp·frames, 100 %" in capsys.readouterr().err
+
+
+@pytest.mark.neural
+def test_clips_are_made_by_the_workers(cluster, tmp_path, capsys):
+    pytest.importorskip("torch")
+    shots = [str(Scene(frames=3).write(tmp_path / name)) for name in ("one", "two")]
+    words = ["prepare", *shots, "-o", str(tmp_path / "clips"), "--tile", "0", "--estimate", "nlm", "--window", "3"]
+    assert main([*words, "--scheduler", cluster[0]]) == 0, capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "clips").glob("*.safetensors")} == {
+        "one.0000.safetensors",
+        "two.0000.safetensors",
+    }
 
 
 def test_a_shot_is_the_same_bytes_though_a_worker_dies(cluster, shot, whole, tmp_path, capsys):
