@@ -161,7 +161,7 @@ def _can_read(shot: Shot, number: int) -> bool:
 
 
 def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
-    layers, pairs = shot.layers(shot.available[0]), _pair_numbers(shot)
+    layers = shot.layers(shot.available[0])
     if layers.motion_convention is None or layers.settled >= set(PARTS):
         first = _judge(shot, layers, pairs[:1])
         if not first.findings and (first.motion is None or first.motion.certain):
