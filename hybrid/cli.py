@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -19,6 +20,8 @@ from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt
 
+# Where numba looks for a folder for compiled loops: its own list, and after that ours.
+FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.compiled.Fallback"
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -61,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments; the process's own without.
     """
+    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", FOLDERS)
     with lasting_streams():
         start_log()  # until a command has read how it is to tell things
         try:
@@ -80,6 +84,12 @@ def _run(argv: Sequence[str] | None) -> int:
         return INTERRUPTED
     except ModuleNotFoundError:
         raise  # a broken installation, not something optional that is missing
+    except MemoryError as error:
+        words = " ".join(str(error).split())  # numpy says how much it was; others say nothing
+        LOG.error(
+            f"not enough memory{f' ({words})' if words else ''}: --max-memory works on a part of a frame at a time"
+        )
+        return 1
     except (ValueError, OSError, ImportError) as error:
         LOG.error(one_line(error))
         return 1

@@ -1,0 +1,122 @@
+"""Compiled loops: kept where they can be, done without where they cannot, made again where they are damaged."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOBODY = 65534
+LOOP = """
+from numba import njit
+
+@njit(cache=True)
+def twice(x):
+    return 2 * x
+"""
+RUN = """
+import os, sys, tempfile
+if "NO_TEMPORARY_FILES" in os.environ:
+    tempfile.tempdir = "/nonexistent"
+from hybrid.cli import FOLDERS
+from hybrid.commands.log import start_log
+start_log()
+os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = FOLDERS
+import numba, hybrid.compiled
+numba.njit(lambda x: 2 * x)(1)  # all that compiling needs is loaded
+if os.geteuid() == 0:  # who may write anywhere
+    os.setegid(int(sys.argv[2]))
+    os.seteuid(int(sys.argv[2]))
+sys.path.insert(0, sys.argv[1])
+import loop
+print(loop.twice(21), loop.twice._cache.cache_path, sum(loop.twice.stats.cache_hits.values()))
+"""
+
+
+def run(folder: Path, **environment: str) -> tuple[str, Path, int, str]:
+    """Run a loop of an installation that nobody but root may write to; its result, folder, and what was found there."""
+    env = {"PATH": os.environ["PATH"], "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), **environment}
+    words = [sys.executable, "-B", "-c", RUN, str(folder), str(NOBODY)]
+    done = subprocess.run(words, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    value, path, found = done.stdout.split()
+    return value, Path(path), int(found), done.stderr
+
+
+@pytest.fixture
+def installed(tmp_path_factory):
+    """A folder with a loop in it, read-only as an installation of root's is to a farm's user."""
+    folder = tmp_path_factory.mktemp("installed")
+    (folder / "loop.py").write_text(LOOP)
+    folder.chmod(0o555)
+    for parent in [folder, *folder.parents]:
+        if parent.owner() == folder.owner() and not parent.stat().st_mode & 0o005 and parent != Path("/"):
+            parent.chmod(parent.stat().st_mode | 0o055)
+    yield folder
+    folder.chmod(0o755)
+
+
+@pytest.fixture
+def temporary(tmp_path):
+    """A folder for temporary files that everybody may write to."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    folder.chmod(0o777)
+    for parent in folder.parents:
+        if parent.name.startswith(("pytest-", "test_")):
+            parent.chmod(0o755)
+    return folder
+
+
+def test_where_neither_home_nor_installation_can_be_written_to_loops_are_kept_among_temporary_files(
+    installed, temporary
+):
+    """Every command ended in a traceback: cannot cache function."""
+    home = {"HOME": "/nonexistent", "TMPDIR": str(temporary)}
+    value, path, found, said = run(installed, **home)
+    assert (value, found) == ("42", 0)
+    assert path.is_relative_to(temporary)
+    assert said.count("compiled loops are kept in") == 1
+    assert path.parent.stat().st_mode & 0o077 == 0
+    assert run(installed, **home)[2] == 1  # the next run has it
+
+
+def test_where_nothing_can_be_written_to_loops_are_compiled_in_each_run(installed):
+    value, _, found, said = run(installed, HOME="/nonexistent", NO_TEMPORARY_FILES="1")
+    assert (value, found) == ("42", 0)
+    assert said.count("cannot be kept anywhere") == 1
+
+
+def test_a_folder_that_somebody_else_has_made_is_not_trusted(installed, temporary):
+    """What is read from it is run."""
+    user = NOBODY if os.geteuid() == 0 else os.geteuid()
+    planted = temporary / f"ravg-compiled-{user}"
+    planted.mkdir()
+    planted.chmod(0o777)
+    path = run(installed, HOME="/nonexistent", TMPDIR=str(temporary))[1]
+    assert not path.is_relative_to(planted)
+    assert not path.exists()  # it was this run's own, and is gone
+
+
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize("share", [0, 0.5, 0.99])
+def test_a_damaged_file_is_made_again(tmp_path, kind, share):
+    """A process killed on a full disk left half a file, and all later ones a traceback."""
+    (tmp_path / "loop.py").write_text(LOOP)
+    home = {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    tmp_path.chmod(0o777)
+    for parent in tmp_path.parents:
+        if parent.name.startswith(("pytest-", "test_")):
+            parent.chmod(0o755)
+    assert run(tmp_path, **home)[2] == 0
+    assert run(tmp_path, **home)[2] == 1
+    (file,) = (tmp_path / "kept").rglob(f"*.{kind}")
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    value, _, found, _ = run(tmp_path, **home)
+    assert (value, found) == ("42", 0)
+    assert run(tmp_path, **home)[2] == 1
