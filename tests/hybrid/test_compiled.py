@@ -67,7 +67,7 @@ def temporary(tmp_path):
     folder.mkdir()
     folder.chmod(0o777)
     for parent in folder.parents:
-        if parent.name.startswith(("pytest-", "test_")):
+        if parent.name.startswith(("pytest-", "popen-", "test_")):
             parent.chmod(0o755)
     return folder
 
@@ -110,7 +110,7 @@ def test_a_damaged_file_is_made_again(tmp_path, kind, share):
     home = {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
     tmp_path.chmod(0o777)
     for parent in tmp_path.parents:
-        if parent.name.startswith(("pytest-", "test_")):
+        if parent.name.startswith(("pytest-", "popen-", "test_")):
             parent.chmod(0o755)
     assert run(tmp_path, **home)[2] == 0
     assert run(tmp_path, **home)[2] == 1
