@@ -81,6 +81,7 @@ let waiting = false;
 function draw() {
   if (waiting) return;
   waiting = true;
+  canvas.dataset.exact = false; // until what is asked for now is painted
   requestAnimationFrame(() => {
     waiting = false;
     paint();
