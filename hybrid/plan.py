@@ -165,7 +165,10 @@ class Rules:
 
     def plan(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
         """Decide on a window by what its frames and its pairs of neighbours show."""
-        return decide(frames, pairs).force(self.on, self.off)
+        vectors = bool(pairs) and all(pair.vectors for pair in pairs)
+        # Who wants frames moved, and has no vectors, wants the motion found; or nobody says where to.
+        found = {"dense-flow"} if "warp" in self.on and pairs and not vectors else set()
+        return decide(frames, pairs).force(self.on | (found - self.off), self.off)
 
     def __call__(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> frozenset[str]:
         """Return the stages of that plan."""

@@ -432,6 +432,7 @@ class Aligner:
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
         self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
+        self._expect_alike(number, numbers)
         stages = self.stages_of(numbers)
         if given:
             # Estimates are compared in any case, for outlines: that their light is alike costs nothing to ask.
@@ -453,6 +454,16 @@ class Aligner:
             beyond = partial(_warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
             return self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
+
+    def _expect_alike(self, number: int, numbers: Sequence[int]) -> None:
+        """Refuse a window of which one frame has a layer that another lacks: light divided by an albedo is no color."""
+        centre = self._frames[number]
+        for there in (self._frames[n] for n in numbers if n in self._frames):
+            if different := sorted(_names(centre) ^ _names(there)):
+                has, lacks = (there, centre) if different[0] in _names(there) else (centre, there)
+                raise ValueError(
+                    f"frame {lacks.number} has no {different[0]}, which frame {has.number} has, expected one in both"
+                )
 
     def _gather(
         self, number: int, numbers: Sequence[int], layers: dict[str, Array], rows: slice, stages: frozenset[str]
@@ -515,10 +526,6 @@ class Aligner:
     ) -> tuple[dict[str, Array], Mask]:
         """Warp a neighbour's layers to these rows of the centre."""
         layers = _layers(there, light="light" in wanted, alpha=f"aov {ALPHA}" in wanted)
-        if missing := set(wanted) - set(layers):
-            raise ValueError(
-                f"frame {there.number} differs from its neighbours in having: {', '.join(sorted(missing))}"
-            )
         if not flow.any():
             return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
         warped = {}
@@ -650,6 +657,12 @@ def _novelty(flow: Array) -> Array:
     """How much of a neighbour's noise is its own where one seed makes the noise of all frames, in [0, 1]."""
     distance = np.hypot(flow[..., 0], flow[..., 1])
     return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
+
+
+def _names(frame: PreparedFrame) -> set[str]:
+    """The layers that all frames of a window have, or none."""
+    given = {"albedo": frame.albedo, "normal": frame.normal, ALPHA: frame.alpha, **frame.aovs}
+    return {name for name, layer in given.items() if layer is not None}
 
 
 def _layers(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:

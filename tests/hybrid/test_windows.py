@@ -210,6 +210,42 @@ def test_dense_flow_forced_on_leaves_the_vectors_alone_and_forced_off_has_no_nei
     assert (window.confidence[[0, 2]] == 0).all()
 
 
+def test_warp_forced_on_where_nothing_moves_and_no_vectors_are_keeps_the_neighbours(tmp_path):
+    """Nobody was to say where to, so each frame was denoised alone."""
+    still = open_shot(replace(CALM, frames=5).write(tmp_path, without={"Vector"}))
+    window = Aligner(still, Rules(on=frozenset({"warp"}))).align(1003)
+    assert "dense-flow" in window.stages
+    assert (np.median(window.confidence, axis=(1, 2)) > 0.5).all()
+    alone = Aligner(still, Rules(on=frozenset({"warp"}), off=frozenset({"dense-flow"}))).align(1003)
+    assert (alone.confidence[[0, 1, 3, 4]] == 0).all()
+
+
+@pytest.mark.parametrize("layer", ["Denoising Albedo", "Denoising Normal"])
+@pytest.mark.parametrize("number", [1001, 1002, 1003])
+def test_a_frame_without_a_layer_that_those_beside_it_have_is_named(tmp_path, layer, number):
+    """Light divided by the albedo was averaged with color that was not."""
+
+    def edit(index, layers):
+        if index == 1:
+            del layers[f"ViewLayer.{layer}"]
+
+    shot = open_shot(replace(CALM, frames=3).write(tmp_path, edit=edit), frames=str(number))
+    with pytest.raises(ValueError, match=f"frame 1002 has no {layer.split()[1].lower()}, which frame 100. has"):
+        Aligner(shot, Rules()).align(number)
+
+
+@pytest.mark.parametrize("number", [1001, 1002, 1003])
+def test_vectors_that_one_frame_lacks_are_taken_from_those_beside_it_or_found(tmp_path, number):
+    def edit(index, layers):
+        if index == 1:
+            del layers["ViewLayer.Vector"]
+
+    scene = replace(CALM, frames=3, step=(2, 0))
+    window = Aligner(open_shot(scene.write(tmp_path, edit=edit)), Rules()).align(number)
+    there = slice(1003 - number, 1003 - number + 3)  # of the window of five
+    assert (np.median(window.confidence[there], axis=(1, 2)) > 0.5).all()
+
+
 def flow_of(shot, rules):
     aligner = Aligner(shot, rules, radius=1)
     aligner.load([1002, 1003])
