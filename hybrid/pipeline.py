@@ -13,7 +13,7 @@ from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
 from hybrid.estimates import EstimateSource
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
-from hybrid.files.sources import MADE_FROM, describe_sources, why_stale
+from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_lost_light, find_nonfinite
 from hybrid.timing import Timings
@@ -41,6 +41,8 @@ class Denoised:
 
 
 DenoiseWindow = Callable[[AlignedWindow], Denoised]
+# From a frame's number to the files that it was made from, by what they are.
+SourcesOf = Callable[[int], dict[str, Source]]
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ def denoise_frames(
     resume: bool = False,
     keep_going: bool = False,
     timings: Timings | None = None,
+    before: SourcesOf | None = None,
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
 
@@ -145,6 +148,8 @@ def denoise_frames(
         Where a frame cannot be made, or read, or written, go on with those after it.
     timings : Timings, optional
         Where to count the stages.
+    before : callable, optional
+        What the frames of the shot were made from themselves (`sources_of`), by a pass before this one.
 
     Yields
     ------
@@ -171,11 +176,12 @@ def denoise_frames(
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    # What shines in one frame alone is told by the frames beside it.
-    reach = 1 + (radius if estimates is None else estimates.reach(radius))
+    sources = sources_of(all_pictures, radius, before)
+    reach = reach_of(estimates, radius)
     for number, path in paths.items():
         try:
-            made_from = _made_from(all_pictures, number, reach)
+            read_as = [picture.taken(number) for picture, _ in all_pictures]
+            made_from = describe_sources(sources(number), layers=read_as, size=list(shot.shape))
             again = why_stale(path, {**(attributes or {}), MADE_FROM: made_from}) if resume else ""
             if again is None:
                 yield Finished(number, path, resumed=True)
@@ -273,12 +279,40 @@ def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -
         raise ValueError(f"frame {number}: {fault}; it was not written")
 
 
-def _made_from(pictures: Sequence[tuple[Shot, Estimates | None]], number: int, reach: int) -> str:
-    """What a frame is made from: all files that its window reaches, and how each picture in them is read."""
-    shot = pictures[0][0]
-    near = shot.near(number, reach)
-    files = shot.states(near)
-    for _, estimates in pictures:
-        if estimates is not None and (given := estimates.files) is not None:
-            files |= given.states((n for n in near if given.has(n)), "estimate")
-    return describe_sources(files, layers=[p.taken(number) for p, _ in pictures], size=list(shot.shape))
+def reach_of(estimates: Estimates | None, radius: int) -> int:
+    """How many frames on each side of one it depends on: those of its window, and one for what shines in one alone."""
+    return 1 + (radius if estimates is None else estimates.reach(radius))
+
+
+def sources_of(
+    pictures: Sequence[tuple[Shot, Estimates | None]], radius: int, before: SourcesOf | None = None
+) -> SourcesOf:
+    """Tell of each frame which files it is made from.
+
+    Parameters
+    ----------
+    pictures : sequence of (Shot, Estimates or None)
+        As `denoise_frames` has them, the shot first.
+    radius : int
+        Frames on each side of the centre.
+    before : callable, optional
+        What tells it of the frames of the shot, where they are themselves made.
+
+    Returns
+    -------
+    callable
+        From a frame's number to all files that its window reaches, or that these were made from.
+    """
+    shot, reach = pictures[0][0], reach_of(pictures[0][1], radius)
+
+    def sources(number: int) -> dict[str, Source]:
+        near = shot.near(number, reach)
+        if before is not None:
+            return {what: source for n in near for what, source in before(n).items()}
+        files = shot.states(near)
+        for _, estimates in pictures:
+            if estimates is not None and (given := estimates.files) is not None:
+                files |= given.states((n for n in near if given.has(n)), "estimate")
+        return files
+
+    return sources

@@ -51,7 +51,7 @@ from hybrid.interrupt import INTERRUPTED, interruptible
 if TYPE_CHECKING:
     from hybrid.estimates import EstimateSource
     from hybrid.files.frames import Shot
-    from hybrid.pipeline import DenoiseWindow
+    from hybrid.pipeline import DenoiseWindow, SourcesOf
     from hybrid.plan import Rules
     from hybrid.plausibility import Judgement
     from hybrid.records import Record
@@ -197,7 +197,8 @@ def denoise(
         typer.Option(
             min=1,
             metavar="N",
-            help="run again on the result: a wider window in time, a softer picture; --resume makes all passes again",
+            help="run again on the result: a wider window in time, a softer picture; --resume leaves alone frames of "
+            "the last pass",
             rich_help_panel=WHAT,
         ),
     ] = 1,
@@ -244,6 +245,7 @@ def denoise(
 
     from hybrid.breakdown import Breakdown, write_breakdown
     from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
+    from hybrid.pipeline import reach_of
     from hybrid.timing import Timings
 
     if breakdown is not None and max_memory is not None:
@@ -275,7 +277,7 @@ def denoise(
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
-        made = opened.around(denoiser.radius * (passes - 1))  # by the first pass
+        made = opened.around(reach_of(None, denoiser.radius) * (passes - 1))  # by the first pass
         quicker = neural.denoise_unet if denoiser.precision == "bfloat16" and neural.has_unet() else None
         choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker)
         source = choose(made, kept=keep_estimates, forced=rules.forced)
@@ -445,28 +447,31 @@ class Job:
     radius: int = 2
     neural: bool = False
     gathers: bool = False  # samples of the window, which OIDN then denoises
+    before: SourcesOf | None = None  # what the shot was made from, if a pass has made it
 
 
 @contextmanager
 def _last_pass(job: Job, passes: int) -> Iterator[Job]:
     """Make all passes but the last, in folders that go when the block ends; it is given what is left to run."""
-    from hybrid.estimates import EstimateSource, OfFrames
+    from hybrid.estimates import OfFrames
     from hybrid.files.frames import output_path
     from hybrid.files.replace import temporary_folder
+    from hybrid.pipeline import reach_of, sources_of
 
     command = job.command
     home = output_path(job.output, job.shot, job.shot.numbers[0]).parent
     with ExitStack() as stack:
         for number in range(1, passes):
             folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
-            made = job.shot.around(job.radius * (passes - number))  # what the windows of later passes reach
+            made = job.shot.around(reach_of(None, job.radius) * (passes - number))  # what later passes reach
             early = replace(job, shot=made, output=str(folder), keep_going=False)
             _run(replace(early, command=f"{command}, pass {number} of {passes}"))
             job = replace(
                 job,
                 shot=job.shot.remade({n: output_path(folder, made, n) for n in made.numbers}),
-                source=EstimateSource("denoised", OfFrames(lambda frame: frame.color), "the pass before has made them"),
+                source=replace(job.source, estimates=OfFrames(lambda frame: frame.color), reason="the pass before"),
                 command=f"{command}, pass {passes} of {passes}",
+                before=sources_of([(job.shot, job.source.estimates)], job.radius, job.before),
             )
         yield job
 
@@ -580,6 +585,7 @@ def _denoise(job: Job, record: Record) -> None:
         resume=job.resume,
         keep_going=job.keep_going,
         timings=timings,
+        before=job.before,
     )
     started = time.perf_counter()
     for finished in frames:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import fields
 
@@ -17,6 +18,7 @@ from hybrid.cli import main  # noqa: E402
 from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
 from hybrid.files.exr import read_exr  # noqa: E402
 from hybrid.files.frames import open_shot  # noqa: E402
+from hybrid.files.sources import MADE_FROM  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
 from network.models import unet  # noqa: E402
@@ -260,6 +262,17 @@ def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, 
     assert one.channel_names == every.channel_names
     for channel in one.channel_names:
         np.testing.assert_array_equal(one.channel(channel), every.channel(channel), err_msg=channel)
+    # The header named the files between the passes, which are others in each run.
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+    for path in sorted(folder.iterdir()):
+        assert path.name in one.parts[0].header[MADE_FROM]
+    capsys.readouterr()
+    words = ["denoise", folder, "-o", tmp_path / "all", "--estimate", "nlm", "--resume", *options]
+    assert run(*words) == 0
+    assert "5 of 5 frames were finished already" in capsys.readouterr().err
+    os.utime(folder / "shot.1001.exr", (0, 0))
+    assert run(*words) == 0
+    assert "frame 1003 is made again: frame 1001, shot.1001.exr, has changed" in capsys.readouterr().err
 
 
 def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
