@@ -280,7 +280,15 @@ def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -
 
 
 def reach_of(estimates: Estimates | None, radius: int) -> int:
-    """How many frames on each side of one it depends on: those of its window, and one for what shines in one alone."""
+    """Count the frames on each side of one that it depends on: its window, and one for what shines in a frame alone.
+
+    Parameters
+    ----------
+    estimates : Estimates or None
+        Where the estimates of single frames come from.
+    radius : int
+        Frames on each side of the centre of a window.
+    """
     return 1 + (radius if estimates is None else estimates.reach(radius))
 
 
