@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import product
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from flow.guide import estimate_noise, median_luminance, pair_guides, smooth_tones, tone_map
-from flow.motion import UNITS, VERTICAL, MotionConvention, normalize_motion
+from flow.motion import ABSURD_LENGTH, UNITS, VERTICAL, MotionConvention, decode_motion
 from flow.tvl1 import dense_flow
 from flow.warp import locate
 
@@ -120,19 +121,17 @@ class Choice:
 
     @property
     def certain(self) -> bool:
-        """Whether something changes, and the reading leaves next to nothing of it."""
-        return self.still > LEAST and self.unexplained <= max(GOOD * self.still, LEAST)
+        """Whether something changes, the reading leaves next to nothing of it, and no other leaves as little."""
+        return not self.open and self.still > LEAST and self.unexplained <= max(GOOD * self.still, LEAST)
 
 
-def choose_convention(
-    pairs: Iterable[FramePair], assumed: MotionConvention, settled: Collection[str] = PARTS
-) -> Choice:
+def choose_convention(pairs: Sequence[Patches], assumed: MotionConvention, settled: Collection[str] = PARTS) -> Choice:
     """Find the reading of motion vectors that explains the pictures.
 
     Parameters
     ----------
-    pairs : iterable of FramePair
-        At least one, all of one size. Of each no more is kept than its luminance and the patches' vectors.
+    pairs : sequence of Patches
+        At least one, of frames of one size. What was tried on them is kept, and not tried again.
     assumed : MotionConvention
         What is taken where the pictures cannot tell.
     settled : collection of str
@@ -156,12 +155,11 @@ def choose_convention(
     less what noise alone gives; patches that leave the picture say nothing. One reading is clearly better than another
     if the mean difference, patch by patch, is three times its standard error.
     """
-    patches = [_Patches(pair) for pair in pairs]
-    if not patches:
+    if not pairs:
         raise ValueError("pairs is empty, expected at least one")
-    unrelated = tuple(index for index, pair in enumerate(patches) if pair.unrelated())
-    related = [pair for index, pair in enumerate(patches) if index not in unrelated]
-    trials, settled = _Trials(related or patches), frozenset(settled)
+    unrelated = tuple(index for index, pair in enumerate(pairs) if pair.unrelated)
+    related = [pair for index, pair in enumerate(pairs) if index not in unrelated]
+    trials, settled = _Trials(related or pairs), frozenset(settled)
     chosen = trials.best(assumed, settled)
     harms = trials.clearly_better(None, chosen)
     if settled and (harms or not trials.good(chosen)):
@@ -186,8 +184,18 @@ def choose_convention(
     )
 
 
-class _Patches:
-    """A pair of frames, seen through patches at the same places of both."""
+ONE_PIXEL = np.ones(2, np.float32)
+_Flows = tuple[np.ndarray | None, np.ndarray | None]
+
+
+class Patches:
+    """A pair of frames, seen through patches at the same places of both.
+
+    Parameters
+    ----------
+    pair : FramePair
+        Of it no more is kept than its luminance and the patches' vectors.
+    """
 
     def __init__(self, pair: FramePair) -> None:
         self.resolution, self.frames = pair.resolution, pair.frames
@@ -206,44 +214,62 @@ class _Patches:
         # Two means differ by noise with the variance 2 s² / size².
         self.expected = 2 * np.square(deviation / (size * self.scale))
         self.all = np.arange(len(self.rows))
-        self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all)
+        self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all, ONE_PIXEL)
         self.few = _informative(self.still, SCREENED)
         layers = pair.earlier_vectors, pair.later_vectors
         self.vectors = [self.gather(layer, self.all) for layer in layers]
         self.few_vectors = [self.gather(layer, self.few) for layer in layers]
+        self.tried: dict[tuple[MotionConvention, bool], np.ndarray] = {}
+        self.decoded: dict[tuple[str, str, float, bool], tuple[_Flows, _Flows]] = {}
 
     def costs(self, convention: MotionConvention, *, few: bool = False) -> np.ndarray:
         """What a reading leaves of each patch, or of the `few` that tell most, in [0, 1]; NaN outside."""
-        sides = []
-        for centre, vectors in enumerate(self.few_vectors if few else self.vectors):
-            motion = normalize_motion(vectors, convention, resolution=self.resolution)
-            toward = motion.to_previous if centre else motion.to_next
-            if toward is not None:
-                flow = toward.flow * np.float32(self.frames)
-                flow[~toward.valid] = np.inf  # leaves the picture
-                sides.append(self._costs(centre, flow, self.few if few else self.all))
+        if (convention, few) not in self.tried:
+            self.tried[convention, few] = self._try(convention, few)
+        return self.tried[convention, few]
+
+    def _try(self, convention: MotionConvention, few: bool) -> np.ndarray:
+        unit = np.array(convention.factors(self.resolution), np.float32) * np.float32(self.frames)
+        earlier, later = self._decoded(convention, few)
+        sides = [
+            self._costs(centre, flow, self.few if few else self.all, unit)
+            for centre, flow in enumerate((earlier[1], later[0]))
+            if flow is not None
+        ]
         if len(sides) == 1:
             return sides[0]
         return np.where(np.isnan(sides[0]), sides[1], np.where(np.isnan(sides[1]), sides[0], (sides[0] + sides[1]) / 2))
 
-    def costs_along(self, flow: np.ndarray) -> np.ndarray:
-        """What a flow (H, W, 2) from the later frame to the earlier leaves of each patch."""
-        return self._costs(1, self.gather(flow, self.all), self.all)
+    def _decoded(self, convention: MotionConvention, few: bool) -> tuple[_Flows, _Flows]:
+        """Vectors of the earlier and of the later frame; many readings differ in their unit alone."""
+        kind = convention.direction, convention.encoding, convention.offset, few
+        if kind not in self.decoded:
+            earlier, later = self.few_vectors if few else self.vectors
+            self.decoded[kind] = decode_motion(earlier, convention), decode_motion(later, convention)
+        return self.decoded[kind]
 
+    @cached_property
+    def found(self) -> np.ndarray:
+        """What a flow that is found in the pictures leaves of each patch."""
+        return self._costs(1, self.gather(_found(*self.pictures), self.all), self.all, ONE_PIXEL)
+
+    @cached_property
     def unrelated(self) -> bool:
         """Whether hardly anything of one frame is found in the other."""
         changes = float(np.mean(self.still - self.expected))
         if changes <= CUT:
             return False
-        left = _mean(self.costs_along(_found(*self.pictures)), self.still) - float(np.mean(self.expected))
+        left = _mean(self.found, self.still) - float(np.mean(self.expected))
         return left > (1 - WORTH) * changes
 
     def length(self, convention: MotionConvention) -> float:
         """Ninth decile of the lengths of the vectors, pixels; 0 without any."""
+        unit = np.array(convention.factors(self.resolution), np.float32)
         lengths = []
-        for vectors in self.few_vectors:
-            motion = normalize_motion(vectors, convention, resolution=self.resolution)
-            lengths += [np.hypot(v.flow[..., 0], v.flow[..., 1])[v.valid] for v in motion if v is not None]
+        for flow in (flow for flows in self._decoded(convention, True) for flow in flows if flow is not None):
+            with np.errstate(over="ignore", invalid="ignore"):
+                length = np.hypot(*np.moveaxis(flow * unit, -1, 0))
+            lengths.append(length[length <= ABSURD_LENGTH])
         every = np.concatenate(lengths)
         return float(np.quantile(every, 0.9)) if every.size else 0.0
 
@@ -254,18 +280,10 @@ class _Patches:
         columns = self.columns[at, None, None] + reach
         return np.asarray(layer[rows, columns].reshape(-1, len(reach), layer.shape[2]))
 
-    def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray, unit: np.ndarray) -> np.ndarray:
         difference = np.empty(len(at), np.float32)
-        flow = np.ascontiguousarray(flow, np.float32)
-        _compare(
-            self.pictures[centre],
-            self.pictures[1 - centre],
-            flow,
-            self.rows[at],
-            self.columns[at],
-            self.radius,
-            difference,
-        )
+        here, there = self.pictures[centre], self.pictures[1 - centre]
+        _compare(here, there, flow, unit, self.rows[at], self.columns[at], self.radius, difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 
@@ -274,12 +292,13 @@ def _compare(
     centre: np.ndarray,
     other: np.ndarray,
     flow: np.ndarray,
+    unit: np.ndarray,
     rows: np.ndarray,
     columns: np.ndarray,
     radius: int,
     difference: np.ndarray,
 ) -> None:
-    """Mean of other(x + v) − centre(x) over each patch; NaN where less than half of it stays in the picture."""
+    """Mean of other(x + v) − centre(x), v = unit · flow, over each patch; NaN where less than half of it stays."""
     height, width = other.shape
     size = 2 * radius + 1
     one = np.float32(1)
@@ -288,7 +307,7 @@ def _compare(
         for j in range(size):
             for i in range(size):
                 y, x = rows[p] - radius + j, columns[p] - radius + i
-                u, v = flow[p * size + j, i, 0], flow[p * size + j, i, 1]
+                u, v = unit[0] * flow[p * size + j, i, 0], unit[1] * flow[p * size + j, i, 1]
                 inside, x0, y0, x1, y1, fx, fy = locate(np.float32(x) + u, np.float32(y) + v, width, height)
                 if inside:
                     total -= centre[y, x]
@@ -301,20 +320,19 @@ def _compare(
 class _Trials:
     """What readings leave of some pairs; each is tried once."""
 
-    def __init__(self, pairs: Sequence[_Patches]) -> None:
+    def __init__(self, pairs: Sequence[Patches]) -> None:
         self.pairs = pairs
         self.expected = float(np.mean(np.concatenate([pair.expected for pair in self.pairs])))
         # The pair that tells most.
         self.screen = max(self.pairs, key=lambda pair: float(np.mean(pair.still - pair.expected)))
-        self.tried: dict[MotionConvention, np.ndarray] = {}
+        self.tried: dict[MotionConvention, None] = {}  # in the order they were tried
 
     def costs(self, reading: MotionConvention | None) -> np.ndarray:
         """What a reading leaves of each patch of all pairs; None: no motion."""
         if reading is None:
             return np.concatenate([pair.still for pair in self.pairs])
-        if reading not in self.tried:
-            self.tried[reading] = np.concatenate([pair.costs(reading) for pair in self.pairs])
-        return self.tried[reading]
+        self.tried[reading] = None
+        return np.concatenate([pair.costs(reading) for pair in self.pairs])
 
     def _screened(self, reading: MotionConvention) -> float:
         return _mean(self.screen.costs(reading, few=True), self.screen.still[self.screen.few])
@@ -401,7 +419,7 @@ class _Trials:
 
     def search(self) -> float:
         """Share of the picture that flows found in the pictures leave unexplained; 0 to 1."""
-        costs = np.concatenate([pair.costs_along(_found(*pair.pictures)) for pair in self.pairs])
+        costs = np.concatenate([pair.found for pair in self.pairs])
         return max(_mean(costs, self.costs(None)) - self.expected, 0.0)
 
     def open_parts(self, chosen: MotionConvention, settled: frozenset[str]) -> tuple[str, ...]:

@@ -158,18 +158,35 @@ def normalize_motion(
         expected = f"(H, W, {convention.channels} or more) for {convention}"
         raise ValueError(f"vectors has shape {vectors.shape}, expected {expected}")
     unit = np.array(convention.factors(resolution or (vectors.shape[0], vectors.shape[1])), np.float32)
+    return Motion(*(None if v is None else _to_pixels(v, unit) for v in decode_motion(vectors, convention)))
+
+
+def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Take a renderer's motion vectors apart, in the unit, the scale and with the y that they have.
+
+    Parameters
+    ----------
+    vectors : (H, W, C) array of float
+        As the renderer wrote them, C at least `convention.channels`.
+    convention : MotionConvention
+        What they mean; its unit, y and scale are not applied.
+
+    Returns
+    -------
+    to_previous, to_next : (H, W, 2) array of float32 or None
+        `MotionConvention.factors` makes pixels of both.
+    """
     size = convention.channels // (2 if convention.pair else 1)
-    first = _to_pixels(vectors[..., :size], convention, unit)
+    first = _decode(vectors[..., :size], convention)
     if convention.direction == "previous":
-        return Motion(first, None)
+        return first, None
     if convention.direction == "next":
-        return Motion(None, first)
-    second = _to_pixels(vectors[..., size : 2 * size], convention, -unit if convention.direction == "cycles" else unit)
-    return Motion(first, second)
+        return None, first
+    second = _decode(vectors[..., size : 2 * size], convention)
+    return first, -second if convention.direction == "cycles" else second
 
 
-def _to_pixels(vectors: np.ndarray, convention: MotionConvention, unit: np.ndarray) -> Vectors:
-    """Decode one vector a pixel; 0 and False where it is not finite or absurdly long."""
+def _decode(vectors: np.ndarray, convention: MotionConvention) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         flow = np.array(vectors[..., :2], np.float32)
         if convention.encoding != "plain":
@@ -178,6 +195,12 @@ def _to_pixels(vectors: np.ndarray, convention: MotionConvention, unit: np.ndarr
             flow *= vectors[..., 2:3]
         if convention.offset:
             flow += np.float32(convention.offset)
+    return flow
+
+
+def _to_pixels(flow: np.ndarray, unit: np.ndarray) -> Vectors:
+    """Vectors in pixels, in place; 0 and False where they are not finite or absurdly long."""
+    with np.errstate(over="ignore", invalid="ignore"):
         flow *= unit
     # Written so that NaN compares false; by planes, which is faster than over so short an axis.
     valid = (np.abs(flow[..., 0]) <= ABSURD_LENGTH) & (np.abs(flow[..., 1]) <= ABSURD_LENGTH)

@@ -6,14 +6,14 @@ convention, guides of another frame. What does not make sense is left out, and a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.convention import PARTS, SCALES, Choice, FramePair, Trial, choose_convention
+from flow.convention import SCALES, Choice, FramePair, Patches, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from hybrid.files.frames import Frame, Shot
 from hybrid.files.layers import Layers
@@ -24,6 +24,8 @@ Array = NDArray[np.float32]
 # Pairs that are looked at, spread over all files of the shot and not over the frames that were asked for: what is
 # decided must not depend on the chunk that a frame comes in.
 PAIRS = 2
+# Rows of which shares and bounds are taken, and to which pictures are reduced before their edges are compared.
+THIN, EDGE_ROWS = 270, 540
 # A layer whose values lie within this of each other, relative to the largest, is the same everywhere: half floats
 # round by 5e-4.
 SAME = 1e-3
@@ -162,28 +164,30 @@ def _can_read(shot: Shot, number: int) -> bool:
 
 def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     layers = shot.layers(shot.available[0])
-    if layers.motion_convention is None or layers.settled >= set(PARTS):
-        first = _judge(shot, layers, pairs[:1])
-        if not first.findings and (first.motion is None or first.motion.certain):
-            return first  # one pair has shown that all is as it is said to be
-        if len(pairs) < 2:
-            return first
-    return _judge(shot, layers, pairs)
-
-
-def _judge(shot: Shot, layers: Layers, pairs: Sequence[tuple[int, int]]) -> Judgement:
     evidence = _Evidence(layers)
-    choice = None
-    if layers.motion_convention is not None and pairs:
-        vectors = _vector_pairs(shot, pairs, evidence.add)
-        choice = choose_convention(vectors, layers.motion_convention, layers.settled)
-    else:
-        for a, b in pairs:
-            evidence.add(shot.read(a), shot.read(b))
     if not pairs:
         evidence.add(shot.read(shot.available[0]))
+        return _judge(evidence, layers, {})
+    patches: dict[tuple[int, int], Patches] = {}
+    for a, b in pairs:
+        earlier, later = shot.read(a), shot.read(b)
+        evidence.add(earlier, later)
+        if earlier.motion is not None and later.motion is not None:
+            resolution = earlier.resolution or earlier.motion.shape[:2]
+            pair = FramePair(earlier.color, later.color, earlier.motion, later.motion, resolution, shot.step)
+            patches[a, b] = Patches(pair)
+        judgement = _judge(evidence, layers, patches)
+        if not judgement.warnings and (judgement.motion is None or judgement.motion.certain):
+            break  # nothing is left to ask
+    return judgement
+
+
+def _judge(evidence: _Evidence, layers: Layers, patches: Mapping[tuple[int, int], Patches]) -> Judgement:
+    choice = None
+    if layers.motion_convention is not None and patches:
+        choice = choose_convention([*patches.values()], layers.motion_convention, layers.settled)
     variance_scale, judged = evidence.judge_variance()
-    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice, pairs))]
+    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice, [*patches]))]
     return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
 
 
@@ -192,18 +196,6 @@ def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
     pairs = [(a, a + shot.step) for a in shot.available if shot.has(a + shot.step)]
     count = min(PAIRS, len(pairs))
     return [pairs[(2 * i + 1) * len(pairs) // (2 * count)] for i in range(count)]
-
-
-def _vector_pairs(
-    shot: Shot, pairs: Sequence[tuple[int, int]], look: Callable[[Frame, Frame], None]
-) -> Iterator[FramePair]:
-    """Pairs with their vectors, one at a time; `look` sees their frames."""
-    for a, b in pairs:
-        earlier, later = shot.read(a), shot.read(b)
-        look(earlier, later)
-        if earlier.motion is not None and later.motion is not None:
-            resolution = earlier.resolution or earlier.motion.shape[:2]
-            yield FramePair(earlier.color, later.color, earlier.motion, later.motion, resolution, shot.step)
 
 
 class _Evidence:
@@ -219,20 +211,22 @@ class _Evidence:
     def add(self, *frames: Frame) -> None:
         """Look at one frame, or at two neighbours."""
         for frame in frames:
+            thin = _thin(frame)
             for role, judge in _JUDGES.items():
                 if getattr(frame, role) is not None:
-                    self.wrong.setdefault(role, []).append(judge(frame))
+                    self.wrong.setdefault(role, []).append(judge(thin))
             if frame.variance is not None:
                 self.variances.append(_variance_ratios(frame))
         if len(frames) == 2:
-            exposure = median_luminance(frames[0].color)
+            small = [_shrink(frame.color) for frame in frames]
+            exposure = median_luminance(small[0])
             # Of noise the correlation knows less where neighbours are averaged.
-            tones = [tone_map(frame.color, exposure)[..., None] for frame in frames]
-            shown = [_slope(np.asarray(cv2.blur(tone, (3, 3)), np.float32).reshape(tone.shape)) for tone in tones]
+            tones = [cv2.blur(tone_map(color, exposure), (3, 3)) for color in small]
+            shown = [_slope(np.asarray(tone, np.float32)) for tone in tones]
             for role in ("albedo", "normal"):
                 guides = [getattr(frame, role) for frame in frames]
                 if all(guide is not None for guide in guides):
-                    slopes = [_slope(guide) for guide in guides]
+                    slopes = [_slope(_shrink(guide)) for guide in guides]
                     own = (_correlate(slopes[0], shown[0]) + _correlate(slopes[1], shown[1])) / 2
                     late, early = _correlate(slopes[1], shown[0]), _correlate(slopes[0], shown[1])
                     self.edges.setdefault(role, []).append((own, late, early))
@@ -273,9 +267,28 @@ class _Evidence:
         return f"{role} ({getattr(self.layers, role) or 'of two halves'})"
 
 
+def _thin(frame: Frame) -> Frame:
+    """Every n-th row and column of a frame: shares of its pixels and their bounds need no more than `THIN` rows."""
+    step = max(1, min(frame.color.shape[:2]) // THIN)
+    roles = ("color", *_JUDGES)
+    layers = {role: layer[::step, ::step] for role in roles if (layer := getattr(frame, role)) is not None}
+    return Frame(frame.number, **layers)
+
+
+def _shrink(layer: Array) -> Array:
+    """A layer (H, W, C) reduced by a whole factor to about `EDGE_ROWS` rows; what is not finite counts as 0."""
+    factor = max(1, min(layer.shape[:2]) // EDGE_ROWS)
+    clean = np.where(np.isfinite(layer), layer, np.float32(0))
+    if factor == 1:
+        return np.asarray(clean, np.float32)
+    size = layer.shape[1] // factor, layer.shape[0] // factor
+    cut = clean[: size[1] * factor, : size[0] * factor]
+    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
 def _judge_guide(layer: Array) -> str | None:
-    # Every other row and column tell as much; plane by plane, which is faster than over so short an axis.
-    planes = [layer[::2, ::2, c] for c in range(layer.shape[2])]
+    # Plane by plane, which is faster than over so short an axis.
+    planes = [layer[..., c] for c in range(layer.shape[2])]
     known = [plane[np.isfinite(plane)] for plane in planes]
     if not all(plane.size for plane in known):
         return "has no finite value"
@@ -290,7 +303,6 @@ def _judge_albedo(frame: Frame) -> str | None:
     layer = frame.albedo
     if layer is None or (words := _judge_guide(layer)) is not None:
         return None if layer is None else words
-    layer = layer[::2, ::2]
     if (below := float(np.mean(layer.min(axis=-1) < -SAME))) > STRAY:
         return f"is negative in {below:.1%} of the picture"
     if (above := float(np.mean(layer.max(axis=-1) > BRIGHT))) > 0.5:
@@ -349,11 +361,9 @@ _JUDGES: dict[str, Callable[[Frame], str | None]] = {
 
 
 def _slope(layer: Array) -> Array:
-    """Length of the gradient of (H, W, C), over all channels."""
-    clean = np.nan_to_num(layer, posinf=0.0, neginf=0.0)
-    across, down = cv2.Sobel(clean, -1, 1, 0), cv2.Sobel(clean, -1, 0, 1)
-    square = (across**2 + down**2).reshape(*layer.shape[:2], -1).sum(axis=-1)
-    return np.asarray(np.sqrt(square), np.float32)
+    """Length of the gradient of (H, W) or (H, W, C), over all channels."""
+    square = np.square(cv2.Sobel(layer, -1, 1, 0)) + np.square(cv2.Sobel(layer, -1, 0, 1))
+    return np.asarray(np.sqrt(square if layer.ndim == 2 else np.einsum("yxc->yx", square)), np.float32)
 
 
 def _correlate(a: Array, b: Array) -> float:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from flow.convention import PARTS, Choice, FramePair, choose_convention
+from flow.convention import PARTS, Choice, FramePair, Patches, choose_convention
 from flow.motion import CYCLES, MotionConvention
 
 HEIGHT, WIDTH = 90, 140
@@ -87,9 +86,9 @@ class Film:
     def next(self, n: int) -> np.ndarray:
         return self.flow(n, n + 1)
 
-    def pairs(self, vectors: Callable[[int], np.ndarray]) -> list[FramePair]:
+    def pairs(self, vectors: Callable[[int], np.ndarray]) -> list[Patches]:
         return [
-            FramePair(self.colors[n], self.colors[n + 1], vectors(n), vectors(n + 1), (HEIGHT, WIDTH))
+            Patches(FramePair(self.colors[n], self.colors[n + 1], vectors(n), vectors(n + 1), (HEIGHT, WIDTH)))
             for n in range(len(self.colors) - 1)
         ]
 
@@ -239,8 +238,8 @@ def test_two_frames_are_enough() -> None:
 
 def test_vectors_span_one_frame_whatever_lies_between_the_two() -> None:
     film = Film(**MOVES)
-    pairs = [replace(pair, frames=2) for pair in film.pairs(lambda n: film.previous(n) / 2)]
-    choice = choose_convention(pairs, PLAIN)
+    pair = FramePair(film.colors[0], film.colors[1], film.previous(0) / 2, film.previous(1) / 2, (HEIGHT, WIDTH), 2)
+    choice = choose_convention([Patches(pair)], PLAIN)
     assert [trial.convention for trial in choice.trials] == [PLAIN]
 
 
@@ -261,7 +260,7 @@ def test_it_depends_neither_on_exposure_nor_on_broken_pixels() -> None:
 
 def test_a_picture_smaller_than_a_patch() -> None:
     color, still = np.ones((3, 5, 3), np.float32), np.zeros((3, 5, 2), np.float32)
-    choice = choose_convention([FramePair(color, color, still, still, (3, 5))], PLAIN)
+    choice = choose_convention([Patches(FramePair(color, color, still, still, (3, 5)))], PLAIN)
     assert choice.convention == PLAIN
 
 
