@@ -6,9 +6,10 @@ from functools import reduce
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from flow.motion import forward_backward_error
+from loops.cores import on_all_cores
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
@@ -150,13 +151,16 @@ def mix_centre(
     mixed = np.empty(centre.shape, np.float32) if out is None else out
     planes = (*centre.shape[:2], -1)
     warped, centre, confidence = (np.asarray(layer, np.float32) for layer in (warped, centre, confidence))
-    _mix(warped.reshape(planes), centre.reshape(planes), confidence, mixed.reshape(planes))
+    layers = warped.reshape(planes), centre.reshape(planes), confidence, mixed.reshape(planes)
+    on_all_cores(_mix, len(centre), *layers)
     return mixed
 
 
-@njit(parallel=True, nogil=True, cache=True)
-def _mix(warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray) -> None:
-    for y in prange(out.shape[0]):
+@njit(nogil=True, cache=True)
+def _mix(
+    first: int, last: int, warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray
+) -> None:
+    for y in range(first, last):
         for x in range(out.shape[1]):
             weight = confidence[y, x]
             for channel in range(out.shape[2]):

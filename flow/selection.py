@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from flow.guide import GuidePair
 from flow.warp import interpolate, locate, weigh
+from loops.cores import on_all_cores
 
 # Share of the incumbent's error by which another flow must be better.
 _MARGIN = 0.15
@@ -69,7 +70,8 @@ def select_flow(
             raise ValueError(f"candidates[{index}] has shape {candidate.shape}, expected {(*shape, 2)}")
         error = np.empty(shape, np.float32)
         vectors = np.ascontiguousarray(candidate, np.float32)
-        _photometric_error(guides.centre, guides.neighbour, scale, vectors, error, evidence)
+        layers = guides.centre, guides.neighbour, scale, vectors, error, evidence
+        on_all_cores(_photometric_error, shape[0], *layers)
         errors.append(error)
     errors = [error * evidence for error in errors]
     incumbent = _find_incumbent([_box_mean(error, _WIDE_BOX) for error in errors], chance)
@@ -102,14 +104,14 @@ def _box_mean(image: np.ndarray, side: int) -> np.ndarray:
     return cv2.blur(image, (side, side)).reshape(image.shape)
 
 
-@njit(parallel=True, nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _photometric_error(
-    centre: np.ndarray, neighbour: np.ndarray, scale: np.ndarray, flow: np.ndarray, error: np.ndarray,
-    evidence: np.ndarray,
+    first: int, last: int, centre: np.ndarray, neighbour: np.ndarray, scale: np.ndarray, flow: np.ndarray,
+    error: np.ndarray, evidence: np.ndarray,
 ) -> None:  # fmt: skip
     """Measure min(5, Σ_g |I₁(x + f) − I₀(x)| · scale); clear `evidence` where the flow leaves the frame."""
     height, width, channels = centre.shape
-    for y in prange(height):
+    for y in range(first, last):
         for x in range(width):
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(y) + flow[y, x, 1], width, height)
             evidence[y, x] &= place.inside

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from loops.cores import on_all_cores
 
 
 class Place(NamedTuple):
@@ -98,10 +100,12 @@ def interpolate(
     return value
 
 
-@njit(parallel=True, nogil=True, cache=True)
-def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
+@njit(nogil=True, cache=True)
+def _bilinear(
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
+) -> None:
     height, width, channels = image.shape
-    for y in prange(flow.shape[0]):
+    for y in range(first, last):
         for x in range(width):
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
             inside[y, x] = place.inside
@@ -110,11 +114,13 @@ def _bilinear(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarr
                 out[y, x, c] = interpolate(image, c, place, weights)
 
 
-@njit(parallel=True, nogil=True, cache=True)
-def _nearest(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
+@njit(nogil=True, cache=True)
+def _nearest(
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
+) -> None:
     height, width, channels = image.shape
     half = np.float32(0.5)
-    for y in prange(flow.shape[0]):
+    for y in range(first, last):
         for x in range(width):
             inside[y, x], x0, y0, x1, y1, fx, fy = locate(
                 np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
@@ -138,10 +144,12 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
     )
 
 
-@njit(parallel=True, nogil=True, cache=True)
-def _bicubic(image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray) -> None:
+@njit(nogil=True, cache=True)
+def _bicubic(
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
+) -> None:
     height, width, channels = image.shape
-    for y in prange(flow.shape[0]):
+    for y in range(first, last):
         columns = np.empty(4, np.int64)
         rows = np.empty(4, np.int64)
         for x in range(width):
@@ -220,7 +228,8 @@ def warp(
     shape = flow.shape[:2]
     warped = np.empty((*shape, source.shape[2]), np.float32)
     inside = np.empty(shape, np.bool_)
-    _KERNELS[interpolation](source, np.ascontiguousarray(flow, np.float32), first_row, warped, inside)
+    vectors = np.ascontiguousarray(flow, np.float32)
+    on_all_cores(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
     return warped.reshape(*shape, *image.shape[2:]), inside
 
 

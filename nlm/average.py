@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
+
+from loops.cores import on_all_cores
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -37,7 +39,10 @@ def average(window: Floats, weight: Floats) -> Floats:
     ValueError
         If the shapes do not fit each other or T is even.
     """
-    return _average(*check_window(window, weight))
+    window, weight = check_window(window, weight)
+    out = np.empty(window.shape[1:], np.float32)
+    on_all_cores(_average, len(out), window, weight, out)
+    return out
 
 
 def robust_average(window: Floats, weight: Floats) -> Floats:
@@ -78,7 +83,10 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
     ----------
     Kalojanov and Thurston, Robust Average Networks for Monte Carlo Denoising, "Robust Average Blocks".
     """
-    return _robust_average(*check_window(window, weight))
+    window, weight = check_window(window, weight)
+    out = np.empty(window.shape[1:], np.float32)
+    on_all_cores(_robust_average, len(out), window, weight, out)
+    return out
 
 
 def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
@@ -121,7 +129,11 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     by less than 0.1 %; with them by 0.3 to 1.2 %; and by 2 % (the centre by 6 %) where two samples in three
     are 0: there much of what is lost is ordinary noise.
     """
-    return _reject_outliers(*check_window(window, weight))
+    window, weight = check_window(window, weight)
+    cleaned, mask, level = window.copy(), np.zeros(weight.shape, np.bool_), np.empty(weight.shape, np.float32)
+    on_all_cores(_channel_mean, window.shape[1], window, level)
+    on_all_cores(_reject_outliers, window.shape[1], window, weight, level, cleaned, mask)
+    return cleaned, mask
 
 
 def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
@@ -201,11 +213,10 @@ def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[
     return np.ascontiguousarray(window, np.float32), np.ascontiguousarray(weight, np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _average(window: Floats, weight: Floats) -> Floats:
-    T, H, W, C = window.shape
-    out = np.empty((H, W, C), np.float32)
-    for y in prange(H):
+@njit(cache=True, nogil=True)
+def _average(first: int, last: int, window: Floats, weight: Floats, out: Floats) -> None:
+    T, _, W, C = window.shape
+    for y in range(first, last):
         for x in range(W):
             total = np.float32(0)
             for t in range(T):
@@ -216,14 +227,12 @@ def _average(window: Floats, weight: Floats) -> Floats:
                     if weight[t, y, x] > 0:  # a NaN that nobody trusts must not count
                         value += weight[t, y, x] * window[t, y, x, c]
                 out[y, x, c] = value / total if total > 0 else window[T // 2, y, x, c]
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _robust_average(window: Floats, weight: Floats) -> Floats:
-    T, H, W, C = window.shape
-    out = np.empty((H, W, C), np.float32)
-    for y in prange(H):
+@njit(cache=True, nogil=True)
+def _robust_average(first: int, last: int, window: Floats, weight: Floats, out: Floats) -> None:
+    T, _, W, C = window.shape
+    for y in range(first, last):
         for x in range(W):
             total, most, trusted = np.float32(0), np.float32(0), 0
             for t in range(T):
@@ -236,39 +245,43 @@ def _robust_average(window: Floats, weight: Floats) -> Floats:
                 share = min(max(total / most - np.float32(2), np.float32(0)), np.float32(1))
             for c in range(C):
                 low, high = np.float32(np.inf), np.float32(-np.inf)
-                first, last = 0, 0
+                lowest, brightest = 0, 0
                 for t in range(T):
                     if weight[t, y, x] > 0:
                         v = window[t, y, x, c]
                         if v < low:
-                            low, first = v, t
+                            low, lowest = v, t
                         if v >= high:  # not the minimum again where all are equal
-                            high, last = v, t
+                            high, brightest = v, t
                 value, left = np.float32(0), np.float32(0)
                 for t in range(T):
                     w = weight[t, y, x]
-                    if t in (first, last):  # left out, not subtracted: 1e6 would leave its rounding
+                    if t in (lowest, brightest):  # left out, not subtracted: 1e6 would leave its rounding
                         w *= 1 - share
                     if w > 0:
                         value += w * window[t, y, x, c]
                         left += w
                 out[y, x, c] = value / left if left > 0 else window[T // 2, y, x, c]
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
-    T, H, W, C = window.shape
-    cleaned, mask = window.copy(), np.zeros((T, H, W), np.bool_)
-    level = np.empty((T, H, W), np.float32)
-    for y in prange(H):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _channel_mean(first: int, last: int, window: Floats, level: Floats) -> None:
+    T, _, W, C = window.shape
+    for y in range(first, last):
         for t in range(T):
             for x in range(W):
                 total = np.float32(0)
                 for c in range(C):
                     total += window[t, y, x, c]
                 level[t, y, x] = total / C
-    for y in prange(H):
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reject_outliers(
+    first: int, last: int, window: Floats, weight: Floats, level: Floats, cleaned: Floats, mask: Mask
+) -> None:
+    T, H, W, C = window.shape
+    for y in range(first, last):
         values = np.empty(9 * T, np.float32)
         mean = np.empty(C, np.float32)
         top, bottom = max(y - 1, 0), min(y + 2, H)
@@ -333,4 +346,3 @@ def _reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
                     mask[t, y, x] = True
                     for c in range(C):
                         cleaned[t, y, x, c] = mean[c] / trust
-    return cleaned, mask

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from loops.cores import on_all_cores
 from nlm.average import check_window
 
 Floats = NDArray[np.float32]
@@ -81,7 +82,11 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
         raise ValueError(f"exposure: expected a positive number, got {exposure}")
     estimates, confidence = check_window(estimates, confidence, "confidence")
     residuals = np.ascontiguousarray(residuals, np.float32)
-    return Gathered(*_gather(estimates, residuals, confidence, np.float32(exposure)))
+    average, image = np.empty(estimates.shape[1:], np.float32), np.empty(estimates.shape[1:], np.float32)
+    samples = np.empty(estimates.shape[1:3], np.float32)
+    given = estimates, residuals, confidence, np.float32(exposure)
+    on_all_cores(_gather, len(samples), *given, average, image, samples)
+    return Gathered(average, image, samples)
 
 
 def restore_mean(picture: Floats, gathered: Floats) -> Floats:
@@ -126,14 +131,13 @@ def _blur(image: Floats, sigma: float) -> Floats:
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _gather(
-    estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32
-) -> tuple[Floats, Floats, Floats]:
-    T, H, W, C = estimates.shape
-    average, image = np.empty((H, W, C), np.float32), np.empty((H, W, C), np.float32)
-    samples = np.empty((H, W), np.float32)
-    for y in prange(H):
+    first: int, last: int, estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32,
+    average: Floats, image: Floats, samples: Floats,
+) -> None:  # fmt: skip
+    T, _, W, C = estimates.shape
+    for y in range(first, last):
         light, noise = np.empty(C, np.float32), np.empty(C, np.float32)
         for x in range(W):
             light[:] = 0
@@ -163,4 +167,3 @@ def _gather(
                     image[y, x, c] = (light[c] + noise[c]) / total
                 else:
                     average[y, x, c] = image[y, x, c] = estimates[T // 2, y, x, c]
-    return average, image, samples

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from loops.cores import on_all_cores
 from nlm.average import replace_nonfinite
 
 Floats = NDArray[np.float32]
@@ -91,8 +92,13 @@ def guided_filter(
         # the mean over trusted pixels only; what is not trusted at all weighs nothing
         small_image /= np.where(small_trust > 0, small_trust, np.float32(1))
     small_radius = max(radius // subsample, 1)
-    coefficients = _solve(small_image, small_guide, small_trust, small_radius, float(eps))
-    output = _apply(_box_sum(coefficients, small_radius), guide, image, subsample)
+    size, channels, planes = small_guide.shape[:2], image.shape[2], guide.shape[2]
+    strips = -(-size[0] // _STRIP)
+    boxes, coefficients = (np.empty((*size, channels * planes + channels + 1), np.float32) for _ in range(2))
+    on_all_cores(_solve, strips, small_image, small_guide, small_trust, small_radius, float(eps), boxes)
+    on_all_cores(_box_sum, strips, boxes, small_radius, coefficients)
+    output = np.empty(image.shape, np.float32)
+    on_all_cores(_apply, len(output), coefficients, guide, image, subsample, output)
     box = np.ones((4 * radius + 1, 4 * radius + 1), np.uint8)
     low, high = (np.asarray(fold(image, box)).reshape(image.shape) for fold in (cv2.erode, cv2.dilate))
     return np.asarray(np.clip(output, low, high), np.float32)
@@ -112,7 +118,9 @@ def measure_guide(guide: Floats) -> Doubles:
         Mean and standard deviation of each channel.
     """
     pixels = guide.shape[0] * guide.shape[1]
-    first, second = _row_moments(np.ascontiguousarray(guide, np.float32)).sum(axis=0) / pixels
+    rows = np.zeros((guide.shape[0], 2, guide.shape[2]))
+    on_all_cores(_row_moments, len(rows), np.ascontiguousarray(guide, np.float32), rows)
+    first, second = rows.sum(axis=0) / pixels
     return np.stack([first, np.sqrt(np.maximum(second - first * first, 0))])
 
 
@@ -122,41 +130,45 @@ def _standardise(guide: Floats, moments: Doubles) -> Floats:
     # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
     constant = deviation <= 1e-6 * np.abs(mean)
     scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))
-    return _scale(guide, mean.astype(np.float32), scale.astype(np.float32))
+    out = np.empty(guide.shape, np.float32)
+    on_all_cores(_scale, len(out), guide, mean.astype(np.float32), scale.astype(np.float32), out)
+    return out
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _row_moments(image: Floats) -> Doubles:
+def _shrink(image: Floats, step: int) -> Floats:
+    """Mean of each step × step block, of what there is of it at the lower and right edge."""
+    height, width, channels = image.shape
+    out = np.zeros((-(-height // step), -(-width // step), channels), np.float32)
+    on_all_cores(_mean_blocks, len(out), image, step, out)
+    return out
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def _row_moments(first: int, last: int, image: Floats, sums: Doubles) -> None:
     """Sums over each row of x and of x², (H, 2, C)."""
-    H, W, C = image.shape
-    sums = np.zeros((H, 2, C))
-    for y in prange(H):
+    _, W, C = image.shape
+    for y in range(first, last):
         for x in range(W):
             for c in range(C):
                 value = float(image[y, x, c])
                 sums[y, 0, c] += value
                 sums[y, 1, c] += value * value
-    return sums
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _scale(image: Floats, centre: Floats, scale: Floats) -> Floats:
-    """Return (image − centre) · scale, channel by channel."""
-    H, W, C = image.shape
-    out = np.empty((H, W, C), np.float32)
-    for y in prange(H):
+@njit(cache=True, nogil=True, boundscheck=False)
+def _scale(first: int, last: int, image: Floats, centre: Floats, scale: Floats, out: Floats) -> None:
+    """Write (image − centre) · scale, channel by channel."""
+    _, W, C = image.shape
+    for y in range(first, last):
         for x in range(W):
             for c in range(C):
                 out[y, x, c] = (image[y, x, c] - centre[c]) * scale[c]
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _shrink(image: Floats, step: int) -> Floats:
-    """Mean of each step × step block, of what there is of it at the lower and right edge."""
+@njit(cache=True, nogil=True, boundscheck=False)
+def _mean_blocks(first: int, last: int, image: Floats, step: int, out: Floats) -> None:
     H, W, C = image.shape
-    out = np.zeros((-(-H // step), -(-W // step), C), np.float32)
-    for y in prange(out.shape[0]):
+    for y in range(first, last):
         bottom = min(y * step + step, H)
         for sy in range(y * step, bottom):
             for x in range(W):
@@ -166,7 +178,6 @@ def _shrink(image: Floats, step: int) -> Floats:
             count = (bottom - y * step) * (min(x * step + step, W) - x * step)
             for c in range(C):
                 out[y, x, c] /= count
-    return out
 
 
 @njit(cache=True, nogil=True, boundscheck=False, inline="always")
@@ -232,26 +243,27 @@ def _solve_box(out: Floats, sums: Doubles, matrix: Doubles, right: Doubles, G: i
     out[C * G + C] = 1
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _solve(image: Floats, guide: Floats, weight: Floats, radius: int, eps: float) -> Floats:
-    """Coefficients of the box around each pixel, (H, W, C·G + C + 1)."""
+@njit(cache=True, nogil=True, boundscheck=False)
+def _solve(
+    first: int, last: int, image: Floats, guide: Floats, weight: Floats, radius: int, eps: float, out: Floats
+) -> None:
+    """Coefficients of the box around each pixel, (H, W, C·G + C + 1), in some strips."""
     H, W, C = image.shape
     G = guide.shape[2]
-    out = np.empty((H, W, C * G + C + 1), np.float32)
-    for strip in prange(-(-H // _STRIP)):
-        first, last = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
+    for strip in range(first, last):
+        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
         columns = np.zeros((W, 1 + G + G * (G + 1) // 2 + C + G * C))
         box = np.empty(columns.shape[1])
         matrix, right = np.empty((G, G)), np.empty((G, C))
-        for y in range(max(first - radius, 0), min(first + radius, H)):
+        for y in range(max(top - radius, 0), min(top + radius, H)):
             for x in range(W):
                 _add_moments(columns[x], image[y, x], guide[y, x], float(weight[y, x, 0]))
-        for y in range(first, last):
+        for y in range(top, bottom):
             enter, leave = y + radius, y - radius - 1
             for x in range(W):
                 if enter < H:
                     _add_moments(columns[x], image[enter, x], guide[enter, x], float(weight[enter, x, 0]))
-                if leave >= max(first - radius, 0):
+                if leave >= max(top - radius, 0):
                     _add_moments(columns[x], image[leave, x], guide[leave, x], -float(weight[leave, x, 0]))
             box[:] = 0
             for x in range(min(radius, W)):
@@ -265,28 +277,26 @@ def _solve(image: Floats, guide: Floats, weight: Floats, radius: int, eps: float
                     for m in range(box.size):
                         box[m] -= columns[x - radius - 1, m]
                 _solve_box(out[y, x], box, matrix, right, G, C, eps)
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False)
-def _box_sum(values: Floats, radius: int) -> Floats:
-    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge."""
+@njit(cache=True, nogil=True, boundscheck=False)
+def _box_sum(first: int, last: int, values: Floats, radius: int, out: Floats) -> None:
+    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, in some strips."""
     H, W, M = values.shape
-    out = np.empty((H, W, M), np.float32)
-    for strip in prange(-(-H // _STRIP)):
-        first, last = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
+    for strip in range(first, last):
+        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
         columns, box = np.zeros((W, M)), np.empty(M)
-        for y in range(max(first - radius, 0), min(first + radius, H)):
+        for y in range(max(top - radius, 0), min(top + radius, H)):
             for x in range(W):
                 for m in range(M):
                     columns[x, m] += values[y, x, m]
-        for y in range(first, last):
+        for y in range(top, bottom):
             enter, leave = y + radius, y - radius - 1
             for x in range(W):
                 if enter < H:
                     for m in range(M):
                         columns[x, m] += values[enter, x, m]
-                if leave >= max(first - radius, 0):
+                if leave >= max(top - radius, 0):
                     for m in range(M):
                         columns[x, m] -= values[leave, x, m]
             box[:] = 0
@@ -302,17 +312,15 @@ def _box_sum(values: Floats, radius: int) -> Floats:
                         box[m] -= columns[x - radius - 1, m]
                 for m in range(M):
                     out[y, x, m] = box[m]
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True, boundscheck=False, error_model="numpy")
-def _apply(coefficients: Floats, guide: Floats, image: Floats, step: int) -> Floats:
+@njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+def _apply(first: int, last: int, coefficients: Floats, guide: Floats, image: Floats, step: int, out: Floats) -> None:
     """Apply coefficients, enlarged bilinearly, to the guide; keep the image where there are none."""
-    H, W, G = guide.shape
+    _, W, G = guide.shape
     C = image.shape[2]
     h, w, M = coefficients.shape
-    out = np.empty((H, W, C), np.float32)
-    for y in prange(H):
+    for y in range(first, last):
         here, row = np.empty(M, np.float32), np.empty((w, M), np.float32)
         sy = min(max((y + 0.5) / step - 0.5, 0.0), h - 1.0)
         top = int(sy)
@@ -332,4 +340,3 @@ def _apply(coefficients: Floats, guide: Floats, image: Floats, step: int) -> Flo
                 for i in range(G):
                     value += here[c * G + i] * guide[y, x, i]
                 out[y, x, c] = value / boxes if boxes > 0 else image[y, x, c]
-    return out

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
+
+from loops.cores import on_all_cores
 
 Floats = NDArray[np.float32]
 
@@ -113,8 +115,11 @@ def joint_nlm(
     variance, features, confidence = (
         np.ascontiguousarray(array, np.float32) for array in (variance, features, confidence)
     )
-    filtered: Floats = _filter(window, variance, features, confidence, radius, patch_radius, np.float32(k))
-    return filtered
+    out = np.empty(window.shape[1:], np.float32)
+    tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
+    given = window, variance, features, confidence, radius, patch_radius, np.float32(k)
+    on_all_cores(_filter, tiles, *given, out)
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -217,18 +222,19 @@ def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: i
                 scale[c, y, x] = 1 / tolerance
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy", boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _filter(
-    window: Floats, variance: Floats, features: Floats, confidence: Floats, radius: int, patch: int, k: np.float32
-) -> Floats:
+    first: int, last: int, window: Floats, variance: Floats, features: Floats, confidence: Floats, radius: int,
+    patch: int, k: np.float32, out: Floats,
+) -> None:  # fmt: skip
+    """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
     T, H, W, C = window.shape
     F = features.shape[2]
     centre = T // 2
-    out = np.empty((H, W, C), np.float32)
-    rows, columns = -(-H // _TILE_HEIGHT), -(-W // _TILE_WIDTH)
+    columns = -(-W // _TILE_WIDTH)
     cancel, far = np.float32(1 / (k * k)), np.float32(_FAR / (k * k))
     norm = np.float32(1 / (C * (2 * patch + 1) ** 2))
-    for tile in prange(rows * columns):
+    for tile in range(first, last):
         y0, x0 = tile // columns * _TILE_HEIGHT, tile % columns * _TILE_WIDTH
         th, tw = min(_TILE_HEIGHT, H - y0), min(_TILE_WIDTH, W - x0)
         pw = tw + 2 * patch
@@ -312,4 +318,3 @@ def _filter(
                         out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin] + total[c, y, x] / weight[y, x]
                     else:
                         out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin]
-    return out

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from loops.cores import on_all_cores
 from nlm.average import check_window
 from nlm.nonlocal_means import joint_nlm
 
@@ -74,7 +75,8 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
     fades into `variance_from_residual`. Light that moves looks like noise; texture does, where the flow is wrong.
     """
     window, confidence = check_window(window, confidence, "confidence")
-    deviation, trust = _centre_deviation(window, confidence)
+    deviation, trust = np.zeros(window.shape[1:], np.float32), np.zeros(window.shape[1:3], np.float32)
+    on_all_cores(_centre_deviation, len(trust), window, confidence, deviation, trust)
     temporal = smooth_variance(deviation)
     if trust.min() >= 1:
         return temporal
@@ -172,13 +174,14 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _centre_deviation(window: Floats, confidence: Floats) -> tuple[Floats, Floats]:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _centre_deviation(
+    first: int, last: int, window: Floats, confidence: Floats, deviation: Floats, trust: Floats
+) -> None:
     """Squared deviation of the centre from the side frames, and in [0, 1] whether two of those are trusted."""
-    T, H, W, C = window.shape
+    T, _, W, C = window.shape
     centre = T // 2
-    deviation, trust = np.zeros((H, W, C), np.float32), np.zeros((H, W), np.float32)
-    for y in prange(H):
+    for y in range(first, last):
         for x in range(W):
             total, squares = np.float32(0), np.float32(0)
             for t in range(T):
@@ -195,4 +198,3 @@ def _centre_deviation(window: Floats, confidence: Floats) -> tuple[Floats, Float
                         mean += confidence[t, y, x] * window[t, y, x, c]
                 difference = window[centre, y, x, c] - mean / total
                 deviation[y, x, c] = difference**2 / (1 + np.float32(_WARPED) * squares / (total * total))
-    return deviation, trust
