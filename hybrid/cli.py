@@ -19,6 +19,7 @@ from hybrid.commands.status import status
 from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt
+from hybrid.threads import let_waiting_threads_sleep
 
 # Where numba looks for a folder for compiled loops: its own list, and after that ours.
 FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.compiled.Fallback"
@@ -65,6 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Arguments; the process's own without.
     """
     os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", FOLDERS)
+    let_waiting_threads_sleep()
     with lasting_streams():
         start_log()  # until a command has read how it is to tell things
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,14 +11,13 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import ParamSpec, Self, TypeVar
 
-import cv2
-import numba
 import numpy as np
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Frame, Shot
 from hybrid.memory import keep_freed_memory
+from hybrid.threads import let_waiting_threads_sleep, limit_threads
 from hybrid.timing import peak_memory
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
@@ -69,9 +67,7 @@ def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     BrokenProcessPool
         If the process dies.
     """
-    # Threads that wait in turns, instead of spinning, cost little alone, and on a busy machine ten times less CPU time
-    # was counted. The libraries read this when the forked process first uses them.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    let_waiting_threads_sleep()  # the libraries read it when the forked process first uses them
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])  # once, and not for every method
     with ProcessPoolExecutor(1, mp_context=context, initializer=keep_freed_memory) as pool:
@@ -132,7 +128,7 @@ def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | N
         What it has cost.
     """
     if method.threads:
-        _limit_threads(method.threads)
+        limit_threads(method.threads)
     next(method.run(shot), None)
     clock, pixels = _Clock(), 0
     with _clock_reading(shot) as reading:
@@ -147,13 +143,6 @@ def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | N
             if store is not None:
                 store.save(name, number, image)
     return Run(pixels / 1e6, clock.seconds - reading.seconds, clock.cpu_seconds - reading.cpu_seconds, peak_memory())
-
-
-def _limit_threads(count: int) -> None:
-    """Let this process's libraries use so many threads; torch reads the variable when it is imported."""
-    os.environ["OMP_NUM_THREADS"] = str(count)
-    cv2.setNumThreads(count)
-    numba.set_num_threads(min(count, numba.get_num_threads()))
 
 
 def time_methods(

@@ -6,10 +6,10 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numba
 import torch
 
 from hybrid.neural.denoiser import shipped_weights
+from hybrid.threads import limit_threads
 from network.checkpoint import load_model
 from network.clips import open_clips, split_by_shot
 from network.models import PRESETS, window_length
@@ -67,8 +67,7 @@ def train_network(
     Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over nccl with GPUs and gloo without.
     """
     if threads is not None:
-        torch.set_num_threads(threads)
-        numba.set_num_threads(min(threads, numba.get_num_threads()))
+        limit_threads(threads)
     training, kept_out = split_by_shot(open_clips(clips), validation)
     if init is None:
         if preset not in PRESETS:

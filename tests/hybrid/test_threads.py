@@ -1,0 +1,50 @@
+"""How many threads the libraries use, and what those do that wait."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hybrid.cli import main
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_the_command_lets_waiting_threads_sleep_unless_told_otherwise(given, expected, monkeypatch, capsys):
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    monkeypatch.setattr(os, "environ", environment | ({"OMP_WAIT_POLICY": given} if given else {}))
+    assert main(["--version"]) == 0
+    assert os.environ["OMP_WAIT_POLICY"] == expected
+
+
+def test_openmp_has_not_read_the_variable_before_the_command_sets_it():
+    """Once numba or torch is loaded it is too late."""
+    code = "import sys, hybrid.cli; print(*{'numba', 'torch', 'cv2'} & set(sys.modules))"
+    assert not subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
+COUNTS = """
+import cv2, numba
+{first}
+from hybrid.threads import limit_threads
+limit_threads(1)
+import torch
+print(cv2.getNumThreads(), numba.get_num_threads(), torch.get_num_threads())
+"""
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("first", ["import torch", ""])
+def test_all_libraries_are_limited_whether_torch_is_there_already_or_not(first):
+    code = COUNTS.format(first=first)
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    environment["NUMBA_NUM_THREADS"] = "3"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.split() == ["1", "1", "1"]
+
+
+def test_numba_is_not_asked_for_more_than_it_started_with():
+    code = "import numba\nfrom hybrid.threads import limit_threads\nlimit_threads(8)\nprint(numba.get_num_threads())"
+    environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.split() == ["2"]
