@@ -251,7 +251,7 @@ class Patches:
     @cached_property
     def found(self) -> np.ndarray:
         """What a flow that is found in the pictures leaves of each patch."""
-        return self._costs(1, self.gather(_found(*self.pictures), self.all), self.all, ONE_PIXEL)
+        return self._costs(1, self.gather(rough_flow(*self.pictures), self.all), self.all, ONE_PIXEL)
 
     @cached_property
     def unrelated(self) -> bool:
@@ -472,6 +472,7 @@ def _agreeing(
         "unit": tuple(UNITS),
         "y": tuple(VERTICAL),
         "encoding": () if "encoding" in settled else _encodings(vectors),
+        "premultiplied": (),
     }
     for part, others in options.items():
         first = getattr(assumed, part)
@@ -497,8 +498,19 @@ def _encodings(vectors: Sequence[np.ndarray]) -> list[str]:
     return ["plain", "gray"]
 
 
-def _found(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """A flow (H, W, 2) from the later picture (H, W) to the earlier, found in them."""
+def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
+    """Find a flow in two pictures, reduced to at most `FOUND_PIXELS` pixels: good enough to tell whether there is one.
+
+    Parameters
+    ----------
+    earlier, later : (H, W) array
+        From `flow.guide.tone_map`.
+
+    Returns
+    -------
+    (H, W, 2) array of float32
+        Pixels, from the later picture to the earlier.
+    """
     height, width = later.shape
     factor = min(1.0, float(np.sqrt(FOUND_PIXELS / (height * width))))
     size = max(1, round(width * factor)), max(1, round(height * factor))

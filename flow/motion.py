@@ -53,6 +53,8 @@ class MotionConvention:
         What is added to each decoded component before that, where the still is not 0.
     encoding : str
         A key of `ENCODINGS`.
+    premultiplied : bool
+        Whether they are multiplied by alpha, by which whoever has both divides them before anything else.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class MotionConvention:
     scale: float = 1.0
     offset: float = 0.0
     encoding: str = "plain"
+    premultiplied: bool = False
 
     def __post_init__(self) -> None:
         words = {"direction": DIRECTIONS, "unit": UNITS, "y": VERTICAL, "encoding": ENCODINGS}
@@ -80,6 +83,8 @@ class MotionConvention:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
                 raise ValueError(f"{name} of motion is {value!r}, expected a number")
+        if not isinstance(self.premultiplied, bool):
+            raise ValueError(f"premultiplied of motion is {self.premultiplied!r}, expected true or false")
         if self.scale == 0:
             raise ValueError("scale of motion is 0, expected a number that is not 0")
 
@@ -105,6 +110,7 @@ class MotionConvention:
         said = [self.direction, self.unit, f"y-{self.y}"]
         said += [] if self.encoding == "plain" else [self.encoding]
         said += [f"{name}={getattr(self, name):.6g}" for name in ("scale", "offset") if self._differs(name)]
+        said += ["premultiplied"] if self.premultiplied else []
         return ",".join(said)
 
     def _differs(self, name: str) -> bool:

@@ -82,9 +82,18 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions for one window, or for a shot: then a stage is on if it is for any frame."""
+    """The decisions for one window, or for a shot: then a stage is on if it is for any frame.
+
+    Attributes
+    ----------
+    decisions : tuple of Decision
+        One for each of `STAGES`.
+    cuts : tuple of (int, int)
+        Neighbouring frames that show something else: nothing is averaged over them.
+    """
 
     decisions: tuple[Decision, ...]
+    cuts: tuple[tuple[int, int], ...] = ()
 
     @property
     def stages(self) -> frozenset[str]:
@@ -93,13 +102,14 @@ class Plan:
 
     def force(self, on: Collection[str] = (), off: Collection[str] = ()) -> Plan:
         """Switch stages on or off whatever was measured."""
-        return Plan(
-            tuple(
+        return replace(
+            self,
+            decisions=tuple(
                 replace(d, on=d.stage in on, forced=True, reason=f"forced; measured: {d.reason}")
                 if d.stage in on or d.stage in off
                 else d
                 for d in self.decisions
-            )
+            ),
         )
 
 
@@ -120,11 +130,12 @@ def as_run(plan: Plan, stages: Collection[str]) -> Plan:
     Plan
     """
     words = "estimates are compared in any case; measured: "
-    return Plan(
-        tuple(
+    return replace(
+        plan,
+        decisions=tuple(
             replace(d, on=True, reason=words + d.reason) if d.stage in stages and not d.on else d
             for d in plan.decisions
-        )
+        ),
     )
 
 
@@ -183,13 +194,15 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
     frames : sequence of FrameFacts
         Of all frames of the window that are there; at least one.
     pairs : sequence of PairFacts
-        Of all neighbours among them.
+        Of all neighbours among them. Of those across a cut nothing is asked.
 
     Returns
     -------
     Plan
         One decision for each of `STAGES`.
     """
+    cuts = tuple(pair.numbers for pair in pairs if pair.cut)
+    pairs = [pair for pair in pairs if not pair.cut]
     vectors = bool(pairs) and all(pair.vectors for pair in pairs)
     changed = max((pair.changed for pair in pairs), default=0.0)
     unexplained = max((pair.unexplained for pair in pairs), default=0.0)
@@ -221,7 +234,8 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             if not transparent
             else _decide("alpha", max(transparent), 0, "{:.1%} of the picture is transparent"),
             _decide("skip", min(frame.noise_free for frame in frames), 0.0, "{:.1%} of the tiles hold no noise"),
-        )
+        ),
+        cuts,
     )
 
 
@@ -278,7 +292,7 @@ def merge(plans: dict[int, Plan]) -> Plan:
         where = f"; frames {format_frames(on)} of {format_frames(plans)}" if 0 < len(on) < len(plans) else ""
         assert stage == most.stage
         merged.append(replace(most, reason=most.reason + where, frames=on))
-    return Plan(tuple(merged))
+    return Plan(tuple(merged), tuple(sorted({cut for plan in plans.values() for cut in plan.cuts})))
 
 
 def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision:

@@ -6,7 +6,7 @@ convention, guides of another frame. What does not make sense is left out, and a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -154,6 +154,19 @@ def judge_layers(shot: Shot) -> Judgement:
         return _judge_pairs(shot, readable) if readable else Judgement()
 
 
+def find_cut(a: int, b: int) -> Finding:
+    """Say that two neighbouring frames show something else.
+
+    Parameters
+    ----------
+    a, b : int
+        Numbers of frames between which `hybrid.alignment.measure.PairFacts` has a cut.
+    """
+    return Finding(
+        "color", f"frames {a} and {b} show something else: nothing is averaged over this cut", left_out=False
+    )
+
+
 def _can_read(shot: Shot, number: int) -> bool:
     try:
         shot.read(number)
@@ -167,27 +180,27 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     evidence = _Evidence(layers)
     if not pairs:
         evidence.add(shot.read(shot.available[0]))
-        return _judge(evidence, layers, {})
-    patches: dict[tuple[int, int], Patches] = {}
+        return _judge(evidence, layers, [])
+    patches: list[Patches] = []
     for a, b in pairs:
         earlier, later = shot.read(a), shot.read(b)
         evidence.add(earlier, later)
         if earlier.motion is not None and later.motion is not None:
             resolution = earlier.resolution or earlier.motion.shape[:2]
             pair = FramePair(earlier.color, later.color, earlier.motion, later.motion, resolution, shot.step)
-            patches[a, b] = Patches(pair)
+            patches.append(Patches(pair))
         judgement = _judge(evidence, layers, patches)
         if not judgement.warnings and (judgement.motion is None or judgement.motion.certain):
             break  # nothing is left to ask
     return judgement
 
 
-def _judge(evidence: _Evidence, layers: Layers, patches: Mapping[tuple[int, int], Patches]) -> Judgement:
+def _judge(evidence: _Evidence, layers: Layers, patches: Sequence[Patches]) -> Judgement:
     choice = None
     if layers.motion_convention is not None and patches:
-        choice = choose_convention([*patches.values()], layers.motion_convention, layers.settled)
+        choice = choose_convention(patches, layers.motion_convention, layers.settled)
     variance_scale, judged = evidence.judge_variance()
-    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice, [*patches]))]
+    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice))]
     return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
 
 
@@ -387,11 +400,8 @@ def _variance_ratios(frame: Frame) -> Array:
     return np.asarray(given[lit] / shown[lit], np.float32).ravel()
 
 
-def _judge_motion(layers: Layers, choice: Choice, pairs: Sequence[tuple[int, int]]) -> Iterator[Finding]:
-    """What there is to say of the vectors, and of frames that they cannot connect."""
-    for index in choice.unrelated:
-        a, b = pairs[index]
-        yield Finding("color", f"frames {a} and {b} show something else: a cut, or another light?", left_out=False)
+def _judge_motion(layers: Layers, choice: Choice) -> Iterator[Finding]:
+    """What there is to say of the vectors."""
     name = f"motion ({layers.motion})"
     left, still = f"{choice.unexplained:.1%}", f"{choice.still:.1%}"
     if choice.convention is None:

@@ -332,7 +332,7 @@ RENDERERS = {
                 | layer("albedo", "RGB", t.albedo)
                 | layer("normal", "XYZ", t.normal)
                 | {"depth": t.depth}
-                | layer("motionvec", "XY", t.following / t.size * 2 * UP)
+                | layer("motionvec", "XY", t.following / t.size * 2 * UP * t.alpha[..., None])
             )
         ),
         direction="next",

@@ -375,7 +375,7 @@ class Aligner:
         return self._frames.get(number)
 
     def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
-        """Flow from frame `start` to frame `end`, chained over the frames between; None where one is missing."""
+        """Flow from frame `start` to frame `end`, chained over the frames between; None beyond a gap or a cut."""
         if (start, end) not in self._chains:
             self._chains[start, end] = self._chain(start, end)
         return self._chains[start, end]
@@ -406,8 +406,11 @@ class Aligner:
 
     def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
         # What a pair calls for is decided from the pair alone: its flow is the same in every window.
-        stages = self.stages_of(sorted((here.number, there.number)))
+        numbers = sorted((here.number, there.number))
+        stages = self.stages_of(numbers)
         shape = here.irradiance.shape[:2]
+        if not isinstance(self._decide, _Always) and self._facts_of_pair(*numbers).cut:
+            return None
         if "warp" not in stages:
             return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
         dense = "dense-flow" in stages

@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import INPUT, OUTPUT, WHAT, FramesOption, LayerOption, choose, open_input
+from hybrid.commands.options import (
+    INPUT,
+    OUTPUT,
+    WHAT,
+    FramesOption,
+    LayerOption,
+    MotionOption,
+    ProfileOption,
+    StrictOption,
+    choose,
+    judge_alike,
+    open_input,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -98,6 +110,9 @@ def compare(
     ] = None,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
+    strict: StrictOption = False,
 ) -> None:
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
     import tempfile
@@ -128,7 +143,9 @@ def compare(
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
-    noisy = open_input(shot, frames, layer)
+    opened = open_input(shot, frames, layer, profile=profile, motion=motion)
+    alike, said = judge_alike({"shot": opened}, strict=strict)
+    noisy = alike["shot"]
     clean = [_open_beside(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
     if sweep:
@@ -136,11 +153,12 @@ def compare(
         from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
         from hybrid.plan import plan_shot
 
-        # Another object, since the frames it keeps would travel to every method's process.
-        plan = plan_shot(open_input(shot, frames, layer))
-        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
+        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}}
+        chosen |= sweep_methods(plan_shot(noisy))
     pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
-    levels = [(open_input(pattern, frames, layer), _number(count, "--level")) for pattern, count in pairs]
+    levels = [
+        (open_input(pattern, frames, layer, profile=profile), _number(count, "--level")) for pattern, count in pairs
+    ]
     bar: Progress | None = None
 
     def show(what: str, done: float, total: float) -> None:
@@ -160,6 +178,7 @@ def compare(
             samples=samples or samples_of(noisy),
             reference_samples=samples_of(clean[0]),
             levels=levels,
+            said=said,
             maps=output is not None,
             folder=Path(folder),
             progress=show,

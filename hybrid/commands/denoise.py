@@ -44,6 +44,7 @@ from hybrid.commands.options import (
     judge_input,
     open_input,
     rules_of,
+    say_cuts,
     usage,
 )
 from hybrid.interrupt import INTERRUPTED, interruptible
@@ -144,6 +145,7 @@ def pseudoref(
             keep_going=keep_going,
             max_memory=max_memory,
             judgement=judgement,
+            strict=strict,
             gathers=gathers,
             others=beside,
         )
@@ -316,6 +318,7 @@ def denoise(
         keep_going=keep_going,
         max_memory=max_memory,
         judgement=judgement,
+        strict=strict,
         others=beside,
         radius=denoiser.radius,
         neural=True,
@@ -445,6 +448,7 @@ class Job:
     judgement: Judgement
     others: Sequence[tuple[Shot, EstimateSource]] = ()
     radius: int = 2
+    strict: bool = False
     neural: bool = False
     gathers: bool = False  # samples of the window, which OIDN then denoises
     before: SourcesOf | None = None  # what the shot was made from, if a pass has made it
@@ -568,7 +572,8 @@ def _denoise(job: Job, record: Record) -> None:
         "ravg/settings": json.dumps(settings, sort_keys=True),
         "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
     }
-    record.write(timings, layers=layers, judged=[vars(finding) for finding in job.judgement.findings])
+    judged = list(job.judgement.findings)
+    record.write(timings, layers=layers, judged=[vars(finding) for finding in judged])
     pixels, outliers = 0, 0
     plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))
@@ -601,6 +606,7 @@ def _denoise(job: Job, record: Record) -> None:
         outliers += finished.outliers
         if finished.plan is not None:
             plans[finished.number] = finished.plan
+            judged += say_cuts(finished.plan, judged, strict=job.strict)
         if finished.again:
             LOG.info(f"frame {finished.number} is made again: {printable(finished.again)}")
         if finished.fireflies:
@@ -615,7 +621,7 @@ def _denoise(job: Job, record: Record) -> None:
         facts = {"file": finished.path.name, "seconds": seconds, "light_removed": finished.removed}
         stages = sorted(finished.plan.stages) if finished.plan else None
         record.add(finished.number, state, **facts, stages=stages)
-        record.write(timings, pixels=pixels, outliers=outliers)
+        record.write(timings, pixels=pixels, outliers=outliers, judged=[vars(finding) for finding in judged])
         message = f"frame {finished.number} {words}"
         progress.advance(message=message, frame=finished.number, seconds=seconds, path=str(finished.path))
     plan = merge(plans).decisions if plans else ()

@@ -24,6 +24,7 @@ from hybrid.commands.options import (
     judge_input,
     open_input,
     rules_of,
+    say_cuts,
 )
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def inspect(
     rules = rules_of(stages, no_stages)
     progress = Progress("look", len(opened))
     plan = plan_shot(opened, rules, advance=progress.advance)
+    judged = [*judgement.findings, *say_cuts(plan, judgement.findings, strict=strict)]
     if as_json:
         document = {
             "frames": opened.numbers,
@@ -73,7 +75,7 @@ def inspect(
             "profile": layers.profile,
             "reason": layers.reason,
             "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in rows],
-            "judged": [asdict(finding) for finding in judgement.findings],
+            "judged": [asdict(finding) for finding in judged],
             "motion": judgement.readings(),
             "plan": [asdict(decision) for decision in plan.decisions],
         }

@@ -15,8 +15,9 @@ from hybrid.commands.log import LOG, printable
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
     from hybrid.files.frames import Shot
-    from hybrid.plan import Rules
-    from hybrid.plausibility import Judgement
+    from hybrid.files.profile import Profile
+    from hybrid.plan import Plan, Rules
+    from hybrid.plausibility import Finding, Judgement
 
 Thing = TypeVar("Thing")
 
@@ -177,13 +178,9 @@ def open_input(
 ) -> Shot:
     from hybrid.files.exr import MAX_PIXELS
     from hybrid.files.frames import open_shot
-    from hybrid.files.profile import open_profile, parse_motion
     from hybrid.files.sequences import parse_frames
 
-    with usage():
-        if motion not in (None, "auto", "none"):
-            parse_motion(motion or "")
-        chosen = None if profile is None else open_profile(profile)
+    chosen = parse_input(profile, motion)
     overrides = parse_layers(layer)
     if frames is not None:
         with usage():
@@ -202,6 +199,16 @@ def open_input(
     for warning in opened.warnings:
         LOG.warning(warning)
     return opened
+
+
+def parse_input(profile: str | None, motion: str | None) -> Profile | None:
+    """The profile that is asked for; what is no convention is refused."""
+    from hybrid.files.profile import open_profile, parse_motion
+
+    with usage():
+        if motion not in (None, "auto", "none"):
+            parse_motion(motion or "")
+        return None if profile is None else open_profile(profile)
 
 
 def parse_layers(layer: Sequence[str] | None) -> dict[str, str]:
@@ -252,14 +259,45 @@ def judge_input(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgemen
     judged = [judge_layers(picture) for picture in pictures]
     findings = [finding for judgement in judged for finding in judgement.findings]
     judgement = replace(judged[0], findings=tuple(dict.fromkeys(findings)))
-    if strict and (warnings := [*shot.warnings, *judgement.warnings]):
-        raise ValueError("; ".join(warnings))
-    for warning in judgement.warnings:
-        LOG.warning(printable(warning))
+    _say(judgement, shot, strict=strict)
     if len(pictures) > 1:
         colors = ", ".join(str(picture.layers(picture.numbers[0]).color) for picture in pictures)
         LOG.info(f"pictures: {printable(colors)}: each is denoised; --layer color=NAME chooses one")
     return tuple(own.apply(picture) for own, picture in zip(judged, pictures, strict=True)), judgement
+
+
+def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, Shot], list[str]]:
+    """Renders of one shot, without the layers that make no sense in one of them; what was found is said as ever.
+
+    Of files with several pictures one has to be chosen. Also returned is what was said.
+    """
+    from hybrid.plausibility import judge_layers
+
+    judged = {name: judge_layers(shot) for name, shot in shots.items()}
+    for name, judgement in judged.items():
+        _say(judgement, shots[name], strict=strict, name=name if len(shots) > 1 else "")
+    findings = tuple(dict.fromkeys(finding for judgement in judged.values() for finding in judgement.findings))
+    apply = {name: replace(judgement, findings=findings).apply(shots[name]) for name, judgement in judged.items()}
+    return apply, [finding.message for finding in findings]
+
+
+def _say(judgement: Judgement, shot: Shot, *, strict: bool, name: str = "") -> None:
+    if strict and (warnings := [*shot.warnings, *judgement.warnings]):
+        raise ValueError(f"{name}: {'; '.join(warnings)}" if name else "; ".join(warnings))
+    for warning in judgement.warnings:
+        LOG.warning(printable(f"{name}: {warning}" if name else warning))
+
+
+def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool) -> list[Finding]:
+    """What there is to say of a plan's cuts beyond what is known; said in a line each, an error if `strict`."""
+    from hybrid.plausibility import find_cut
+
+    found = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
+    if strict and found:
+        raise ValueError("; ".join(finding.message for finding in found))
+    for finding in found:
+        LOG.warning(finding.message)
+    return found
 
 
 def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:

@@ -19,7 +19,12 @@ from hybrid.commands.options import (
     WHAT,
     FramesOption,
     LayerOption,
+    MotionOption,
+    ProfileOption,
+    StrictOption,
     import_neural,
+    judge_alike,
+    parse_input,
     parse_layers,
     usage,
 )
@@ -27,6 +32,7 @@ from network.train_config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
     from hybrid.files.frames import Shot
+    from hybrid.files.profile import Profile
 
 TRAINING = "Training"
 DEFAULTS = TrainConfig(steps=1)  # one limit there must be
@@ -38,6 +44,8 @@ def open_levels(
     *,
     frames: str | None = None,
     layers: dict[str, str] | None = None,
+    profile: Profile | None = None,
+    motion: str | None = None,
 ) -> tuple[str, dict[str, Shot], list[float]]:
     """Find the noise levels of a shot.
 
@@ -50,7 +58,7 @@ def open_levels(
         Levels to take, and their samples per pixel. Without: all there are, and what Cycles wrote in their headers.
     frames : str, optional
         As for `hybrid.files.frames.open_shot`.
-    layers : dict of str to str, optional
+    layers, profile, motion : optional
         The same.
 
     Returns
@@ -83,7 +91,10 @@ def open_levels(
     else:
         path = path.parent
         specs = {Path(spec).name.partition(".")[0]: spec}
-    levels = {name: open_shot(item, frames=frames, layers=layers or {}, keep=1) for name, item in specs.items()}
+    levels = {
+        name: open_shot(item, frames=frames, layers=layers or {}, profile=profile, motion=motion, keep=1)
+        for name, item in specs.items()
+    }
     counts = []
     for name, shot in levels.items():
         count = (samples or {}).get(name) or samples_of(shot)
@@ -135,6 +146,9 @@ def prepare(
     seed: Annotated[int, typer.Option(help="of the places", rich_help_panel=WHAT)] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
+    profile: ProfileOption = None,
+    motion: MotionOption = None,
+    strict: StrictOption = False,
     scheduler: SchedulerOption = None,
 ) -> None:
     """Make training clips: aligned windows at all noise levels, with first estimates and pseudo-references.
@@ -152,8 +166,8 @@ def prepare(
 
     with usage():
         samples = None if levels is None else parse_samples(levels)
-    roles = parse_layers(layer)
-    found = [open_levels(spec, samples, frames=frames, layers=roles) for spec in shots]
+    roles, chosen = parse_layers(layer), parse_input(profile, motion)
+    found = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
@@ -174,7 +188,7 @@ def prepare(
             bar.advance(len(first), f"{name} has clips already")
             continue
         write_clips(
-            shot,
+            judge_alike(shot, strict=strict)[0],
             counts,
             output,
             name,

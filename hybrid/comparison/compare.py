@@ -33,6 +33,7 @@ def compare_shot(
     samples: float | None = None,
     reference_samples: float | None = None,
     levels: Sequence[tuple[Shot, float]] = (),
+    said: Sequence[str] = (),
     maps: bool = False,
     folder: Path | None = None,
     progress: Progress | None = None,
@@ -59,6 +60,8 @@ def compare_shot(
         Per pixel, of the shot and of the (whole) reference.
     levels : sequence of (Shot, float)
         Further renders of the shot with their samples per pixel, to measure how the noisy error falls.
+    said : sequence of str
+        What there is to say of the shot's layers.
     maps : bool
         Whether the methods' own maps are made too.
     folder : Path, optional
@@ -104,6 +107,8 @@ def compare_shot(
             else _result(name, method, runs[name], statistics[name], law)
             for name, method in methods.items()
         ]
+        if said:
+            facts["Layers"] = "; ".join(said)
         if maps:
             for name in runs:
                 run_apart(_store_maps, methods[name], shot, numbers, name, store)

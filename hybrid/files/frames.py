@@ -773,6 +773,11 @@ def _frame(
     if following is not None and layers.motion_convention is not None:
         one = layers.motion_convention.channels // 2
         taken["motion"] = np.concatenate([taken["motion"][..., :one], following[..., :one]], axis=-1)
+    convention = layers.motion_convention
+    if convention is not None and convention.premultiplied:
+        convention = replace(convention, premultiplied=False)
+        if (alpha := taken.get("alpha")) is not None:
+            np.divide(taken["motion"], alpha[..., None], out=taken["motion"], where=alpha[..., None] > 0)
     for role in LIMITED & taken.keys():
         taken[role] = _limited(taken[role], LARGEST**2 if role == "variance" else LARGEST)
     halves = taken.pop("half_a", None), taken.pop("half_b", None)
@@ -781,7 +786,7 @@ def _frame(
     return Frame(
         number=number,
         **taken,
-        motion_convention=layers.motion_convention,
+        motion_convention=convention,
         resolution=_size(image.parts[layers.color.part])[::-1],
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
         source=image.path,

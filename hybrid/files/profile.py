@@ -92,8 +92,8 @@ class Profile:
     @property
     def settled(self) -> frozenset[str]:
         """The parts of the convention that are documented."""
-        # No renderer is known that shifts its vectors otherwise than their encoding tells.
-        return frozenset({*self.motion, "offset"})
+        # Nobody is known to shift vectors otherwise than their encoding tells, and MoonRay alone to multiply them.
+        return frozenset({*self.motion, "offset", "premultiplied"})
 
     def with_motion(self, words: str) -> Profile:
         """The same with motion as the user says it (`parse_motion`); with "auto", nothing of it is settled.
@@ -131,7 +131,7 @@ def parse_motion(words: str) -> dict[str, Any]:
     """
     tables = {"direction": DIRECTIONS, "unit": UNITS, "encoding": ENCODINGS}
     known: dict[str, tuple[str, Any]] = {word: (part, word) for part, table in tables.items() for word in table}
-    known |= {f"y-{side}": ("y", side) for side in VERTICAL}
+    known |= {f"y-{side}": ("y", side) for side in VERTICAL} | {"premultiplied": ("premultiplied", True)}
     parts: dict[str, Any] = {}
     for word in filter(None, (text.strip() for text in words.split(","))):
         part, value = known.get(word, ("", ""))

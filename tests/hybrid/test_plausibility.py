@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +15,8 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import open_shot
-from hybrid.plausibility import find_lost_light, find_nonfinite, judge_layers
+from hybrid.plan import plan_shot
+from hybrid.plausibility import find_cut, find_lost_light, find_nonfinite, judge_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 
@@ -238,15 +240,62 @@ def test_a_shot_of_one_frame_is_judged_too(tmp_path) -> None:
     assert judgement.motion is None
 
 
-def test_a_cut_is_noticed(tmp_path) -> None:
+def test_vectors_are_not_judged_over_a_cut(tmp_path) -> None:
     def edit(index: int, channels: Channels) -> None:
         if index >= 1:
             channels.update({name: np.ascontiguousarray(plane[::-1, ::-1]) for name, plane in channels.items()})
             channels.update({name: -plane for name, plane in channels.items() if ".Vector." in name})
 
-    judgement = judge_layers(open_shot(write(tmp_path, edit)))
-    assert judgement.warnings == ("frames 9 and 10 show something else: a cut, or another light?",)
-    assert not judgement.findings[0].left_out  # the vectors are as good as they were
+    spec = write(tmp_path, edit)
+    judgement = judge_layers(open_shot(spec))
+    assert judgement.findings == ()
+    assert judgement.motion is not None
+    assert judgement.motion.convention is not None
+    assert plan_shot(judgement.apply(open_shot(spec))).cuts == ((9, 10),)
+
+
+def test_a_cut_anywhere_is_noticed_said_once_and_nothing_is_averaged_over_it(tmp_path) -> None:
+    """Also between the pairs that are judged before anything runs."""
+
+    def edit(index: int, channels: Channels) -> None:
+        if index >= 2:
+            channels.update({name: np.ascontiguousarray(plane[::-1, ::-1]) for name, plane in channels.items()})
+            channels.update({name: -plane for name, plane in channels.items() if ".Vector." in name})
+
+    spec = write(tmp_path / "cut", edit)
+    assert judge_layers(open_shot(spec)).warnings == ()
+    made, said = denoised(spec, tmp_path / "out", "--preset", "draft")
+    assert warnings(said) == [f"warning: {find_cut(10, 11).message}"]
+    (record,) = (tmp_path / "out" / "ravg").glob("*.json")
+    assert find_cut(10, 11).message in record.read_text()
+    # As if the other half were not there.
+    for number in (11, 12):
+        (tmp_path / "cut" / f"shot.{number:04d}.exr").unlink()
+    alone, _ = denoised(spec, tmp_path / "alone", "--preset", "draft")
+    for number in (9, 10):
+        np.testing.assert_array_equal(made[number], alone[number])
+
+
+def test_a_light_that_is_switched_on_is_no_cut(tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        if index >= 2:
+            channels.update({name: 4 * plane for name, plane in channels.items() if name.startswith(f"{LIGHT}.")})
+
+    assert plan_shot(open_shot(write(tmp_path, edit))).cuts == ()
+
+
+def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        if index >= 2:
+            channels.update({name: np.ascontiguousarray(plane[::-1, ::-1]) for name, plane in channels.items()})
+
+    spec = write(tmp_path, edit)
+    assert main(["inspect", str(spec), "--motion", "none", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert "frames 10 and 11 show something else" in " ".join(err.split())
+    assert "frames 10 and 11 show something else" in json.loads(out)["judged"][-1]["message"]
+    assert main(["inspect", str(spec), "--motion", "none", "--strict"]) == 1
+    assert main(["pseudoref", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"]) == 1
 
 
 def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales() -> None:

@@ -6,9 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybrid.cli import main
+from hybrid.comparison.results import read_comparison
 from tests.scenes import Scene
 
 SMALL = Scene(height=24, width=32, frames=2)
@@ -52,3 +54,21 @@ def test_without_jinja_the_page_is_refused_before_anything_runs(shots: tuple[Pat
         "expected: pip install 'ravg[compare]' (the table alone is made without)"
     ]
     assert not (tmp_path / "report").exists()
+
+
+def test_layers_are_judged_as_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One warning, a word in the report's facts, an error where that is asked for; and a motion that is said holds."""
+
+    def black(index: int, layers: dict[str, np.ndarray]) -> None:
+        layers["ViewLayer.Denoising Albedo"][:] = 0
+
+    noisy, clean = SMALL.write(tmp_path / "noisy", edit=black), SMALL.write(tmp_path / "clean", clean=True)
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1"]
+    assert main([*words, "-o", str(tmp_path / "report"), "--motion", "none"]) == 0
+    said = "albedo (ViewLayer.Denoising Albedo.RGB) is black: left out"
+    assert " ".join(capsys.readouterr().err.split()).count(said) == 1
+    assert said in read_comparison(tmp_path / "report" / "results.json").facts["Layers"]
+    assert main([*words, "--strict"]) == 1
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert main([*words, "--motion", "sideways"]) == 2
+    assert main([*words, "--profile", "nobody"]) == 2

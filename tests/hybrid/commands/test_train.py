@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 
 from hybrid.cli import main  # noqa: E402
 from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
-from hybrid.files.exr import read_exr  # noqa: E402
+from hybrid.files.exr import read_exr, write_layers  # noqa: E402
 from hybrid.files.frames import open_shot  # noqa: E402
 from hybrid.files.sources import MADE_FROM  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
@@ -54,6 +54,24 @@ def weights(tmp_path_factory):
 
 def run(*arguments):
     return main([str(argument) for argument in arguments])
+
+
+def test_what_makes_no_sense_at_one_level_is_left_out_of_the_clips(shot, tmp_path, capsys):
+    kept = tmp_path / "wall"
+    shutil.copytree(shot, kept)
+    for path in kept.glob("b.*.exr"):
+        image = read_exr(path)
+        layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
+        layers["ViewLayer.Denoising Albedo"][:] = 0
+        write_layers(path, layers)
+    options = (kept, "-o", tmp_path / "clips", "--levels", "a=24,b=24", "--tile", 0, "--estimate", "nlm", "--window", 3)
+    assert run("prepare", *options, "--strict") == 1
+    assert not list((tmp_path / "clips").glob("*.safetensors"))
+    assert run("prepare", *options, "--motion", "none") == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "b: albedo (ViewLayer.Denoising Albedo.RGB) is black: left out" in said
+    assert "a: albedo" not in said
+    assert run("prepare", *options, "--motion", "sideways") == 2
 
 
 def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):

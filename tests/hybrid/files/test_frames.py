@@ -8,7 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from flow.motion import CYCLES
+from flow.motion import CYCLES, MotionConvention
 from hybrid.alignment.align import Aligner
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import ExrError, read_exr, write_layers
@@ -175,6 +175,18 @@ def test_two_half_buffers_give_the_variance_where_there_is_none(tmp_path):
     np.testing.assert_array_equal(open_shot(tmp_path).read(1).variance, layers["ViewLayer.Combined"])
     write_layers(tmp_path / "a.0001.exr", {k: v for k, v in layers.items() if "B" not in k}, half=False)
     assert open_shot(tmp_path).read(1).variance is None
+
+
+def test_vectors_that_are_multiplied_by_alpha_are_divided_by_it(tmp_path):
+    alpha = np.linspace(0, 1, 24, dtype=np.float32).reshape(*SIZE, 1)
+    layers = {"color": np.concatenate([image(1), alpha], axis=-1), "motion": alpha * image(-3, 2)}
+    write_layers(tmp_path / "shot.0001.exr", layers)
+    frame = open_shot(tmp_path, motion="previous,premultiplied").read(1)
+    assert frame.motion_convention == MotionConvention()
+    np.testing.assert_allclose(frame.motion[alpha[..., 0] > 0], -3, rtol=1e-3)  # half floats
+    assert not frame.motion[0, 0].any()  # nothing is there, and nothing is known
+    plain = open_shot(tmp_path, motion="previous").read(1)
+    np.testing.assert_array_equal(plain.motion, layers["motion"])
 
 
 def test_variance_of_one_channel_holds_for_all_three(tmp_path):

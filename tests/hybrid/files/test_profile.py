@@ -131,18 +131,23 @@ def test_an_attribute_counts_more_than_a_layer(tmp_path):
     assert find_profile(image(tmp_path, "RGBA MotionVectors.RG DiffuseFilter.RGB", vrayInfo__w="8")).name == "V-Ray"
 
 
+NEVER_OPEN = {"offset", "premultiplied"}
+
+
 def test_what_is_documented_is_settled_and_the_rest_is_to_be_measured(tmp_path):
     cycles = find_layers(image(tmp_path, "V.Combined.RGB V.Vector.XYZW V.Noisy_Image.RGB"))
     assert cycles.motion_convention == CYCLES
     arnold = find_layers(image(tmp_path, "RGBA motionvector.RG", arnold__version="7"))
     assert arnold.motion_convention == MotionConvention("next")
-    assert arnold.settled == {"direction", "offset"}
+    assert arnold.settled == {"direction", *NEVER_OPEN}
     appleseed = find_layers(image(tmp_path, "RGBA screen_space_velocity.RGB"))
     assert appleseed.motion_convention == MotionConvention("next", "ndc", encoding="magnitude")
-    assert appleseed.settled == {"direction", "unit", "encoding", "offset"}
+    assert appleseed.settled == {"direction", "unit", "encoding", *NEVER_OPEN}
     octane = find_layers(image(tmp_path, "Beauty.RGB Motion_vector.RG"))
     assert octane.motion_convention == MotionConvention("next", "screen", "up")
-    assert octane.settled == {"offset"}
+    assert octane.settled == NEVER_OPEN
+    moonray = find_layers(image(tmp_path, "RGBA motionvec.XY"))
+    assert moonray.motion_convention == MotionConvention(unit="half-ndc", premultiplied=True)
 
 
 def test_of_vectors_to_both_neighbours_one_layer_is_enough(tmp_path):
@@ -254,14 +259,21 @@ def test_motion_is_said_in_words():
         parse_motion("scale=0")
 
 
+def test_what_is_multiplied_by_alpha_is_said_in_a_word():
+    assert parse_motion("next,premultiplied") == {"direction": "next", "premultiplied": True}
+    assert str(MotionConvention(premultiplied=True)) == "previous,pixels,y-down,premultiplied"
+    with pytest.raises(ValueError, match="premultiplied of motion is 1, expected true or false"):
+        MotionConvention(premultiplied=1)
+
+
 def test_what_the_user_says_of_motion_goes_before_the_profile():
     arnold = open_profile("arnold")
     told = arnold.with_motion("previous,y-up")
     assert told.convention(2) == MotionConvention("previous", y="up")
-    assert told.settled == {"direction", "y", "offset"}
+    assert told.settled == {"direction", "y", *NEVER_OPEN}
     measured = open_profile("cycles").with_motion("auto")
     assert measured.convention(4) == CYCLES
-    assert measured.settled == {"offset"}
+    assert measured.settled == NEVER_OPEN
 
 
 def test_one_line_says_what_was_taken(tmp_path):
@@ -286,7 +298,7 @@ def test_the_profile_of_the_documentation_is_one(tmp_path):
     path.write_text(DOCUMENT.partition("```toml\n")[2].partition("```")[0], encoding="utf-8")
     profile = read_profile(path)
     assert (profile.name, profile.samples, profile.files) == ("Studio", "studio/spp", {"variance": "{name}_stats"})
-    assert profile.settled == {"unit", "y", "offset"}
+    assert profile.settled == {"unit", "y", *NEVER_OPEN}
 
 
 @pytest.mark.parametrize("name", sorted(set(read_profiles()) - {"common"}))
