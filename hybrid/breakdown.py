@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -78,13 +78,13 @@ def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
     return {**layers, **{f"weight.{name}": weight for name, weight in zip(names, weights, strict=True)}}
 
 
-def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> None:
+def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, path: Path) -> None:
     """Write a PNG of the middle frame: noisy and denoised, what each frame contributes, and its weight.
 
     Parameters
     ----------
-    shot : Shot
-        The input.
+    pictures : sequence of Shot
+        The input, once for each picture in its files; they stand one below the other.
     output : str or Path
         Where frames with the layers of `layers_of` have been written.
     frames : int
@@ -93,16 +93,24 @@ def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> 
         Of the PNG. Top row: noisy, denoised. Then the contributions of the frames in order of time, and below each
         its weight, black 0 and white 1. All but the weights are exposed alike and sRGB encoded.
     """
-    names = frame_names(frames)
+    sheets = [_sheet(shot, output, frame_names(frames)) for shot in pictures]
+    width = max(sheet.shape[1] for sheet in sheets)
+    write_png(
+        path, np.vstack([np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=1) for s in sheets])
+    )
+
+
+def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:
+    """The rows of one picture, in [0, 1]."""
     number = shot.numbers[len(shot.numbers) // 2]
-    layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
-    denoised = shot.remade({number: output_path(output, shot, number)}, aovs=layers).read(number)
+    kinds = [[shot.own_name(f"{kind}.{name}") for name in names] for kind in ("contribution", "weight")]
+    denoised = shot.remade({number: output_path(output, shot, number)}, aovs=[*kinds[0], *kinds[1]]).read(number)
     noisy, _ = replace_nonfinite(shot.read(number).color)
     exposure = np.float32(measure_exposure(noisy) / 0.18)
     rows = [
         [encode_srgb(image / exposure) for image in (noisy, denoised.color)],
-        [encode_srgb(denoised.aovs[name] / exposure) for name in layers[:frames]],
-        [np.repeat(np.clip(denoised.aovs[name], 0, 1), 3, axis=-1) for name in layers[frames:]],
+        [encode_srgb(denoised.aovs[name] / exposure) for name in kinds[0]],
+        [np.repeat(np.clip(denoised.aovs[name], 0, 1), 3, axis=-1) for name in kinds[1]],
     ]
     height, width = noisy.shape[:2]
     shrink = min(1.0, PICTURE_SIDE / max(height, width))
@@ -110,5 +118,4 @@ def write_breakdown(shot: Shot, output: str | Path, frames: int, path: Path) -> 
     columns = max(len(row) for row in rows)
     white = np.ones((size[1], size[0], 3), np.float32)
     small = [[cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in row] for row in rows]
-    sheet = np.vstack([np.hstack(row + [white] * (columns - len(row))) for row in small])
-    write_png(path, sheet)
+    return np.vstack([np.hstack(row + [white] * (columns - len(row))) for row in small])

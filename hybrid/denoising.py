@@ -90,7 +90,7 @@ def denoise_shot(
             source = choose_estimate(estimate or "auto", shot, mode=mode)
         else:
             source = EstimateSource("none", None, "this network takes none")
-    check_written(shot, str(output), source, {"weights": weights}, {})
+    check_written(shot, str(output), [source], {"weights": weights}, {})
     attributes = {"ravg/command": "denoise_shot", "ravg/preset": preset, "ravg/estimate": source.name}
     yield from denoise_frames(
         shot,

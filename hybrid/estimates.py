@@ -7,6 +7,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -275,7 +276,7 @@ class Kept:
     shot : Shot
         The noisy shot.
     spec : str
-        Where they are: a pattern or a folder.
+        Where they are: a pattern or a folder; those of one of several pictures in a folder of its own there.
     forced : str
         As for `choose_estimate`.
     mode : str
@@ -291,7 +292,11 @@ class Kept:
 
     def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool) -> None:
         # Of neighbours too that were not asked for.
-        self.places = {number: output_path(spec, shot, number, beside=True) for number in shot.files}
+        path = Path(spec)
+        if shot.picture:
+            name = re.sub(r"[^\w.-]", "_", shot.picture)
+            path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
+        self.places = {number: output_path(path, shot, number, beside=True) for number in shot.files}
         self._shot = shot
         self._facts = {"estimate": mode, "quicker": quicker, "forced": forced, **versions("pyoidn")}
         # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.

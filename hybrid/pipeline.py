@@ -73,7 +73,7 @@ class Finished:
 def check_written(
     shot: Shot,
     output: str | Path,
-    source: EstimateSource,
+    sources: Sequence[EstimateSource],
     inputs: Mapping[str, str | Path | None],
     others: Mapping[str, Path | None],
 ) -> None:
@@ -85,7 +85,7 @@ def check_written(
         What is denoised.
     output : str or Path
         As for `denoise_frames`.
-    source : EstimateSource
+    sources : sequence of EstimateSource
         Whose files are read, or kept.
     inputs, others : mapping of str to Path or None
         What else is read, and what else is written: what it is called → where.
@@ -96,10 +96,10 @@ def check_written(
         As `hybrid.files.replace.check_outputs`.
     """
     written = [("output", output_path(output, shot, number)) for number in shot.numbers]
-    written += [("keep-estimates", path) for path in source.kept]
+    written += [("keep-estimates", path) for source in sources for path in source.kept]
     written += [(what, path) for what, path in others.items() if path is not None]
     read = [("frame", path) for number in shot.files for path in shot.paths(number)]
-    read += [("estimate", path) for path in (source.files.files.values() if source.files else ())]
+    read += [("estimate", path) for source in sources if source.files for path in source.files.files.values()]
     read += [(what, Path(path)) for what, path in inputs.items() if path is not None]
     check_outputs(written, read)
 
@@ -190,13 +190,13 @@ def denoise_frames(
             counted, pictures = [aligned], []
             for (picture, _), other in zip(others, beside, strict=True):
                 theirs, counts = _denoise_frame(other, number, denoise, rows or shot.shape[0])
-                pictures.append((picture, {"color": theirs.color, **theirs.aovs}))
+                pictures.append((picture, {"color": theirs.color, **theirs.aovs}, theirs.extra))
                 counted.append(counts)
             plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
             with timings.stage("check"):
                 images = {"color": denoised.color, **denoised.aovs}
                 _check_picture(images, aligner, number)
-                for (_, layers), other in zip(pictures, beside, strict=True):
+                for (_, layers, _), other in zip(pictures, beside, strict=True):
                     _check_picture(layers, other, number)
             with timings.stage("write"):
                 own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}

@@ -120,11 +120,11 @@ def pseudoref(
         return
     with _on_record(context, shot, opened, output):
         (opened, *others), judgement = judge_input(opened, strict=strict)
-    _expect_one(others, {"keep-estimates": keep_estimates})
     timings = Timings()
-    source = choose_estimate(estimate, opened, own=chosen, kept=keep_estimates, forced=rules.forced)
-    beside = [(other, choose_estimate(estimate, other, own=chosen)) for other in others]
-    _spare_inputs(opened, output, source, {"profile": profile}, preview=preview, contact=contact)
+    choose = partial(choose_estimate, estimate, own=chosen, kept=keep_estimates, forced=rules.forced)
+    source, beside = choose(opened), [(other, choose(other)) for other in others]
+    sources = [source, *(theirs for _, theirs in beside)]
+    _spare_inputs(opened, output, sources, {"profile": profile}, preview=preview, contact=contact)
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
@@ -262,8 +262,6 @@ def denoise(
         return
     with _on_record(context, shot, opened, output):
         (opened, *others), judgement = judge_input(opened, strict=strict)
-    alone = {"keep-estimates": keep_estimates, "breakdown": breakdown, "passes": passes if passes > 1 else None}
-    _expect_one(others, alone)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -279,18 +277,18 @@ def denoise(
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
-        made = opened.around(reach_of(None, denoiser.radius) * (passes - 1))  # by the first pass
+        ahead = reach_of(None, denoiser.radius) * (passes - 1)  # what the first pass makes
         quicker = neural.denoise_unet if denoiser.precision == "bfloat16" and neural.has_unet() else None
-        choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker)
-        source = choose(made, kept=keep_estimates, forced=rules.forced)
-        beside = [(other, choose(other)) for other in others]
+        choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker, kept=keep_estimates, forced=rules.forced)
+        source, beside = choose(opened.around(ahead)), [(other, choose(other.around(ahead))) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
         beside = [(other, source) for other in others]
     else:
         raise ValueError(f"estimate is {estimate!r}, expected auto or none: the network of {path.name} takes none")
     inputs = {"weights": path, "profile": profile}
-    _spare_inputs(opened, output, source, inputs, preview=preview, contact=contact, breakdown=breakdown)
+    sources = [source, *(theirs for _, theirs in beside)]
+    _spare_inputs(opened, output, sources, inputs, preview=preview, contact=contact, breakdown=breakdown)
     settings = {
         "layer": layer,
         "profile": profile,
@@ -328,7 +326,7 @@ def denoise(
         _run(last if breakdown is None else replace(last, denoise=denoiser.counting(counted)))
     _look(opened, output, preview, fps, contact)
     if breakdown is not None:
-        write_breakdown(opened, output, 2 * denoiser.radius + 1, breakdown)
+        write_breakdown([opened, *others], output, 2 * denoiser.radius + 1, breakdown)
         if counted.pixels:
             title = "Weights in the frames made by this run"
             table = Table("frame", "average weight", "minimum", "maximum", title=title, title_justify="left")
@@ -341,24 +339,22 @@ def denoise(
 
 
 def _spare_inputs(
-    shot: Shot, output: str, source: EstimateSource, inputs: Mapping[str, str | Path | None], **pictures: Path | None
+    shot: Shot,
+    output: str,
+    sources: Sequence[EstimateSource],
+    inputs: Mapping[str, str | Path | None],
+    **pictures: Path | None,
 ) -> None:
     """Refuse, before anything is made, to write over anything that is read, and what is no preview."""
     from hybrid.pipeline import check_written
     from hybrid.preview import check_preview, check_sheet
 
-    check_written(shot, output, source, inputs, {**pictures, "log-file": log_file()})
+    check_written(shot, output, sources, inputs, {**pictures, "log-file": log_file()})
     with usage():
         if (preview := pictures.get("preview")) is not None:
             check_preview(preview)
         if (contact := pictures.get("contact")) is not None:
             check_sheet(contact)
-
-
-def _expect_one(others: Sequence[Shot], options: Mapping[str, object]) -> None:
-    """Refuse what is made of one picture where a file has several."""
-    if given := [name for name, value in options.items() if others and value is not None]:
-        raise typer.BadParameter(f"--{given[0]} is of one picture, and the files have several: --layer color=NAME")
 
 
 def _hand_out(context: typer.Context, given: Mapping[str, object], shot: Shot, scheduler: str, size: int) -> None:
@@ -462,7 +458,7 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
     from hybrid.files.replace import temporary_folder
     from hybrid.pipeline import reach_of, sources_of
 
-    command = job.command
+    command, given = job.command, OfFrames(lambda frame: frame.color)
     home = output_path(job.output, job.shot, job.shot.numbers[0]).parent
     with ExitStack() as stack:
         for number in range(1, passes):
@@ -470,12 +466,19 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
             made = job.shot.around(reach_of(None, job.radius) * (passes - number))  # what later passes reach
             early = replace(job, shot=made, output=str(folder), keep_going=False)
             _run(replace(early, command=f"{command}, pass {number} of {passes}"))
+            files = {n: output_path(folder, made, n) for n in made.numbers}
+            pictures = [(job.shot, job.source), *job.others]
+            (again, source), *others = (
+                (picture.remade(files), replace(theirs, estimates=given, reason="the pass before"))
+                for picture, theirs in pictures
+            )
             job = replace(
                 job,
-                shot=job.shot.remade({n: output_path(folder, made, n) for n in made.numbers}),
-                source=replace(job.source, estimates=OfFrames(lambda frame: frame.color), reason="the pass before"),
+                shot=again,
+                source=source,
+                others=others,
                 command=f"{command}, pass {passes} of {passes}",
-                before=sources_of([(job.shot, job.source.estimates)], job.radius, job.before),
+                before=sources_of([(shot, theirs.estimates) for shot, theirs in pictures], job.radius, job.before),
             )
         yield job
 

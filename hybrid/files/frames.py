@@ -161,6 +161,8 @@ class Shot:
         The frames that were asked for and are not there.
     warnings : list of str
         One line each.
+    picture : str
+        Which of several `pictures` of the files it is: the name of its color; "" for the only one.
 
     Notes
     -----
@@ -193,6 +195,7 @@ class Shot:
         self.step = math.gcd(*(b - a for a, b in pairwise(sorted({*files, *wanted})))) or 1
         self.numbers = tuple(number for number in wanted if number in files)
         self.warnings: list[str] = []
+        self.picture = ""
         if not self.numbers:
             folder = next(iter(files.values())).parent
             raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
@@ -283,7 +286,7 @@ class Shot:
             keep=self._keep,
             max_pixels=self._max_pixels,
         )
-        made.missing = self.missing
+        made.missing, made.picture = self.missing, self.picture
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
         return made.judged(self._left_out, self._convention, self._variance_scale)
@@ -432,6 +435,7 @@ class Shot:
             other.__dict__.pop(name, None)
         other._held, other._known = OrderedDict(), {}
         other._overrides = {**self._overrides, "color": color}
+        other.picture = color.name or str(color)
         return other
 
     def paths(self, number: int) -> tuple[Path, ...]:
@@ -483,7 +487,7 @@ class Shot:
         images: Mapping[str, np.ndarray],
         extra: Mapping[str, np.ndarray] | None = None,
         attributes: Mapping[str, str] | None = None,
-        others: Iterable[tuple[Shot, Mapping[str, np.ndarray]]] = (),
+        others: Iterable[tuple[Shot, Mapping[str, np.ndarray], Mapping[str, np.ndarray]]] = (),
     ) -> int:
         """Write a frame's file again with some layers replaced (`hybrid.files.exr.write_exr`).
 
@@ -497,11 +501,12 @@ class Shot:
             "color", "alpha" or the name of one of `aovs` → (H, W, C) or (H, W), of the size of `Frame.color`.
             "color" goes where the denoised picture belongs (`Layers.target`). Channels beyond C stay as they are.
         extra : mapping of str to array, optional
-            Layers to add; name → (H, W, C) or (H, W), of the same size.
+            Layers to add; name → (H, W, C) or (H, W), of the same size. Of one of several `pictures` they are named
+            after it: ``ViewLayer.Combined.left.NAME``.
         attributes : mapping of str to str, optional
             Strings for the header.
-        others : iterable of (Shot, mapping of str to array)
-            Further `pictures` of the same files, and what replaces layers of theirs.
+        others : iterable of (Shot, mapping of str to array, mapping of str to array)
+            Further `pictures` of the same files, what replaces layers of theirs, and what is added.
 
         Returns
         -------
@@ -510,12 +515,17 @@ class Shot:
         """
         self.check_unchanged([number])
         source = self.source(number)
-        replaced = self._replace(source, images)
-        for other, theirs in others:
-            replaced |= other._replace(source, theirs)
         home = source.parts[self._find(source).color.part]
-        added = {name: self._cut(image, home) for name, image in (extra or {}).items()}
+        replaced: dict[str, np.ndarray] = {}
+        added: dict[str, np.ndarray] = {}
+        for picture, theirs, new in ((self, images, extra or {}), *others):
+            replaced |= picture._replace(source, theirs)
+            added |= {picture.own_name(name): picture._cut(image, home) for name, image in new.items()}
         return write_exr(path, source, replaced, added, attributes)
+
+    def own_name(self, layer: str) -> str:
+        """What a layer is called that is added to the files for this picture."""
+        return f"{self.picture}.{layer}" if self.picture else layer
 
     def _replace(self, source: ExrImage, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels of a file that pictures by role or AOV take the place of."""

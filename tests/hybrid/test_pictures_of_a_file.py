@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenEXR
 import pytest
 
 from hybrid.cli import main
-from hybrid.files.exr import read_exr
+from hybrid.files.exr import ExrImage, read_exr
 from hybrid.files.frames import open_shot
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
 FRAMES = truths()
+WEIGHTS = Path(__file__).parent.parent / "data" / "small.safetensors"
 
 
 def view(truth: Truth, name: str = "", *, other: bool = False) -> Channels:
@@ -93,6 +95,58 @@ def test_every_view_layer_is_denoised_or_the_one_that_was_chosen(
     assert color(back, "Back.Combined") == mono["right"]
     noisy = color(tmp_path, "Front.Combined")
     assert color(back, "Front.Combined") == noisy != mono["left"]
+
+
+def stereo(folder: Path) -> Path:
+    for truth in FRAMES:
+        channels = view(truth, "left") | view(truth, "right", other=True)
+        save(folder / f"shot.{truth.number:04d}.exr", channels, {"multiView": ["left", "right"]})
+    return folder
+
+
+@pytest.mark.neural
+def test_two_passes_and_the_breakdown_of_both_eyes_are_those_of_mono_files(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    options = ["--weights", str(WEIGHTS), "--frames", "10", "--passes", "2", "--breakdown"]
+    alone: dict[str, ExrImage] = {}
+    sheets = {}
+    for eye in ("left", "right"):
+        for truth in FRAMES:
+            save(tmp_path / eye / f"shot.{truth.number:04d}.exr", view(truth, other=eye == "right"))
+        out, sheet = tmp_path / f"{eye}_out", tmp_path / f"{eye}.png"
+        assert main(["denoise", str(tmp_path / eye), "-o", str(out), *options, str(sheet)]) == 0
+        alone[eye], sheets[eye] = read_exr(out / "shot.0010.exr"), cv2.imread(str(sheet))
+    out, sheet = tmp_path / "both_out", tmp_path / "both.png"
+    assert main(["denoise", str(stereo(tmp_path / "both")), "-o", str(out), *options, str(sheet)]) == 0
+    both = read_exr(out / "shot.0010.exr")
+    for eye, mono in alone.items():
+        for c in "RGB":
+            expected = mono.channel(f"ViewLayer.Combined.{c}")
+            np.testing.assert_array_equal(both.channel(f"ViewLayer.Combined.{eye}.{c}"), expected)
+        added = [name for name in mono.channel_names if name.startswith(("weight.", "contribution."))]
+        assert added
+        for name in added:
+            expected = mono.channel(name)
+            np.testing.assert_array_equal(both.channel(f"ViewLayer.Combined.{eye}.{name}"), expected)
+    np.testing.assert_array_equal(cv2.imread(str(sheet)), np.vstack([sheets["left"], sheets["right"]]))
+    names = [picture.picture for picture in open_shot(out).pictures]
+    assert names == ["ViewLayer.Combined.left", "ViewLayer.Combined.right"]
+
+
+def test_kept_estimates_of_both_eyes_lie_apart(mono: dict[str, bytes], tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn")
+    spec, kept = stereo(tmp_path / "in"), tmp_path / "kept"
+    options = ["--estimate", "oidn-fast", "--keep-estimates"]
+    first = run(spec, tmp_path / "first", *options, str(kept))
+    places = sorted(path.relative_to(kept).as_posix() for path in kept.rglob("*.0010.exr"))
+    assert places == ["ViewLayer.Combined.left/shot.0010.exr", "ViewLayer.Combined.right/shot.0010.exr"]
+    run(spec, tmp_path / "again", *options, str(tmp_path / "named" / "e.####.exr"))
+    assert (tmp_path / "named" / "ViewLayer.Combined.left" / "e.0010.exr").is_file()
+    before = {path: path.stat().st_mtime_ns for path in kept.rglob("*.exr")}
+    second = run(spec, tmp_path / "second", *options, str(kept))
+    assert before == {path: path.stat().st_mtime_ns for path in kept.rglob("*.exr")}
+    for eye in ("left", "right"):
+        assert color(first, f"ViewLayer.Combined.{eye}") == color(second, f"ViewLayer.Combined.{eye}") != mono[eye]
 
 
 def test_layers_apart_need_to_know_of_which_picture_they_are(tmp_path: Path) -> None:
