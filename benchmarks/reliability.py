@@ -1,129 +1,1552 @@
-"""The table of what was tried, what failed before, and what holds now.
+"""Never silently wrong: what used to give wrong pictures, stale ones, or lost files, tried again.
 
-    python benchmarks/reliability.py [--before REVISION] [--fuzz 2000] [--damaged FOLDER] [--json OUT]
+    python benchmarks/reliability.py [--only ROW …] [--against CHECKOUT] [--json OUT]
 
-Runs `tests/hard_cases`, the fuzz of files, and the kills (on `pseudoref` and on `denoise`), and counts. With --before
-same tests run on the packages of an older revision too. It takes minutes, and exits with 1 where anything fails.
+Each case is a function that makes what it needs in a folder of its own, runs the command, and returns None where all is
+as promised, or else what is not. The rows of the table are those of docs/reliability.md. With --against the same
+cases run on another checkout, whose counts stand beside. It exits with 1 where something does not hold here.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import json
 import os
+import pkgutil
+import re
+import resource
+import shutil
+import signal
+import socket
 import subprocess
 import sys
-import tarfile
 import tempfile
-import xml.etree.ElementTree as ElementTree
-from io import BytesIO
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-ROOT = Path(__file__).parent.parent
-NAMES = {
-    "test_hard_corrupt": "NaN, Inf and lost frames in any layer",
-    "test_hard_light": "exposure, fireflies, cuts, variance, guides",
-    "test_hard_motion": "motion vectors that lie",
-    "test_hard_sizes": "sizes from 1×1 to 33000 on a side",
-    "test_hard_stages": "every stage of flow and nlm (drawn at random)",
-    "test_hard_network": "kernels, losses, gradients, metrics",
-    "test_hard_weights": "weights files, damaged and hostile",
-    "test_hard_checks": "absurd values, estimates and pictures that cannot be right",
-    "test_hard_files": "EXR files and the names in them",
-    "test_hard_faults": "resume, interrupts, memory, threads",
+import cv2
+import numpy as np
+import OpenEXR
+
+HERE = Path(__file__).resolve().parent.parent
+# The packages that are tried: those of this checkout, or of another.
+PACKAGES = Path(os.environ.get("RAVG_UNDER_TEST", HERE))
+OURS = tuple(name for name in ("loops", "flow", "nlm", "network", "hybrid") if (PACKAGES / name).is_dir())
+Layers = dict[str, np.ndarray]
+Edit = Callable[[int, Layers], None]
+Case = Callable[[Path], str | None]
+Cases = Iterator[tuple[str, Case]]
+SIZE = 32, 48
+DRAFT = "--preset", "draft"
+NOBODY = 65534
+
+
+# --- running the command
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a command ended, and what it said."""
+
+    code: int
+    said: str
+
+    @property
+    def refused(self) -> str | None:
+        """None where it ended with an error in one line."""
+        if self.code not in (1, 2):
+            return f"exit code {self.code}: {self.said[-200:]}"
+        if "Traceback" in self.said:
+            return f"traceback: {self.said.strip().splitlines()[-1][:200]}"
+        longest = max(map(len, self.said.splitlines() or [""]))
+        return f"a line of {longest} characters" if longest > 2500 else None
+
+    @property
+    def failed(self) -> str | None:
+        """None where it ended with 0."""
+        return None if self.code == 0 else f"exit code {self.code}: {self.said.strip()[-300:]}"
+
+
+def ravg(*words: object, seconds: float = 120, memory: int = 6 * 2**30, folder: Path | None = None) -> Done:
+    """Run the command in a process of its own, forked, so that nothing has to be imported again; at most so long."""
+    with tempfile.TemporaryFile() as said:
+        child = os.fork()
+        if child == 0:
+            _be_command([str(word) for word in words], said.fileno(), memory, folder)
+        code = _wait(child, seconds)
+        said.seek(0)
+        return Done(code, said.read().decode("utf-8", "replace"))
+
+
+def _be_command(words: list[str], said: int, memory: int, folder: Path | None) -> None:
+    code = 70
+    try:
+        for descriptor in (1, 2):
+            os.dup2(said, descriptor)
+        sys.stdout, sys.stderr = (os.fdopen(d, "w", encoding="utf-8", buffering=1, closefd=False) for d in (1, 2))
+        if folder is not None:
+            os.chdir(folder)
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
+        from hybrid.cli import main
+
+        code = main(words)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+def _wait(child: int, seconds: float) -> int:
+    """The exit code of a process; -9 where it hangs."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.01)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return -9
+
+
+def alone(
+    script: str, *words: object, packages: Path = PACKAGES, folder: Path | None = None, **environment: str
+) -> Done:
+    """Run a script in a new interpreter."""
+    command = [sys.executable, "-P", "-c", script, *map(str, words)]
+    env = {**os.environ, "PYTHONPATH": str(packages), **environment}
+    done = subprocess.run(command, env=env, capture_output=True, check=False, timeout=600, cwd=folder)
+    return Done(done.returncode, (done.stdout + done.stderr).decode("utf-8", "replace"))
+
+
+COMMAND = "import sys; from hybrid.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+# --- made-up shots
+
+
+def wall(index: int, size: tuple[int, int] = SIZE, step: tuple[int, int] = (0, 0)) -> Layers:
+    """A textured wall in a soft light, with Cycles' names; it passes by `step` pixels right and down per frame."""
+    rng = np.random.default_rng(7)
+    height, width = size[0] + 160, size[1] + 160
+    texture = cv2.resize(rng.uniform(0.2, 0.8, (height // 5, width // 5, 3)).astype(np.float32), (width, height))
+    y, x = 80 - step[1] * index, 80 - step[0] * index
+    block = slice(y, y + size[0]), slice(x, x + size[1])
+    light = np.linspace(0.7, 1.5, width, dtype=np.float32)[None, :, None]
+    vector = np.zeros((*size, 4), np.float32)
+    vector[:] = -step[0], step[1], -step[0], step[1]
+    return {
+        "ViewLayer.Combined": (texture * light)[block].copy(),
+        "ViewLayer.Denoising Albedo": texture[block].copy(),
+        "ViewLayer.Denoising Normal": np.broadcast_to(np.float32([0, 0, 1]), (*size, 3)).copy(),
+        "ViewLayer.Vector": vector,
+    }
+
+
+def grained(picture: np.ndarray, seed: object, noise: float = 0.3) -> np.ndarray:
+    """Unbiased noise, skewed as that of a path tracer."""
+    grain = np.random.default_rng(seed).gamma(1 / noise**2, noise**2, (*picture.shape[:2], 1))  # type: ignore[arg-type]
+    return np.asarray(picture * grain, np.float32)
+
+
+def write(path: Path, layers: Layers, **header: object) -> Path:
+    """A file of named layers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    channels = {}
+    for name, layer in layers.items():
+        planes = layer[..., None] if layer.ndim == 2 else layer
+        vector = name.endswith(("Normal", "Vector", "normal"))
+        letters = "XYZW" if vector else "RGBA" if planes.shape[2] > 1 else "A" if name.endswith("Alpha") else "Z"
+        for letter, plane in zip(letters, np.moveaxis(planes, 2, 0), strict=False):
+            channels[f"{name}.{letter}" if name else letter] = np.ascontiguousarray(plane)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File([OpenEXR.Part(header, channels, "")]).write(str(path))
+    return path
+
+
+def shot(
+    folder: Path,
+    frames: int = 6,
+    edit: Edit | None = None,
+    *,
+    step: tuple[int, int] = (0, 0),
+    size: tuple[int, int] = SIZE,
+    noise: float = 0.3,
+    name: str = "shot.{:04d}.exr",
+    first: int = 1001,
+    **header: object,
+) -> Path:
+    """A sequence; `edit` changes the layers of a frame before there is noise in the color, which 0 leaves out."""
+    for index in range(frames):
+        layers = wall(index, size, step)
+        if edit is not None:
+            edit(index, layers)
+        for layer in layers if noise else ():
+            if layer.endswith("Combined"):
+                layers[layer][..., :3] = grained(layers[layer][..., :3], (3, index), noise)
+        if late := layers.pop("late", None):  # what comes after the noise
+            late(layers)  # type: ignore[operator]
+        write(folder / name.format(first + index), layers, **header)
+    return folder
+
+
+def blurred(folder: Path, source: Path) -> Path:
+    """What a cheap denoiser of single frames makes of a shot."""
+    for path in sorted(source.glob("*.exr")):
+        layers = wall(0)
+        found = read(path)
+        color = np.stack([found[f"ViewLayer.Combined.{c}"] for c in "RGB"], axis=-1)
+        layers["ViewLayer.Combined"] = cv2.GaussianBlur(color, (0, 0), 1.5)
+        write(folder / path.name, layers)
+    return folder
+
+
+def read(path: Path) -> Layers:
+    """Channel → pixels."""
+    return {
+        name: channel.pixels
+        for part in OpenEXR.File(str(path), separate_channels=True).parts
+        for name, channel in part.channels.items()
+    }
+
+
+def header(path: Path) -> dict[str, Any]:
+    return dict(OpenEXR.File(str(path), header_only=True).parts[0].header)
+
+
+def color(path: Path, layer: str = "ViewLayer.Combined") -> np.ndarray:
+    found = read(path)
+    return np.stack([found[f"{layer}.{c}" if layer else c] for c in "RGB"], axis=-1).astype(np.float32)
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.glob("*.exr")}
+
+
+def differ(one: Path, other: Path, only: set[str] | None = None) -> str | None:
+    """Say where two folders of frames do not hold the same pixels."""
+    wanted = names(one) if only is None else only
+    if not wanted or not wanted <= names(other):
+        return f"frames {sorted(wanted)} are expected in both"
+    for name in sorted(wanted):
+        first, second = read(one / name), read(other / name)
+        for channel in sorted(first.keys() | second.keys()):
+            if channel not in first or channel not in second:
+                return f"{name}: {channel} is in one alone"
+            if not np.array_equal(first[channel], second[channel], equal_nan=True):
+                most = float(np.nanmax(np.abs(first[channel].astype(float) - second[channel])))
+                return f"{name}: {channel} differs by up to {most:.3g}"
+    return None
+
+
+def contents(*folders: Path) -> dict[Path, bytes]:
+    """The bytes of every file there is."""
+    files = (path for folder in folders for path in (folder.rglob("*") if folder.is_dir() else [folder]))
+    return {path: path.read_bytes() for path in files if path.is_file()}
+
+
+def first_of(*reasons: str | None) -> str | None:
+    return next((reason for reason in reasons if reason), None)
+
+
+# --- 1: what one window has and no other
+
+
+ODD = 6
+
+
+def flare(factor: float, part: slice = slice(None)) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        layers["ViewLayer.Combined"][part] *= factor if index == ODD else 1
+
+    return edit
+
+
+def switch(factor: float) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        layers["ViewLayer.Combined"] *= np.float32(factor if index >= ODD else 1)
+
+    return edit
+
+
+def burst(index: int, layers: Layers) -> None:
+    """From frame 7 to 9 the wall slides by three pixels per frame."""
+    moved = wall(min(max(index - ODD, 0), 3), SIZE, (3, 0))
+    layers |= moved
+    layers["ViewLayer.Vector"][..., 0] = -3 if ODD < index <= ODD + 3 else 0
+    layers["ViewLayer.Vector"][..., 1] = layers["ViewLayer.Vector"][..., 3] = 0
+    layers["ViewLayer.Vector"][..., 2] = -3 if ODD <= index < ODD + 3 else 0
+
+
+def cut(index: int, layers: Layers) -> None:
+    if index >= ODD:
+        for name in ("ViewLayer.Combined", "ViewLayer.Denoising Albedo"):
+            layers[name] = np.ascontiguousarray(layers[name][::-1, ::-1])
+
+
+def sparks(count: int, value: float = 5000) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        if index == ODD:
+            places = np.random.default_rng(count).integers(4, (SIZE[0] - 4, SIZE[1] - 4), (count, 2))
+            layers["late"] = lambda late: [late["ViewLayer.Combined"].__setitem__((y, x), value) for y, x in places]  # type: ignore[assignment]
+
+    return edit
+
+
+EVENTS: dict[str, Edit] = {
+    "a frame five times brighter": flare(5),
+    "a frame at a fifth of its light": flare(0.2),
+    "a light switched down": switch(0.2),
+    "a light switched on": switch(5),
+    "half of a frame four times brighter": flare(4, slice(0, SIZE[0] // 2)),
+    "a tenth of a frame darker": flare(0.2, slice(0, 4)),
+    "a burst of motion": burst,
+    "a cut": cut,
+    "a firefly": sparks(1),
+    "five fireflies": sparks(5, 800),
+}
+FORCED = "--effects", "warp", "--effects", "gate", "--effects", "outliers"
+
+
+def odd_window(edit: Edit, given: bool, folder: Path) -> str | None:
+    """Planned, no frame is worse by more than 0.2 dB or 1 % of its mean than with what guards forced on."""
+    noisy, clean = shot(folder / "in", 18, edit), shot(folder / "clean", 18, edit, noise=0)
+    more = ["--estimate", blurred(folder / "single", noisy)] if given else []
+    for out, forced in (("planned", ()), ("forced", FORCED)):
+        if failed := ravg("pseudoref", noisy, "-o", folder / out, *DRAFT, *more, *forced).failed:
+            return failed
+    for index in range(ODD - 3, ODD + 4):
+        name = f"shot.{1001 + index:04d}.exr"
+        truth = color(clean / name)
+        if truth.max() > 100:  # what the firefly is in
+            truth = color(clean / "shot.1001.exr")
+        planned, forced = (color(folder / out / name) for out in ("planned", "forced"))
+        scale = float(truth.mean())
+        error = [float(np.mean(np.square(x / (x + scale) - truth / (truth + scale)))) for x in (planned, forced)]
+        decibels = 10 * np.log10((error[0] + 1e-9) / (error[1] + 1e-9))
+        means = [abs(float(x.mean()) / scale - 1) for x in (planned, forced)]
+        if decibels > 0.2 or means[0] - means[1] > 0.01:
+            return f"{name}: {decibels:.2f} dB and {means[0] - means[1]:.1%} of its mean worse"
+        if not 0.8 < planned.mean() / scale < 1.25:
+            return f"{name}: {planned.mean() / scale:.2f} times its light"
+    return None
+
+
+def same_in_chunks(edit: Edit, folder: Path) -> str | None:
+    noisy = shot(folder / "in", 18, edit)
+    for out, frames in (("all", "1001-1018"), ("part", "1005-1007"), ("part", "1008")):
+        if failed := ravg("pseudoref", noisy, "-o", folder / out, *DRAFT, "--frames", frames).failed:
+            return failed
+    return differ(folder / "part", folder / "all")
+
+
+def told_where(edit: Edit, stage: str, frames: str, folder: Path) -> str | None:
+    said = ravg("inspect", shot(folder, 18, edit)).said
+    words = " ".join(said[said.find(stage) :].split()[:60])
+    return None if frames in words else f"frames {frames} are not named with {stage}"
+
+
+def row_1() -> Cases:
+    for name, edit in EVENTS.items():
+        for given in (False, True):
+            yield f"{name}{', beside estimates' * given}", partial(odd_window, edit, given)
+        yield f"{name}, in chunks", partial(same_in_chunks, edit)
+    yield "inspect says where the light changes", partial(told_where, flare(5), "gate", "1005-1009")
+    yield "inspect says where something moves", partial(told_where, burst, "warp", "1006-1012")
+    yield "inspect says where fireflies are", partial(told_where, sparks(1), "fireflies", "1005-1009")
+
+
+# --- 2: values that cannot be right
+
+
+def pixel(layer: str, value: float) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        if index == 2:
+            layers["late"] = lambda late: late[f"ViewLayer.{layer}"].__setitem__((10, 20), value)  # type: ignore[assignment]
+
+    return edit
+
+
+def one_absurd_pixel(layer: str, value: float, folder: Path) -> str | None:
+    """What is one pixel's is not a frame's."""
+    for name, edit in (("plain", None), ("absurd", pixel(layer, value))):
+        noisy = shot(folder / f"{name} in", 5, edit, step=(2, 1))
+        if failed := ravg("pseudoref", noisy, "-o", folder / name, *DRAFT).failed:
+            return failed
+    for name in sorted(names(folder / "plain")):
+        here, plain = color(folder / "absurd" / name), color(folder / "plain" / name)
+        if not np.isfinite(here).all():
+            return f"{name} is not finite"
+        if abs(here.mean() / plain.mean() - 1) > 0.05:
+            return f"{name} has {here.mean() / plain.mean():.2f} times its light"
+    return None
+
+
+def wrong_estimate(change: Callable[[np.ndarray], object], folder: Path) -> str | None:
+    """Nothing is made of it, and the frame is named."""
+    noisy = shot(folder / "in", 5, step=(2, 1))
+    estimates = blurred(folder / "single", noisy)
+    layers = wall(2, SIZE, (2, 1))
+    change(layers["ViewLayer.Combined"])
+    write(estimates / "shot.1003.exr", layers)
+    done = ravg("pseudoref", noisy, "-o", folder / "out", *DRAFT, "--estimate", estimates)
+    if done.code == 0:
+        return "exit code 0"
+    return done.refused or (None if "1003" in done.said else "the frame is not named")
+
+
+def frames_that_are_not_there(asked: str, folder: Path) -> str | None:
+    noisy = shot(folder / "in", 5)
+    (noisy / "shot.1003.exr").unlink()
+    return ravg("pseudoref", noisy, "-o", folder / "out", *DRAFT, "--frames", asked).refused
+
+
+def absurd_weights(factor: float, folder: Path) -> str | None:
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(PACKAGES / "network" / "weights" / "fast.safetensors", "np") as file:
+        tensors = {name: np.clip(file.get_tensor(name) * np.float16(factor), -6e4, 6e4) for name in list(file.keys())}
+        save_file(tensors, folder / "w.safetensors", file.metadata())
+    words = ["denoise", shot(folder / "in", 3, step=(2, 1)), "-o", folder / "out", "--estimate", "nlm"]
+    done = ravg(*words, "--weights", folder / "w.safetensors")
+    for path in (folder / "out").glob("*.exr"):
+        made, given = color(path), color(folder / "in" / path.name)
+        if not np.isfinite(made).all():
+            return f"{path.name} is not finite"
+        if not 1 / 3 < made.mean() / given.mean() < 3:
+            return f"{path.name} has {made.mean() / given.mean():.2g} times its light"
+    return done.refused if done.code else None
+
+
+def row_2() -> Cases:
+    for layer in ("Combined", "Denoising Albedo", "Denoising Normal", "Vector"):
+        for value in (1e15, 1e30, -1e30, 3e38):
+            yield f"a pixel of {value:g} in {layer}", partial(one_absurd_pixel, layer, value)
+    wrong = {
+        "nan": lambda x: x.fill(np.nan),
+        "half nan": lambda x: x[:16].fill(np.nan),
+        "of 1e30": lambda x: x.fill(1e30),
+        "black": lambda x: x.fill(0),
+        "four times too bright": lambda x: np.multiply(x, 4, out=x),
+        "without red": lambda x: x[..., 0].fill(0),
+    }
+    for name, change in wrong.items():
+        yield f"an estimate that is {name}", partial(wrong_estimate, change)
+    for asked in ("1001-1005", "1003", "1004-1009", "1-3,1004"):
+        yield f"--frames {asked} without 1003", partial(frames_that_are_not_there, asked)
+    for factor in (30.0, 300.0, -30.0):
+        yield f"weights times {factor:g}", partial(absurd_weights, factor)
+
+
+# --- 3: names
+
+
+def time_runs_forward(name: str, given: str, folder: Path) -> str | None:
+    """Under whatever name, the frames are those of shot.####.exr."""
+    plain, named = (
+        shot(folder / out, 5, step=(3, 1), name=form, first=1)
+        for out, form in (("plain", "shot.{:04d}.exr"), ("named", name))
+    )
+    for source, spec in ((plain, plain), (named, named / given if given else named)):
+        if failed := ravg("pseudoref", spec, "-o", folder / f"{source.name} out", *DRAFT).failed:
+            return failed
+    for index in range(1, 6):
+        one = color(folder / "plain out" / f"shot.{index:04d}.exr")
+        other = folder / "named out" / name.format(index)
+        if not other.exists() or not np.array_equal(one, color(other)):
+            return f"frame {index} is another"
+    return None
+
+
+def several_pictures(layers: Sequence[str], kept: Sequence[str], folder: Path) -> str | None:
+    """Each is denoised, but for those of a compositor; or all is refused."""
+
+    def edit(index: int, found: Layers) -> None:
+        for layer in layers:
+            if layer not in found:
+                found[layer] = found["ViewLayer.Combined"].copy()
+            if not layer.startswith("ViewLayer"):
+                group = layer.rpartition(".")[0]
+                found |= {f"{group}.{n}": found[f"ViewLayer.{n}"] for n in ("Denoising Albedo", "Vector")}
+
+    done = ravg("pseudoref", shot(folder / "in", 3, edit), "-o", folder / "out", *DRAFT)
+    if done.code:
+        return done.refused
+    for layer in layers:
+        same = np.array_equal(*(color(folder / x / "shot.1002.exr", layer) for x in ("in", "out")))
+        if same != (layer in kept):
+            return f"{layer} was {'not ' * same}denoised"
+    return None
+
+
+def aov_that_is_a_role(name: str, folder: Path) -> str | None:
+    """It is refused, or leaves all else as it is without."""
+    words = ["denoise", shot(folder / "in", 3, step=(2, 0)), "--estimate", "nlm"]
+    done = ravg(*words, "-o", folder / "out", "--aov", name)
+    if done.code:
+        return done.refused
+    if failed := ravg(*words, "-o", folder / "plain").failed:
+        return failed
+    return differ(folder / "plain", folder / "out")
+
+
+def channels_in_doubt(extra: Sequence[str], folder: Path) -> str | None:
+    """Two channels, or two layers, could be one thing: refused."""
+
+    def edit(index: int, layers: Layers) -> None:
+        for name in extra:
+            layers[name] = layers["ViewLayer.Combined"].copy()
+        if "color" in extra:
+            del layers["ViewLayer.Combined"]
+
+    return ravg("pseudoref", shot(folder / "in", 3, edit), "-o", folder / "out", *DRAFT).refused
+
+
+def row_3() -> Cases:
+    for name, given in {
+        "shot-{:04d}.exr": "",
+        "a_b-{:03d}.exr": "a_b-###.exr",
+        "v2-{:d}.exr": "v2-#.exr",
+        "-{:04d}.exr": "",
+        "shot.{:04d}_final.exr": "",
+        "7_{:04d}.exr": "7_%04d.exr",
+        "shot - {:04d}.exr": "",
+    }.items():
+        yield f"frames called {name}", partial(time_runs_forward, name, given)
+    both = ["ViewLayer.Combined", "Composite.Combined"]
+    yield "the compositor's beside a view layer", partial(several_pictures, both, both[1:])
+    yield "two view layers", partial(several_pictures, ["ViewLayer.Combined", "Fog.Combined"], [])
+    yield "three view layers", partial(several_pictures, ["ViewLayer.Combined", "A.Combined", "Z.Combined"], [])
+    for name in ("normal", "albedo", "Combined", "ViewLayer.Combined", "color", "Vector"):
+        yield f"--aov {name}", partial(aov_that_is_a_role, name)
+    yield "color and beauty, neither a renderer's", partial(channels_in_doubt, ["color", "beauty"])
+    yield "beauty, rgba and color", partial(channels_in_doubt, ["color", "beauty", "rgba"])
+
+
+# --- 4: one seed for all frames
+
+
+def seed_is_told(samples: int, moves: bool, fixed: bool, shots: int, folder: Path) -> str | None:
+    """Detail of a pixel's size correlates between frames as a fixed noise does."""
+    size, step = (96, 128), (3, 1) if moves else (0, 0)
+    detail = np.random.default_rng(shots).uniform(0.5, 1.5, (200, 200, 1)).astype(np.float32)
+    for index in range(4):
+        layers = wall(index, size, step)
+        y, x = 40 - step[1] * index, 40 - step[0] * index
+        clean = layers["ViewLayer.Combined"] * detail[y : y + 96, x : x + 128]
+        layers["ViewLayer.Combined"] = grained(clean, (shots, 0 if fixed else index), 2 / samples**0.5)
+        write(folder / f"shot.{1001 + index}.exr", layers)
+    found = "one seed for all frames" in " ".join(ravg("inspect", folder).said.split())
+    return None if found == fixed else f"one seed is {'' if found else 'not '}said"
+
+
+def row_4() -> Cases:
+    for samples in (16, 256, 4096):
+        for moves in (False, True):
+            for fixed in (False, True):
+                for number in (1, 2):
+                    words = f"{samples} samples, {'moving' if moves else 'still'}, {'one seed' if fixed else 'many'}"
+                    yield words, partial(seed_is_told, samples, moves, fixed, number)
+
+
+# --- 5: alpha
+
+
+def covered(hole: Callable[[int], bool], share: float = 0.0) -> Edit:
+    """An alpha that is opaque but for a hole in some frames."""
+
+    def edit(index: int, layers: Layers) -> None:
+        alpha = np.ones((*SIZE, 1), np.float32)
+        if hole(index):
+            alpha[8:16, 8:16] = share
+            layers["ViewLayer.Combined"][8:16, 8:16] *= share
+        layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
+
+    return edit
+
+
+def opaque_stays_opaque(edit: Edit, folder: Path) -> str | None:
+    noisy = shot(folder / "in", 5, edit, step=(2, 0))
+    if failed := ravg("denoise", noisy, "-o", folder / "out", "--estimate", "nlm").failed:
+        return failed
+    for name in sorted(names(folder / "out")):
+        before, after = (read(folder / where / name)["ViewLayer.Combined.A"] for where in ("in", "out"))
+        inside = cv2.erode((before == 1).astype(np.uint8), np.ones((5, 5), np.uint8)) == 1
+        if not (after[inside] == 1).all():
+            return f"{name}: what is opaque falls to {after[inside].min():.4f}"
+        if after.min() < -1e-6 or after.max() > 1 + 1e-6:
+            return f"{name}: alpha from {after.min():.3f} to {after.max():.3f}"
+    return None
+
+
+def alpha_of_some_frames(folder: Path) -> str | None:
+    """The stage runs where there is something transparent, whatever the first frame has."""
+    outs = []
+    for first in (1001, 1005):
+        noisy = shot(folder / "in", 8, covered(lambda index: index >= 5, 0.5), step=(2, 0))
+        outs.append(folder / f"from {first}")
+        done = ravg("denoise", noisy, "-o", outs[-1], "--estimate", "nlm", "--frames", f"{first}-1008")
+        if done.failed:
+            return done.failed
+    return differ(outs[1], outs[0])
+
+
+def stages_that_run(folder: Path) -> str | None:
+    """pseudoref has no network, and says of no stage of one that it runs."""
+    done = ravg("pseudoref", shot(folder / "in", 3, covered(lambda index: True)), "-o", folder / "out", *DRAFT)
+    if done.failed:
+        return done.failed
+    found = re.search(r"\brun: (alpha|skip)", re.sub(r"not run: \w+", "", done.said))
+    return f"it says that {found[1]} runs" if found else None
+
+
+def row_5() -> Cases:
+    for name, hole in {
+        "every frame": lambda i: True,
+        "the first": lambda i: i == 0,
+        "a later one": lambda i: i == 3,
+    }.items():
+        for share in (0.0, 0.5):
+            yield f"a hole of {share} in {name}", partial(opaque_stays_opaque, covered(hole, share))
+    yield "chunks that begin before and after a hole", alpha_of_some_frames
+    yield "pseudoref says what it runs", stages_that_run
+
+
+# --- 6: --resume
+
+
+@dataclass(frozen=True)
+class Project:
+    """A shot with estimates, denoised once; what is changed then must show in what --resume makes."""
+
+    folder: Path
+
+    @property
+    def frames(self) -> Path:
+        return self.folder / "in"
+
+    @property
+    def estimates(self) -> Path:
+        return self.folder / "single"
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+    def frame(self, number: int) -> Path:
+        return self.frames / f"shot.{number}.exr"
+
+    def run(self, out: Path, *more: object) -> Done:
+        return ravg("pseudoref", self.frames, "-o", out, *DRAFT, "--estimate", self.estimates, *more)
+
+
+def rendered_again(path: Path, seconds: float | None = None) -> None:
+    """Other pixels in the same number of bytes, with the same time or another."""
+    before = path.stat()
+    data = read(path)
+    value = data["ViewLayer.Combined.R"].reshape(-1)[::-1].copy().reshape(SIZE)
+    stored = {name: OpenEXR.Channel(name, pixels) for name, pixels in {**data, "ViewLayer.Combined.R": value}.items()}
+    kept = {k: v for k, v in header(path).items() if k != "channels"}
+    OpenEXR.File([OpenEXR.Part(kept, stored, "")]).write(str(path))
+    when = before.st_mtime if seconds is None else seconds
+    os.utime(path, (when, when))
+
+
+def resumed(change: Callable[[Project], object], more: Sequence[object], late: bool, folder: Path) -> str | None:
+    """After the change, --resume leaves what a run into an empty folder makes."""
+    project = Project(folder)
+    options = {"compression": OpenEXR.NO_COMPRESSION}  # so that other pixels are as many bytes
+    shot(project.frames, 8, step=(2, 1), **options)
+    blurred(project.estimates, project.frames)
+    if late:
+        project.frame(1004).rename(folder / "late.exr")
+    if failed := project.run(project.out).failed:
+        return failed
+    if late:
+        (folder / "late.exr").rename(project.frame(1004))
+    change(project)
+    if failed := first_of(
+        project.run(project.out, "--resume", *more).failed, project.run(folder / "fresh", *more).failed
+    ):
+        return failed
+    return differ(folder / "fresh", project.out, names(folder / "fresh"))
+
+
+def swapped(project: Project) -> None:
+    """Two frames change places, with their times."""
+    a, b, spare = project.frame(1003), project.frame(1006), project.folder / "spare"
+    a.rename(spare), b.rename(a), spare.rename(b)
+
+
+CHANGES: dict[str, Callable[[Project], object]] = {
+    "a frame rendered again": lambda p: rendered_again(p.frame(1004), time.time() + 5),
+    "a frame rendered again, of an older time": lambda p: rendered_again(p.frame(1004), 1e9),
+    "a frame rendered again, of the same time and size": lambda p: rendered_again(p.frame(1004)),
+    "the last frame rendered again, of the same time": lambda p: rendered_again(p.frame(1008)),
+    "two frames swapped": swapped,
+    "a frame that is gone": lambda p: p.frame(1008).unlink(),
+    "estimates made again": lambda p: [rendered_again(x, time.time() + 5) for x in p.estimates.iterdir()],
+    "an older estimate": lambda p: rendered_again(p.estimates / "shot.1004.exr", 1e9),
+    "an estimate of the same time and size": lambda p: rendered_again(p.estimates / "shot.1004.exr"),
+    "the noisy frames in the estimates' place": lambda p: [
+        shutil.copy2(x, p.estimates / x.name) for x in p.frames.iterdir()
+    ],
+    "an output that is another frame's": lambda p: shutil.copy2(p.out / "shot.1005.exr", p.out / "shot.1004.exr"),
+    "an output that somebody has painted on": lambda p: rendered_again(p.out / "shot.1004.exr", time.time() + 5),
+    "an output cut short": lambda p: os.truncate(p.out / "shot.1004.exr", 3000),
+    "an empty output": lambda p: os.truncate(p.out / "shot.1004.exr", 0),
+    "an output that is an input": lambda p: shutil.copy2(p.frame(1004), p.out / "shot.1004.exr"),
+}
+OPTIONS: dict[str, Sequence[object]] = {
+    "a layer left out": ("--layer", "normal=Denoising Albedo"),
+    "a stage forced on": ("--effects", "refine"),
+    "a stage forced off": ("--no-effects", "gate"),
+    "another preset": ("--preset", "final", "--estimate", "none"),
+    "no estimates": ("--estimate", "none"),
+    "our own estimates": ("--estimate", "nlm"),
+    "OIDN's estimates": ("--estimate", "oidn-fast"),
 }
 
 
-def run(words: list[str], packages: Path) -> subprocess.CompletedProcess[str]:
-    """Run a script or pytest with the packages of some folder."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(packages), str(ROOT / "tests" / "hard_cases")])}
-    return subprocess.run([sys.executable, "-P", *words], cwd=ROOT, env=environment, capture_output=True, text=True)
+def weights_exchanged(folder: Path) -> str | None:
+    noisy, weights = shot(folder / "in", 3, step=(2, 1)), folder / "w.safetensors"
+    words = ["denoise", noisy, "--estimate", "nlm", "--weights", weights]
+    shutil.copy(PACKAGES / "network" / "weights" / "fast.safetensors", weights)
+    os.utime(weights, (1e9, 1e9))
+    if failed := ravg(*words, "-o", folder / "out").failed:
+        return failed
+    shutil.copy(PACKAGES / "network" / "weights" / "balanced.safetensors", weights)
+    os.utime(weights, (1e9, 1e9))
+    for out in ("out", "fresh"):
+        if failed := ravg(*words, "-o", folder / out, "--resume").failed:
+            return failed
+    return differ(folder / "fresh", folder / "out")
 
 
-def run_tests(packages: Path) -> dict[str, tuple[int, int]]:
-    """File → (cases, failed cases) of the tests; a test that draws or loops says how many it stands for."""
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.xml"
-        words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "--continue-on-collection-errors", "tests/hard_cases"]
-        run([*words, f"--junitxml={report}"], packages)
-        counts = dict.fromkeys(NAMES, (0, 0))
-        for case in ElementTree.parse(report).iter("testcase"):
-            file = case.get("classname", "").rpartition(".")[2] or case.get("name", "").rpartition(".")[2]
-            said = [int(p.get("value", "1")) for p in case.iter("property") if p.get("name") == "cases"]
-            failed = case.find("failure") is not None or case.find("error") is not None
-            if file in counts and case.find("skipped") is None:
-                cases = max(said, default=1)
-                counts[file] = counts[file][0] + cases, counts[file][1] + cases * failed
+def says_why(folder: Path) -> str | None:
+    project = Project(folder)
+    shot(project.frames, 5)
+    blurred(project.estimates, project.frames)
+    project.run(project.out)
+    rendered_again(project.estimates / "shot.1003.exr", 1e9)
+    said = project.run(project.out, "--resume").said
+    return None if "made again" in said and "shot.1003.exr" in said else "it does not say why"
+
+
+def nothing_changed(change: Callable[[Project], Path], folder: Path) -> str | None:
+    """What is the same is left alone."""
+    project = Project(folder)
+    shot(project.frames, 4)
+    blurred(project.estimates, project.frames)
+    if failed := project.run(project.out).failed:
+        return failed
+    stamps = {path: path.stat().st_mtime_ns for path in project.out.glob("*.exr")}
+    moved = Project(change(project))
+    if failed := moved.run(project.out, "--resume").failed:
+        return failed
+    return None if stamps == {path: path.stat().st_mtime_ns for path in stamps} else "frames are made again"
+
+
+def moved_elsewhere(project: Project) -> Path:
+    (project.folder / "elsewhere").mkdir()
+    for path in (project.frames, project.estimates):
+        path.rename(project.folder / "elsewhere" / path.name)
+    return project.folder / "elsewhere"
+
+
+def row_6() -> Cases:
+    for name, change in CHANGES.items():
+        yield name, partial(resumed, change, (), False)
+    yield "a neighbour that comes late", partial(resumed, lambda p: None, (), True)
+    yield (
+        "a neighbour that comes late, of an old time",
+        partial(resumed, lambda p: os.utime(p.frame(1004), (1e9, 1e9)), (), True),
+    )
+    for name, more in OPTIONS.items():
+        yield name, partial(resumed, lambda p: None, more, False)
+    yield "weights exchanged under one name", weights_exchanged
+    yield "it says why", says_why
+    yield "nothing has changed", partial(nothing_changed, lambda p: p.folder)
+    yield "all lies elsewhere now", partial(nothing_changed, moved_elsewhere)
+
+
+# --- 7: --keep-estimates
+
+
+def kept(change: Callable[[Path], object], first: Sequence[str], then: Sequence[str], folder: Path) -> str | None:
+    """Pictures that were kept never show in what would be made without."""
+    shot(folder / "in", 4, step=(2, 1), compression=OpenEXR.NO_COMPRESSION)
+    words = ["pseudoref", folder / "in", *DRAFT]
+    if failed := ravg(*words, "-o", folder / "first", *first, "--keep-estimates", folder / "kept").failed:
+        return failed
+    change(folder)
+    done = ravg(*words, "-o", folder / "out", *then, "--keep-estimates", folder / "kept")
+    if done.code:
+        return done.refused
+    if failed := ravg(*words, "-o", folder / "fresh", *then).failed:
+        return failed
+    return differ(folder / "fresh", folder / "out")
+
+
+def kept_where(place: Callable[[Path], Path], folder: Path) -> str | None:
+    """No file that is somebody else's is written over."""
+    noisy = shot(folder / "in", 4)
+    where = place(folder)
+    before = contents(noisy, where)
+    done = ravg("pseudoref", noisy, "-o", folder / "out", *DRAFT, "--estimate", "oidn-fast", "--keep-estimates", where)
+    after = {path: path.read_bytes() for path in before}
+    return first_of(done.refused, None if after == before else "files have changed")
+
+
+def linked_output(folder: Path) -> Path:
+    (folder / "out").mkdir()
+    (folder / "link").symlink_to(folder / "out")
+    return folder / "link"
+
+
+def row_7() -> Cases:
+    modes = {mode: ["--estimate", mode] for mode in ("oidn", "oidn-fast", "oidn-clean", "oidn-best")}
+    for one, other in (
+        ("oidn", "oidn-best"),
+        ("oidn-best", "oidn"),
+        ("oidn-fast", "oidn-clean"),
+        ("oidn-clean", "oidn"),
+    ):
+        yield f"{one}'s taken for {other}'s", partial(kept, lambda f: None, modes[one], modes[other])
+    fast = modes["oidn-fast"]
+
+    def frame(folder: Path) -> Path:
+        return folder / "in" / "shot.1002.exr"
+
+    changes: dict[str, Callable[[Path], object]] = {
+        "a frame rendered again": lambda f: rendered_again(frame(f), time.time() + 5),
+        "a frame of an older time": lambda f: rendered_again(frame(f), 1e9),
+        "a frame of the same time and size": lambda f: rendered_again(frame(f)),
+        "a kept picture cut short": lambda f: os.truncate(f / "kept" / "shot.1002.exr", 2000),
+        "a kept picture of another frame": lambda f: shutil.copy2(
+            f / "kept" / "shot.1001.exr", f / "kept" / "shot.1002.exr"
+        ),
+        "somebody else's picture in its place": lambda f: shutil.copy2(frame(f), f / "kept" / "shot.1002.exr"),
+        "the output in its place": lambda f: shutil.copy2(f / "first" / "shot.1002.exr", f / "kept" / "shot.1002.exr"),
+    }
+    for name, change in changes.items():
+        yield name, partial(kept, change, fast, fast)
+    yield "another layer as albedo", partial(kept, lambda f: None, fast, [*fast, "--layer", "albedo=Denoising Normal"])
+    yield "in the output", partial(kept_where, lambda f: f / "out")
+    yield "in the output, by a link", partial(kept_where, linked_output)
+    yield "in the input", partial(kept_where, lambda f: f / "in")
+    yield "among another shot's frames", partial(kept_where, lambda f: shot(f / "other", 4, noise=0.1))
+
+
+# --- 8: other people's files
+
+
+def spared(words: Callable[[Path], Sequence[object]], folder: Path) -> str | None:
+    """Whatever a command is told to write, nothing that was there before is another afterwards."""
+    shot(folder / "in", 3)
+    blurred(folder / "single", folder / "in")
+    shutil.copy(PACKAGES / "network" / "weights" / "fast.safetensors", folder / "w.safetensors")
+    given = [str(word) for word in words(folder)]
+    before, kinds = contents(folder), {path: path.lstat().st_mode for path in folder.rglob("*")}
+    done = ravg(*given, folder=folder)
+    if "Traceback" in done.said or done.code == -9:
+        return done.said.strip()[-200:] or "it hangs"
+    for path, mode in kinds.items():
+        if not path.is_symlink() and not path.exists():
+            return f"{path.relative_to(folder)} is gone"
+        if path.lstat().st_mode != mode:
+            return f"{path.relative_to(folder)} is something else now"
+    changed = [path for path, data in before.items() if path.read_bytes() != data]
+    return f"{changed[0].relative_to(folder)} was written over" if changed else None
+
+
+def pseudoref_with(option: str, make: Callable[[Path], object], folder: Path) -> Sequence[object]:
+    estimate = ["--estimate", folder / "single"]
+    return ["pseudoref", folder / "in", "-o", folder / "out", *DRAFT, *estimate, option, make(folder)]
+
+
+def denoise_with(option: str, make: Callable[[Path], object], folder: Path) -> Sequence[object]:
+    weights = ["--weights", folder / "w.safetensors", "--estimate", "nlm"]
+    return ["denoise", folder / "in", "-o", folder / "out", *weights, option, make(folder)]
+
+
+def device(folder: Path) -> Path:
+    os.mknod(folder / "null.png", 0o020666, os.makedev(1, 3))
+    return folder / "null.png"
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe.png")
+    return folder / "pipe.png"
+
+
+def link(to: str, name: str = "soft.png") -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).symlink_to(folder / to)
+        return folder / name
+
+    return make
+
+
+def hard_link(to: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        os.link(folder / to, folder / "hard.png")
+        return folder / "hard.png"
+
+    return make
+
+
+def own_json(name: str) -> Callable[[Path], Sequence[object]]:
+    def words(folder: Path) -> Sequence[object]:
+        path = folder / "out" / name
+        path.parent.mkdir(parents=True)
+        path.write_text('{"mine": true}')
+        return ["pseudoref", folder / "in", "-o", folder / "out", *DRAFT]
+
+    return words
+
+
+def planted(folder: Path) -> Sequence[object]:
+    """Links under all the names that temporary files could have, were they told by host and process."""
+    (folder / "out").mkdir()
+    (folder / "victim").write_text("mine")
+    host = re.sub(r"\W", "_", socket.gethostname()) or "host"
+    for number in range(1001, 1004):
+        for process in range(os.getpid(), os.getpid() + 3000):
+            name = f".shot.{number}.exr.{host}-{process}-{threading.get_ident()}.tmp"
+            (folder / "out" / name).symlink_to(folder / "victim")
+    return ["pseudoref", folder / "in", "-o", folder / "out", *DRAFT]
+
+
+def outside(name: str, folder: Path) -> str | None:
+    """A comparison writes into its folder alone, whatever its methods are called."""
+    noisy, clean = shot(folder / "in", 3), shot(folder / "clean", 3, noise=0)
+    (folder / "a" / "b").mkdir(parents=True)
+    words = [
+        "compare",
+        noisy,
+        "--reference",
+        clean,
+        "--methods",
+        "draft",
+        "--rounds",
+        1,
+        "-o",
+        folder / "a" / "b" / "c",
+    ]
+    before = {path for path in folder.rglob("*")}
+    done = alone(COMMAND, *words, "--external", f"{name}={clean}", folder=folder)
+    if "Traceback" in done.said:
+        return "traceback"
+    inside = folder / "a" / "b" / "c"
+    made = [path for path in folder.rglob("*") if path not in before and inside not in (path, *path.parents)]
+    return f"{made[0].relative_to(folder)} was written" if made else (done.refused if done.code else None)
+
+
+def row_8() -> Cases:
+    targets: dict[str, Callable[[Path], object]] = {
+        "a frame": lambda f: f / "in" / "shot.1002.exr",
+        "an estimate": lambda f: f / "single" / "shot.1002.exr",
+        "an estimate, by a link": link("single/shot.1002.exr"),
+        "an estimate, by a hard link": hard_link("single/shot.1002.exr"),
+        "a frame, by a folder's other name": lambda f: f / "single" / ".." / "in" / "shot.1001.exr",
+        "a device": device,
+        "a pipe": pipe,
+        "the output": lambda f: f / "in" / ".." / "in" / "shot.1003.exr",
+    }
+    for name, make in targets.items():
+        yield f"--preview over {name}", partial(spared, partial(pseudoref_with, "--preview", make))
+    for name in ("a frame", "a device"):
+        yield f"--breakdown over {name}", partial(spared, partial(denoise_with, "--breakdown", targets[name]))
+    weights: dict[str, Callable[[Path], object]] = {
+        "the weights": lambda f: f / "w.safetensors",
+        "the weights, by a link": link("w.safetensors"),
+        "the weights, by a hard link": hard_link("w.safetensors"),
+    }
+    for name, make in weights.items():
+        for option in ("--preview", "--breakdown"):
+            yield f"{option} over {name}", partial(spared, partial(denoise_with, option, make))
+    for name, where in {"the estimates": "single", "the input": "in"}.items():
+        words = partial(lambda where, f: [*pseudoref_with("-o", lambda f: f / where, f)], where)
+        yield f"output over {name}", partial(spared, words)
+    for name in ("ravg.json", "ravg", "ravg/shot.1001-1003.json"):
+        yield f"a {name} of somebody's own in the output", partial(spared, own_json(name))
+    yield "links planted under temporary names", partial(spared, planted)
+    for name in ("../../evil", "../../../in/shot.1001", "/tmp/ravg-evil", "..", "a/../../../b", "x" * 300):
+        yield f"--external {name[:20]}", partial(outside, name)
+
+
+# --- 9: two containers on one folder
+
+
+HOLD = """
+import pathlib, sys
+try:
+    from hybrid.files.replace import replace_file, temporary_folder
+except ImportError:
+    from hybrid.files import replace_file, temporary_folder
+kind, path = sys.argv[1], pathlib.Path(sys.argv[2])
+with (replace_file if kind == "file" else temporary_folder)(path) as temporary:
+    inside = temporary if kind == "file" else temporary / "a.exr"
+    inside.write_bytes(b"whole")
+    print("begun", flush=True)
+    sys.stdin.read(1)
+    print(inside.read_bytes().decode(), flush=True)
+"""
+
+
+def other_container(kind: str, same_numbers: bool, folder: Path) -> str | None:
+    """A process that this one cannot see keeps what it writes; a dead one's goes."""
+    if os.geteuid() or shutil.which("unshare") is None:
+        raise UntriedError("needs unshare, as root")
+    noisy, out = shot(folder / "in", 2), folder / "out"
+    out.mkdir()
+    words = ["unshare", "--pid", "--fork", *(["--mount-proc"] if same_numbers else [])]
+    child = subprocess.Popen(
+        [*words, sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr")],
+        env={**os.environ, "PYTHONPATH": str(PACKAGES)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert child.stdout is not None
+    if child.stdout.readline() != "begun\n":
+        return "it did not begin"
+    done = ravg("pseudoref", noisy, "-o", out, *DRAFT)
+    said, _ = child.communicate("x")
+    if done.failed or child.returncode or "whole" not in said:
+        return f"it was disturbed: {said.strip()[-200:]}{done.failed or ''}"
+    return None
+
+
+def dead_container(kind: str, folder: Path) -> str | None:
+    noisy, out = shot(folder / "in", 2), folder / "out"
+    out.mkdir()
+    child = subprocess.Popen(
+        [sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr")],
+        env={**os.environ, "PYTHONPATH": str(PACKAGES)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    child.stdout.readline()
+    child.kill()
+    child.communicate()
+    if failed := ravg("pseudoref", noisy, "-o", out, *DRAFT).failed:
+        return failed
+    left = [path.name for path in out.iterdir() if path.name.startswith(".")]
+    return f"{left[0]} is left" if left else None
+
+
+def row_9() -> Cases:
+    for kind in ("file", "folder"):
+        for same in (False, True):
+            yield (
+                f"a {kind} of another container{' with a /proc of its own' * same}",
+                partial(other_container, kind, same),
+            )
+        yield f"a {kind} of a process that was killed", partial(dead_container, kind)
+
+
+# --- 10: where nothing may be written
+
+
+# The interpreter itself may be root's alone: what it needs is loaded before.
+AS_NOBODY = """
+import contextlib, importlib, json, os, sys
+for name in json.loads(open(os.environ["MODULES"]).read()):
+    with contextlib.suppress(Exception):
+        importlib.import_module(name)
+import numba
+numba.njit(lambda x: 2 * x)(1)
+os.setegid(65534), os.seteuid(65534)
+sys.path.insert(0, os.environ["INSTALLED"])
+from hybrid.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def installed(folder: Path, *, compiled: bool) -> Path:
+    """The packages as an administrator installs them: not for the user to write to."""
+    for name in OURS:
+        ignore = None if compiled else shutil.ignore_patterns("__pycache__")
+        shutil.copytree(PACKAGES / name, folder / "installed" / name, ignore=ignore)
+    return folder / "installed"
+
+
+def read_only(words: Callable[[Path], Sequence[object]], temporary: bool, folder: Path) -> str | None:
+    """A farm's user, with no home, and an installation of root's."""
+    if os.geteuid():
+        raise UntriedError("needs root, to be somebody else")
+    packages = installed(folder, compiled=False)
+    (folder / "tmp").mkdir()
+    for path in (folder, folder / "tmp"):
+        path.chmod(0o777)
+    environment = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent", "INSTALLED": str(packages)}
+    environment |= {"TMPDIR": str(folder / "tmp" if temporary else folder / "none")}
+    ours = (*OURS, "__")
+    (folder / "modules.json").write_text(json.dumps([name for name in sys.modules if not name.startswith(ours)]))
+    environment["MODULES"] = str(folder / "modules.json")
+    return alone(AS_NOBODY, *words(folder), packages=Path("/nonexistent"), **environment).failed
+
+
+def cut_short(pattern: str, share: float, folder: Path) -> str | None:
+    """What was compiled and is half there is compiled again."""
+    packages, noisy = installed(folder, compiled=True), shot(folder / "in", 1)
+    files = sorted((packages / "nlm" / "__pycache__").glob(pattern))
+    if not files:
+        raise UntriedError("nothing is compiled yet")
+    for path in files:
+        os.truncate(path, int(share * path.stat().st_size))
+    words = ["pseudoref", noisy, "-o", folder / "out", *DRAFT]
+    return alone(COMMAND, *words, packages=packages).failed
+
+
+def row_10() -> Cases:
+    for temporary in (True, False):
+        where = "temporary files" if temporary else "no temporary files"
+        yield f"--help, {where}", partial(read_only, lambda f: ["--help"], temporary)
+        yield f"inspect, {where}", partial(read_only, lambda f: ["inspect", shot(f / "in", 1)], temporary)
+    yield "status", partial(read_only, lambda f: ["status", "--help"], True)
+    for kind in ("nbi", "nbc"):
+        for share in (0, 0.5, 0.99):
+            yield f"compiled loops cut to {share}, {kind}", partial(cut_short, f"average*.{kind}", share)
+
+
+# --- 11: weights
+
+
+def hostile_weights(change: Callable[[dict[str, str]], object], base: str, folder: Path) -> str | None:
+    """Refused in a line, at once, with next to no memory."""
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(PACKAGES / "network" / "weights" / f"{base}.safetensors", "np") as file:
+        metadata = dict(file.metadata())
+        change(metadata)
+        save_file({name: file.get_tensor(name) for name in list(file.keys())}, folder / "w.safetensors", metadata)
+    words = ["denoise", shot(folder / "in", 1), "-o", folder / "out", "--estimate", "auto"]
+    done = ravg(*words, "--weights", folder / "w.safetensors", seconds=60, memory=3 * 2**30)
+    error = next((line for line in done.said.splitlines() if line.startswith("error: ")), "")
+    return first_of(
+        done.refused,
+        None if error else "no line of error",
+        f"a line of {len(error)} characters" if len(error) > 600 else None,
+    )
+
+
+def described(**changes: object) -> Callable[[dict[str, str]], object]:
+    def change(metadata: dict[str, str]) -> None:
+        description = json.loads(metadata["description"])
+        description["config"] |= changes
+        metadata["description"] = json.dumps(description)
+
+    return change
+
+
+def nested(depth: int) -> Callable[[dict[str, str]], object]:
+    def change(metadata: dict[str, str]) -> None:
+        kernel = {"frames": 5, "size": 5, "threshold": 0.5, "activation": "relu"}
+        inner: object = {"model": "RAUNet", "config": {"kernel": kernel, "widths": [16, 32, 64], "ra_scales": [1]}}
+        for _ in range(depth):
+            inner = {"model": "MultiScale", "scales": 2, "base": inner}
+        metadata["description"] = json.dumps(inner)
+
+    return change
+
+
+def row_11() -> Cases:
+    for depth in (2, 12, 25, 400):
+        yield f"scales of scales, {depth} deep", partial(hostile_weights, nested(depth), "fast")
+    for changes in ({"conv_size": 99}, {"width": 10**9}, {"width": 10**400}, {"blocks": 255}, {"temporal_blocks": 255}):
+        yield f"{str(changes)[:40]}", partial(hostile_weights, described(**changes), "tkpcn")
+    for changes in (
+        {"frames": 255},
+        {"frames": 5.0},
+        {"widths": [256] * 100},
+        {"widths": [2**40]},
+        {"cell": 0},
+        {"cell": 10**6},
+    ):
+        yield f"{str(changes)[:40]}", partial(hostile_weights, described(**changes), "fast")
+    for entry in ("description", "version", "format", "notes"):
+        long = partial(lambda entry, metadata: metadata.update({entry: "x\n" * 500_000}), entry)
+        yield f"a megabyte of {entry}", partial(hostile_weights, long, "fast")
+    for text in ("[" * 10**5, '{"a":' * 10**5, "null", "1e999", '{"model": "Stabilizer", "config": null}'):
+        other = partial(lambda text, metadata: metadata.update({"description": text}), text)
+        yield f"a description {text[:12]}", partial(hostile_weights, other, "fast")
+
+
+# --- 12: crash, hang, memory
+
+
+def refused(words: Callable[[Path], Sequence[object]], folder: Path, **limits: Any) -> str | None:
+    shot(folder / "in", 3)
+    given = words(folder)
+    return ravg(*given, folder=folder, **limits).refused
+
+
+def loop(folder: Path) -> Path:
+    (folder / "a").symlink_to(folder / "b")
+    (folder / "b").symlink_to(folder / "a")
+    return folder / "a"
+
+
+def special(kind: str, command: str, folder: Path) -> str | None:
+    """Among the frames lies something that is no file: refused, or left out, and never waited for."""
+    noisy = shot(folder / "in", 5)
+    path = noisy / "shot.1003.exr"
+    path.unlink()
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(path))
+    elif kind == "device":
+        os.mknod(path, 0o020666, os.makedev(1, 5))  # /dev/zero: without end
+    elif kind == "loop":
+        path.symlink_to(path)
+    elif kind == "folder":
+        path.mkdir()
+    words = {"inspect": [], "pseudoref": ["-o", folder / "out", *DRAFT]}[command]
+    done = ravg(command, noisy, *words, seconds=60)
+    if done.code == -9:
+        return "it hangs"
+    return "traceback" if "Traceback" in done.said else None
+
+
+def pseudoref(folder: Path, *words: object) -> Sequence[object]:
+    return ["pseudoref", folder / "in", "-o", folder / "out", *DRAFT, *words]
+
+
+def hostile_results(text: str, folder: Path) -> str | None:
+    (folder / "report").mkdir()
+    (folder / "report" / "results.json").write_text(text)
+    return ravg("compare", "--beside", folder / "report", "-o", folder / "page", seconds=60).refused
+
+
+def markup(name: str, folder: Path) -> str | None:
+    """A name is shown as it is."""
+    noisy, clean = shot(folder / "in", 2), shot(folder / "clean", 2, noise=0)
+    words = ["compare", noisy, "--reference", clean, "--methods", "draft", "--rounds", 1]
+    done = alone(COMMAND, *words, "--external", f"{name}={clean}")
+    if done.code:
+        return done.refused
+    shown = "".join(done.said.split())
+    return None if "".join(name.split())[:12] in shown else "the name is not shown"
+
+
+WITHOUT_LIBRARY = """
+import sys, types
+class Broken:
+    def find_spec(self, name, path=None, target=None):
+        return None
+broken = types.ModuleType("pyoidn")
+broken.__spec__ = __import__("importlib.machinery").machinery.ModuleSpec("pyoidn", None)
+def absent(name):
+    if name.startswith("__"):
+        raise AttributeError(name)
+    raise OSError("libOpenImageDenoise.so.2: cannot open shared object file")
+broken.__getattr__ = absent
+sys.modules["pyoidn"] = broken
+from hybrid.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def no_library(estimate: str, folder: Path) -> str | None:
+    """pyoidn is there, and the library that it loads is not: auto does without, and says so."""
+    words = ["denoise", shot(folder / "in", 2), "-o", folder / "out", "--estimate", estimate]
+    done = alone(WITHOUT_LIBRARY, *words)
+    if estimate != "auto":
+        return done.refused
+    return done.failed or (None if "nlm" in done.said else "it does not say what it took")
+
+
+def row_12() -> Cases:
+    for kind in ("pipe", "socket", "device", "loop", "folder"):
+        for command in ("inspect", "pseudoref"):
+            yield f"a {kind} among the frames, {command}", partial(special, kind, command)
+    yield "a loop of links as the shot", partial(refused, lambda f: ["inspect", loop(f)])
+    yield "a loop of links as the output", partial(refused, lambda f: [*pseudoref(f)[:2], "-o", loop(f) / "x"])
+    yield "a loop of links as the preview", partial(refused, lambda f: pseudoref(f, "--preview", loop(f) / "x.png"))
+    for size in ("9" * 400, "1" + "0" * 400 + "G", "9" * 400 + ".5T", "1e400"):
+        yield (
+            f"--max-memory of {len(size)} characters",
+            partial(refused, lambda f, s=size: pseudoref(f, "--max-memory", s)),
+        )
+    for count in (50, 300):
+        big = partial(lambda f: ["pseudoref", shot(f / "big", 3, size=(1500, 2000), noise=0), "-o", f / "out", *DRAFT])
+        yield f"{count} MiB of memory", partial(refused, big, memory=count * 2**20)
+    for name in ("[red]x[/blue]", "[/]", "[link=http://a]b", "\x1b[2J", "[bold]"):
+        yield f"--external {name!r}", partial(markup, name)
+    for text in (
+        "", "null", "[]", "{}", "[" * 10**5, '{"results": 1}', '{"shot": 1, "results": [{}], "facts": {}}',
+        '{"shot": "x", "results": [{"metrics": []}], "facts": {}}', '{"shot": "x", "results": "abc", "facts": {}}',
+        '{"shot": "x", "results": [null], "facts": null}', "\\ud800", '{"results": [{"metrics": {"psnr": 0}}]}',
+    ):  # fmt: skip
+        yield f"results.json: {text[:30]}", partial(hostile_results, text)
+    for estimate in ("auto", "oidn", "oidn-best"):
+        yield f"pyoidn without its library, {estimate}", partial(no_library, estimate)
+
+
+# --- 13: words
+
+
+def attribute(value: bytes, folder: Path) -> str | None:
+    """A string in a header is kept to the byte, whatever its encoding."""
+    noisy = shot(folder / "in", 2, owner="A" * len(value))
+    for path in noisy.iterdir():
+        data = path.read_bytes()
+        assert data.count(b"A" * len(value)) == 1
+        path.write_bytes(data.replace(b"A" * len(value), value))
+    if failed := ravg("pseudoref", noisy, "-o", folder / "out", *DRAFT).failed:
+        return failed
+    made = (folder / "out" / "shot.1001.exr").read_bytes()
+    return None if b"owner\0string\0" + len(value).to_bytes(4, "little") + value in made else "it is another"
+
+
+def odd_folder(name: str, pattern: bool, folder: Path) -> str | None:
+    noisy = shot(folder / name / "in", 2)
+    spec = noisy / "shot.####.exr" if pattern else noisy
+    out = folder / name / "out"
+    target = out / "made.####.exr" if pattern else out
+    if failed := ravg("pseudoref", spec, "-o", target, *DRAFT).failed:
+        return failed
+    return None if len(names(out)) == 2 else "its frames are not there"
+
+
+def ascii_only(words: Callable[[Path], Sequence[object]], folder: Path) -> str | None:
+    return alone(COMMAND, *words(folder), PYTHONIOENCODING="ascii", LC_ALL="C").failed
+
+
+def usage(words: Sequence[object], folder: Path) -> str | None:
+    """Bad usage, exit code 2, and nothing is made."""
+    given = ["pseudoref", shot(folder / "in", 3), *DRAFT, *words]
+    if "-o" not in words:
+        given += ["-o", folder / "out"]
+    before = set(folder.rglob("*"))
+    done = ravg(*given, folder=folder)
+    if made := set(folder.rglob("*")) - before:
+        return f"{made.pop().relative_to(folder)} was made"
+    return None if done.code == 2 and "Traceback" not in done.said else f"exit code {done.code}"
+
+
+def row_13() -> Cases:
+    values = {"Latin-1": "Ærø Müller".encode("latin-1"), "Shift-JIS": "レンダー太郎".encode("shift_jis")}
+    values |= {"UTF-8": "Zoë 渲染".encode(), "bytes of no encoding": b"\xff\xfe\x80abc\x81"}
+    for name, value in values.items():
+        yield f"{name} in a header", partial(attribute, value)
+    for name in (
+        "a#b",
+        "####",
+        "a@b",
+        "@@@@",
+        "%04d",
+        "$F4",
+        "<frame04>",
+        "[1]",
+        "a[1-3]b",
+        "a*b",
+        "a?b",
+        "{x}",
+        "ä 渲",
+        " a",
+    ):
+        for pattern in (False, True):
+            yield f"a folder called {name!r}{', and a pattern' * pattern}", partial(odd_folder, name, pattern)
+    yield "inspect in ASCII", partial(ascii_only, lambda f: ["inspect", shot(f / "in", 2)])
+    yield "pseudoref in ASCII", partial(ascii_only, lambda f: ["pseudoref", shot(f / "ä", 2), "-o", f / "ö", *DRAFT])
+    yield "help in ASCII", partial(ascii_only, lambda f: ["denoise", "--help"])
+    for words in (
+        ["--max-memory", "0"], ["--max-memory", "0G"], ["-o", ""], ["-o", "x.tif"], ["-o", "x.####.png"],
+        ["--layer", "color="], ["--layer", "=x"], ["--layer", "nonsense=x"], ["--layer", "albedo"],
+        ["--max-memory", ""], ["--max-memory", "-1G"], ["--preset", "best"], ["--frames", ""], ["--frames", "1-x"],
+        ["--effects", "magic"], ["--preview", "x.tif"], ["--max-pixels", "0"],
+    ):  # fmt: skip
+        yield f"usage: {' '.join(map(str, words))}", partial(usage, words)
+
+
+# --- 14: fireflies
+
+
+def ring(value: float, estimate: str, count: int, folder: Path) -> str | None:
+    """A spark leaves no ring of light around it: 9×9, without its own pixel."""
+    place = [(12, 16), (20, 34), (8, 40), (25, 8)][:count]
+
+    def burnt(index: int, layers: Layers) -> None:
+        if index == 2:
+            layers["late"] = lambda late: [late["ViewLayer.Combined"].__setitem__(at, value) for at in place]  # type: ignore[assignment]
+
+    words = ["--estimate", estimate, "--preset", "standard" if (PACKAGES / "hybrid/files").is_dir() else "balanced"]
+    for name, edit in (("plain", None), ("burnt", burnt)):
+        noisy = shot(folder / f"{name} in", 5, edit, step=(1, 0))
+        if failed := ravg("pseudoref", noisy, "-o", folder / name, *words).failed:
+            return failed
+    for number in (1002, 1003, 1004):
+        plain, made = (color(folder / name / f"shot.{number}.exr") for name in ("plain", "burnt"))
+        for y, x in place:
+            block = slice(y - 4, y + 5), slice(x - 6, x + 7)
+            if (share := made[block].mean() / plain[block].mean()) > 1.1:
+                return f"frame {number}: {share:.2f} times the light around it"
+            if (peak := made[block].max() / plain[block].max()) > 1.5:
+                return f"frame {number}: a peak of {peak:.1f}"
+    return None
+
+
+def lamp(step: tuple[int, int], value: float, folder: Path) -> str | None:
+    """A light of one pixel that is there in every frame stays."""
+
+    def lit(index: int, layers: Layers) -> None:
+        at = 16 + step[1] * index, 20 + step[0] * index
+        layers["late"] = lambda late: late["ViewLayer.Combined"].__setitem__(at, value)  # type: ignore[assignment]
+
+    noisy = shot(folder / "in", 5, lit, step=step)
+    if failed := ravg("pseudoref", noisy, "-o", folder / "out", *DRAFT, "--estimate", "oidn").failed:
+        return failed
+    for index in range(5):
+        made = color(folder / "out" / f"shot.{1001 + index}.exr")
+        y, x = 16 + step[1] * index, 20 + step[0] * index
+        light = float(made[y - 3 : y + 4, x - 3 : x + 4].mean(axis=-1).sum())
+        if not 0.5 * value < light < 2 * value:
+            return f"frame {1001 + index}: {light / value:.2f} of its light is there"
+    return None
+
+
+def on_record(folder: Path) -> str | None:
+    def burnt(index: int, layers: Layers) -> None:
+        if index == 1:
+            layers["late"] = lambda late: late["ViewLayer.Combined"].__setitem__((12, 16), 5000)  # type: ignore[assignment]
+
+    if failed := ravg("pseudoref", shot(folder / "in", 3, burnt), "-o", folder / "out", *DRAFT).failed:
+        return failed
+    records = [json.loads(path.read_text()) for path in (folder / "out").rglob("*.json")]
+    share = max((e.get("light_removed", 0) for r in records for e in dict(r.get("frames", {})).values()), default=0)
+    true = 5000 * 3 / color(folder / "in" / "shot.1002.exr").sum()
+    return None if abs(share / true - 1) < 0.1 else f"{share:.3f} on record, {true:.3f} taken out"
+
+
+def row_14() -> Cases:
+    for estimate in ("none", "nlm", "oidn", "oidn-fast", "oidn-best"):
+        for value in (300.0, 20_000.0, 60_000.0):
+            yield f"a spark of {value:g}, {estimate}", partial(ring, value, estimate, 1)
+    for estimate in ("none", "oidn"):
+        yield f"four sparks, {estimate}", partial(ring, 5000.0, estimate, 4)
+    for step in ((0, 0), (2, 1)):
+        for value in (50.0, 5000.0):
+            yield f"a lamp of {value:g}{' that moves' * any(step)}", partial(lamp, step, value)
+    yield "what was taken out is on record", on_record
+
+
+ROWS: dict[int, tuple[str, Callable[[], Cases]]] = {
+    1: ("what one window has and no other is found there", row_1),
+    2: ("absurd values make no picture; frames not made are no success", row_2),
+    3: ("names mean one thing, or are refused", row_3),
+    4: ("one seed is told from detail", row_4),
+    5: ("what is opaque stays opaque", row_5),
+    6: ("--resume makes again what would be another", row_6),
+    7: ("kept estimates are those that would be made", row_7),
+    8: ("nobody else's file is written over", row_8),
+    9: ("two containers leave each other's files alone", row_9),
+    10: ("a home that is read-only, compiled loops cut short", row_10),
+    11: ("weights that ask for too much", row_11),
+    12: ("no crash, no hang: one line", row_12),
+    13: ("words of any encoding, folders of any name, usage", row_13),
+    14: ("fireflies go, lamps stay", row_14),
+}
+
+
+class UntriedError(Exception):
+    """This machine cannot try it."""
+
+
+def try_case(case: Case) -> str | None:
+    """None where it holds, else what does not."""
+    folder = Path(tempfile.mkdtemp(prefix="ravg-"))
+    folder.chmod(0o755)
+    try:
+        return case(folder)
+    except UntriedError:
+        raise
+    except Exception as error:  # what was expected is not even there
+        return f"{type(error).__name__}: {error}"
+    finally:
+        subprocess.run(["rm", "-rf", str(folder)], check=False)
+
+
+def try_rows(rows: Sequence[int]) -> dict[int, tuple[int, int]]:
+    """Row → cases, and how many of them hold; what does not goes to standard error."""
+    _import_all()
+    counts = {}
+    for row in rows:
+        cases = holding = 0
+        for name, case in ROWS[row][1]():
+            try:
+                reason = try_case(case)
+            except UntriedError as untried:
+                print(f"{row}: {name}: not tried: {untried}", file=sys.stderr, flush=True)
+                continue
+            cases += 1
+            holding += reason is None
+            if reason is not None:
+                print(f"{row}: {name}: {' '.join(reason.split())[:400]}", file=sys.stderr, flush=True)
+        counts[row] = cases, holding
+        print(f"row {row}: {holding} of {cases} hold", file=sys.stderr, flush=True)
     return counts
 
 
-def extract(revision: str, folder: Path) -> None:
-    """Put the packages of a revision into a folder."""
-    listed = subprocess.run(["git", "ls-tree", "--name-only", revision], cwd=ROOT, check=True, capture_output=True)
-    packages = {"loops", "flow", "nlm", "network", "hybrid"} & set(listed.stdout.decode().split())
-    words = ["git", "archive", revision, *sorted(packages)]
-    packed = subprocess.run(words, cwd=ROOT, check=True, capture_output=True).stdout
-    with tarfile.open(fileobj=BytesIO(packed)) as archive:
-        archive.extractall(folder, filter="data")
-
-
-def last_json(done: subprocess.CompletedProcess[str]) -> dict[str, object]:
-    """What a script printed last."""
-    if not done.stdout.strip():
-        raise RuntimeError(done.stderr)
-    result: dict[str, object] = json.loads(done.stdout.strip().splitlines()[-1])
-    return result
+def _import_all() -> None:
+    """Import what is tried, so that processes that are forked need not."""
+    sys.path.insert(0, str(PACKAGES))
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    cv2.setNumThreads(1)
+    for package in OURS:
+        found = importlib.import_module(package)
+        for module in pkgutil.walk_packages(found.__path__, f"{package}."):
+            if "simulate" not in module.name:
+                with contextlib.suppress(ImportError):
+                    importlib.import_module(module.name)
+    if not Path(sys.modules["hybrid"].__file__ or "").is_relative_to(PACKAGES):
+        raise RuntimeError(f"hybrid is not that of {PACKAGES}")
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--before", metavar="REVISION", help="run the tests on the packages of this revision too")
-    parser.add_argument("--fuzz", type=int, default=2000, help="files to damage")
-    parser.add_argument("--shots", type=int, default=300, help="made-up shots with one odd window")
-    parser.add_argument("--damaged", type=Path, help="folder of damaged EXR files to run on as well")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
+    """Run, print, and tell by the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--only", type=int, nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="of another revision")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the counts there too")
     options = parser.parse_args(argv)
-    now = run_tests(ROOT)
-    before = {}
-    if options.before:
-        with tempfile.TemporaryDirectory() as folder:
-            extract(options.before, Path(folder))
-            before = run_tests(Path(folder))
-    rows = []
-    for file, name in NAMES.items():
-        cases, failed = now[file]
-        # A file whose imports the older packages lack fails as a whole.
-        old = None if not before else cases if before[file][0] <= 1 < cases else before[file][1]
-        rows.append((name, cases, old, cases - failed))
-    scripts = {
-        "damaged files (fuzz)": ["benchmarks/fuzz_files.py", "--cases", str(options.fuzz)],
-        "kills, stops, no space, two at once: pseudoref": ["benchmarks/kill_runs.py"],
-        "kills, stops, no space, two at once: denoise": [
-            "benchmarks/kill_runs.py",
-            "--command",
-            "denoise --estimate nlm",
-        ],
-    }
-    scripts["one odd window in a calm shot"] = ["benchmarks/odd_windows.py", "--shots", str(options.shots)]
-    if options.damaged:
-        scripts["damaged files (given)"] = ["benchmarks/fuzz_files.py", "--folder", str(options.damaged)]
-    for name, words in scripts.items():
-        result = last_json(run(words, ROOT))
-        if "kills" in result:
-            cases = int(str(result["kills"])) + int(str(result["stops"])) + 6
-            failed = len(result["problems"])  # type: ignore[arg-type]
-        else:
-            cases, failed = int(str(result["cases"])), int(str(result["failed"]))
-        rows.append((name, cases, None, cases - failed))
-    print("| what was tried | cases | failed before | hold now |\n|---|---|---|---|")
-    for name, cases, old, holding in rows:
-        print(f"| {name} | {cases} | {'–' if old is None else old} | {holding} |")
-    total = sum(row[1] for row in rows)
-    print(f"| all | {total} | {sum(row[2] or 0 for row in rows)} | {sum(row[3] for row in rows)} |")
+    before: dict[int, tuple[int, int]] = {}
+    if options.against is not None:
+        with tempfile.NamedTemporaryFile(suffix=".json") as counts:
+            words = [sys.executable, "-P", __file__, "--json", counts.name, "--only", *map(str, options.only)]
+            environment = {**os.environ, "RAVG_UNDER_TEST": str(options.against.resolve()), "PYTHONPATH": ""}
+            subprocess.run(words, env=environment, check=False, stdout=subprocess.DEVNULL)
+            before = {int(row): tuple(count) for row, count in json.loads(Path(counts.name).read_text()).items()}
+    now = try_rows(options.only)
     if options.json is not None:
-        keys = ("name", "cases", "failed_before", "hold_now")
-        options.json.write_text(json.dumps([dict(zip(keys, row, strict=True)) for row in rows], indent=2) + "\n")
-    return 0 if all(row[1] == row[3] for row in rows) else 1
+        options.json.write_text(json.dumps(now))
+    print("| promise | cases | held before | hold now |\n|---|---|---|---|")
+    for row, (cases, holding) in now.items():
+        print(f"| {row}. {ROWS[row][0]} | {cases} | {before[row][1] if before else '–'} | {holding} |")
+    sums = [sum(count[i] for count in counts.values()) for counts, i in ((now, 0), (before, 1), (now, 1))]
+    print(f"| all | {sums[0]} | {sums[1] if before else '–'} | {sums[2]} |")
+    return 0 if sums[0] == sums[2] else 1
 
 
 if __name__ == "__main__":

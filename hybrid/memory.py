@@ -57,12 +57,14 @@ def parse_size(words: str) -> int:
     Raises
     ------
     ValueError
-        If it is no size.
+        If it is no size, nothing, or more than there is anywhere.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", words, re.IGNORECASE)
-    if match is None:
-        raise ValueError(f"max-memory is {words!r}, expected a size such as 8G or 500M")
-    return int(float(match[1]) * _UNITS[match[2].upper()])
+    size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
+    if not 1 <= size < 2.0**63:
+        shown = words if len(words) < 60 else f"{words[:56]}…"
+        raise ValueError(f"max-memory is {shown!r}, expected a size such as 8G or 500M")
+    return int(size)
 
 
 def plan_rows(

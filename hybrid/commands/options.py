@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,9 +27,40 @@ INPUT, WHAT, OUTPUT, RESOURCES = "Input", "What to run", "Output", "Resources"
 
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
 
+# What a folder is not called: somebody wants pictures of a kind that is not written.
+_OTHER_KINDS = re.compile(r"\.(avi|bmp|dpx|gif|hdr|jpe?g|mkv|mov|mp4|pfm|png|tga|tiff?|webp)", re.IGNORECASE)
+
+
+def _check_output(output: str) -> str:
+    """Refuse what can be neither a sequence of EXR files nor a folder for one."""
+    if not output.strip():
+        raise typer.BadParameter("it is empty, expected OUT.####.exr, or a folder")
+    if _OTHER_KINDS.fullmatch(Path(output).suffix) and not Path(output).is_dir():
+        raise typer.BadParameter(f"it is {output!r}, expected OUT.####.exr, or a folder: frames are written as OpenEXR")
+    return output
+
+
+def _check_size(size: str | None) -> str | None:
+    """Refuse what is no size, before anything is made."""
+    from hybrid.memory import parse_size
+
+    if size is not None:
+        with usage():
+            parse_size(size)
+    return size
+
+
 ShotArgument = Annotated[str, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")]
 OutputOption = Annotated[
-    str, typer.Option("-o", "--output", metavar="OUT", help="OUT.####.exr, or a folder", rich_help_panel=OUTPUT)
+    str,
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="OUT",
+        callback=_check_output,
+        help="OUT.####.exr, or a folder",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 FramesOption = Annotated[
     str | None, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2", rich_help_panel=INPUT)
@@ -133,6 +165,7 @@ MemoryOption = Annotated[
     str | None,
     typer.Option(
         metavar="SIZE",
+        callback=_check_size,
         envvar="RAVG_MAX_MEMORY",
         help="such as 8G; frames are then worked on a part at a time",
         rich_help_panel=RESOURCES,
@@ -142,6 +175,7 @@ PixelsOption = Annotated[
     int | None,
     typer.Option(
         metavar="N",
+        min=1,
         envvar="RAVG_MAX_PIXELS",
         help="refuse files that claim more pixels than this; 2^28 without",
         rich_help_panel=RESOURCES,

@@ -24,7 +24,8 @@ from typing import Any, TextIO
 import numpy as np
 import OpenEXR
 
-from hybrid.files.replace import replace_file
+from hybrid.files.replace import refuse_other_kinds, replace_file
+from hybrid.files.strings import readable_copy, restore_strings, without_surrogates
 
 # 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
 # that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
@@ -317,6 +318,7 @@ def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIX
         deep, mip-mapped or chroma-subsampled.
     """
     path = Path(path)
+    refuse_other_kinds(path)
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
             raise ExrError(f"{path}: not an OpenEXR file")
@@ -331,15 +333,11 @@ def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
     parts: tuple[Part, ...] = ()
     with _library_messages() as messages:
         try:
-            file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
-            parts = tuple(
-                Part(
-                    part.header.get("name", ""),
-                    part.header,
-                    {c.name: c for c in (part.header["channels"] if header_only else part.channels.values())},
-                )
-                for part in file.parts
-            )
+            try:
+                parts = _load(path, {}, header_only=header_only)
+            except UnicodeDecodeError:
+                with readable_copy(path, header_only=header_only) as (copy, strings):
+                    parts = _load(copy, strings, header_only=header_only)
         except Exception as error:  # the binding raises RuntimeError, UnicodeDecodeError, MemoryError, …
             reason = str(error).replace(f" '{path}'", "").removesuffix(" when attempting to open for read")
             messages.append(reason.replace("\n", " "))
@@ -348,6 +346,18 @@ def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
         reason = messages[0] if messages else "no parts"
         raise ExrError(f"{path}: damaged or truncated OpenEXR file ({reason})")
     return parts
+
+
+def _load(path: Path, strings: Mapping[tuple[int, str], str], *, header_only: bool) -> tuple[Part, ...]:
+    """The parts of a file, with some strings of their headers, by part and name, in place of those in the file."""
+    file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+    parts = []
+    for index, part in enumerate(file.parts):
+        own = {name: text for (where, name), text in strings.items() if where == index}
+        header = {**part.header, **own} if own else part.header
+        channels = header["channels"] if header_only else part.channels.values()
+        parts.append(Part(header.get("name", ""), header, {channel.name: channel for channel in channels}))
+    return tuple(parts)
 
 
 def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> None:
@@ -508,7 +518,9 @@ def write_exr(
             if not isinstance(header.get(key, ""), str):
                 raise ValueError(f"attribute {key!r} of {source.path} is not a string, and cannot be set")
             header[key] = value
-        parts.append(OpenEXR.Part(header, by_part[index], part.name))
+        parts.append(OpenEXR.Part(header, by_part[index], without_surrogates(part.name)))
+        if part.name:
+            parts[-1].header["name"] = part.name
     _write(Path(path), parts + added)
     return clamped
 
@@ -623,10 +635,17 @@ def _convert(values: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, int]:
 
 def _write(path: Path, parts: list[OpenEXR.Part]) -> None:
     """Write parts so that `path` is never a part of a file."""
+    odd = []
+    for part in parts:
+        texts = {name: value for name, value in part.header.items() if isinstance(value, str)}
+        odd.append({name: text for name, text in texts.items() if without_surrogates(text) != text})
+        part.header.update({name: without_surrogates(text) for name, text in odd[-1].items()})
     with replace_file(path) as temporary:
         with _library_messages() as messages:
             try:
                 OpenEXR.File(parts).write(str(temporary))
+                if any(odd):
+                    restore_strings(temporary, odd)
             except Exception as error:
                 messages.append(str(error).replace(str(temporary), str(path)).replace("\n", " "))
         if messages:  # filled on leaving the block above

@@ -45,7 +45,7 @@ def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[st
         names |= dict.fromkeys(identities(path), f"{what} {str(path)!r}")
     written: dict[object, tuple[str, Path]] = {}
     for what, path in outputs:
-        _refuse_other_kinds(path)
+        refuse_other_kinds(path)
         for name in identities(path):
             if name in names:
                 raise ValueError(f"{what} {str(path)!r} would overwrite an input: {names[name]}")
@@ -64,8 +64,8 @@ def identities(path: Path) -> Iterator[object]:
         yield status.st_dev, status.st_ino
 
 
-def _refuse_other_kinds(path: Path) -> None:
-    """Raise OSError for what is there and no file."""
+def refuse_other_kinds(path: Path) -> None:
+    """Raise OSError for what is there and no file: a pipe would be waited for, a device has no end."""
     try:
         mode = path.stat().st_mode
     except OSError:  # nothing there, or a link to nothing, which is replaced
@@ -96,7 +96,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         If the folder cannot be written to, `path` is there and no file, or somebody has put another file in the
         place of the temporary one. It names `path`, not the temporary file.
     """
-    _refuse_other_kinds(path)
+    refuse_other_kinds(path)
     temporary, descriptor = _create(path)
     try:
         yield temporary

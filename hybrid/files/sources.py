@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.replace import refuse_other_kinds
 
 MADE_FROM = "ravg/made-from"
 # Of larger files so many bytes are hashed, in blocks all over: two renders differ everywhere, and what an editor has
@@ -64,6 +65,7 @@ def identify(path: Path) -> Source:
     OSError
         If it cannot be read.
     """
+    refuse_other_kinds(path)
     status = path.stat()
     size = status.st_size
     found = hashlib.blake2b(digest_size=8)

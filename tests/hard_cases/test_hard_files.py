@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 def run_alone(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a script of the project in a process of its own."""
-    # The packages under test, which need not be those beside the tests (`benchmarks/reliability.py --before`).
+    # The packages under test, which need not be those beside the tests (`benchmarks/hard_cases.py --before`).
     packages = str(Path(hybrid.__file__).parents[1])
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join([packages, *sys.path]), **environment}
     return subprocess.run([sys.executable, *words], cwd=ROOT, env=variables, capture_output=True, text=True)

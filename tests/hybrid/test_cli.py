@@ -256,6 +256,13 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["inspect", "SHOT", "--quiet", "--verbose"],
         ["inspect", "SHOT", "--log-format", "prose"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "much"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "0"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "9" * 400],
+        ["pseudoref", "SHOT", "-o", "OUT", "--max-pixels", "0"],
+        ["pseudoref", "SHOT", "-o", ""],
+        ["pseudoref", "SHOT", "-o", "OUT.tif"],
+        ["pseudoref", "SHOT", "-o", "out.####.PNG"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--layer", "color="],
         ["compare", "SHOT", "--reference", "SHOT", "--clock", "sun"],
         ["simulate", "random", "-o", "OUT", "--size", "large"],
         ["simulate", "random", "-o", "OUT", "--frames", "a-b"],
@@ -263,9 +270,13 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["simulate", "random", "-o", "OUT", "--jobs", "0"],
     ],
 )
-def test_bad_usage_is_two(arguments, shot_folder, tmp_path, capsys):
+def test_bad_usage_is_two_and_makes_nothing(arguments, shot_folder, tmp_path, capsys, monkeypatch):
+    """No memory at all, and an output of no name or another kind, were found out after a record had been written."""
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
     words = {"SHOT": str(shot_folder), "OUT": str(tmp_path / "o")}
     assert run(capsys, *(words.get(word, word) for word in arguments))[0] == 2
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.neural
@@ -282,9 +293,9 @@ def test_bad_usage_is_two(arguments, shot_folder, tmp_path, capsys):
         ["prepare", "SHOT", "-o", "OUT", "--levels", "many"],
     ],
 )
-def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys):
+def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys, monkeypatch):
     pytest.importorskip("torch")
-    test_bad_usage_is_two(options, shot_folder, tmp_path, capsys)
+    test_bad_usage_is_two_and_makes_nothing(options, shot_folder, tmp_path, capsys, monkeypatch)
 
 
 def test_a_file_without_color_is_refused(tmp_path, capsys):

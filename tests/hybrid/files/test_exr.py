@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hypothesis.extra.numpy import arrays
 from flow import motion
 from hybrid.files.exr import ExrError, read_exr, write_exr, write_layers
 from hybrid.files.layers import find_layers
+from hybrid.files.sources import identify
 
 CYCLES = {
     "Combined": "RGBA",
@@ -50,6 +52,17 @@ def save_parts(path: Path, parts: dict[str, dict], headers: dict[str, dict] | No
 
 def cycles_names(layers=CYCLES, prefix="ViewLayer.") -> list[str]:
     return [f"{prefix}{layer}.{c}" for layer, components in layers.items() for c in components]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket"])
+@pytest.mark.parametrize("look", [read_exr, identify])
+def test_what_is_no_file_is_not_waited_for(tmp_path, kind, look):
+    """A pipe among the frames was read until somebody wrote to it: for ever."""
+    path = tmp_path / "a.exr"
+    with socket.socket(socket.AF_UNIX) as server:
+        os.mkfifo(path) if kind == "pipe" else server.bind(os.path.relpath(path))
+        with pytest.raises(OSError, match=f"a.exr is a {kind}, expected a file"):
+            look(path)
 
 
 # --- reading

@@ -1,0 +1,105 @@
+"""Strings in the headers of OpenEXR files, kept to the byte whatever their encoding.
+
+Studios write Latin-1 and Shift-JIS; the library's binding reads and writes UTF-8 alone. So it is shown a copy in which
+each byte that is not UTF-8 is a question mark, of the same length, and the bytes themselves are kept as Python keeps
+such names of files: as lone surrogates (PEP 383).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+# Of the version field: several parts, each with a header, and one more that is empty.
+_MULTI_PART = 0x1000
+# Headers and tables of offsets are within so many bytes; of what is behind them a reader of headers sees nothing.
+_HEADERS = 2**24
+
+
+def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
+    """Find the attributes that are strings.
+
+    Parameters
+    ----------
+    data : bytes
+        A file, or the beginning of one. What ends in the midst, or makes no sense, ends the search.
+
+    Yields
+    ------
+    (int, str, slice)
+        The part, the attribute's name, and where its bytes are.
+    """
+    several = bool(int.from_bytes(data[4:8], "little") & _MULTI_PART)
+    part, at = 0, 8
+    while at < len(data):
+        if data[at] == 0:  # the end of a header, and of all where there is nothing before it
+            part, at = part + 1, at + 1
+            if not several or data[at : at + 1] in (b"\0", b""):
+                return
+            continue
+        name_end = data.find(b"\0", at, at + 256)
+        kind_end = data.find(b"\0", name_end + 1, name_end + 257)
+        if name_end < 0 or kind_end < 0:
+            return
+        start = kind_end + 5
+        end = start + int.from_bytes(data[kind_end + 1 : start], "little")
+        if end > len(data):
+            return
+        if data[name_end + 1 : kind_end] == b"string":
+            yield part, data[at:name_end].decode("utf-8", "surrogateescape"), slice(start, end)
+        at = end
+
+
+@contextmanager
+def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict[tuple[int, str], str]]]:
+    """Give a copy of a file whose strings are UTF-8, and those that are not in the file itself.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    header_only : bool
+        Nothing behind the headers has to be there.
+
+    Yields
+    ------
+    (Path, dict of (int, str) to str)
+        The copy, which goes when the block ends; part and name of an attribute → its string.
+    """
+    with path.open("rb") as file:
+        data = bytearray(file.read(_HEADERS if header_only else -1))
+    strings = {}
+    for part, name, where in [*find_strings(bytes(data))]:
+        text = bytes(data[where]).decode("utf-8", "surrogateescape")
+        if (plain := without_surrogates(text)) != text:
+            strings[part, name] = text
+            data[where] = plain.encode()
+    with tempfile.NamedTemporaryFile(suffix=".exr") as copy:
+        copy.write(data)
+        copy.truncate(path.stat().st_size)
+        copy.flush()
+        yield Path(copy.name), strings
+
+
+def restore_strings(path: Path, headers: Sequence[dict[str, str]]) -> None:
+    """Put strings into a file that was written without their surrogates.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    headers : sequence of dict of str to str
+        For each part the strings to put there, by name.
+    """
+    with path.open("r+b") as file:
+        for part, name, where in find_strings(file.read(_HEADERS)):
+            if name in headers[part]:
+                file.seek(where.start)
+                file.write(headers[part][name].encode("utf-8", "surrogateescape"))
+
+
+def without_surrogates(text: str) -> str:
+    """A string of the same length in bytes, with a question mark for each byte that is not UTF-8."""
+    return "".join("?" if "\udc80" <= sign <= "\udcff" else sign for sign in text)
