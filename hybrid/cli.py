@@ -86,16 +86,25 @@ def _run(argv: Sequence[str] | None) -> int:
         return INTERRUPTED
     except ModuleNotFoundError:
         raise  # a broken installation, not something optional that is missing
-    except MemoryError as error:
-        words = " ".join(str(error).split())  # numpy says how much it was; others say nothing
-        LOG.error(
-            f"not enough memory{f' ({words})' if words else ''}: --max-memory works on a part of a frame at a time"
-        )
-        return 1
-    except (ValueError, OSError, ImportError) as error:
+    except Exception as error:
+        if _is_lack_of_memory(error):
+            words = one_line(error)  # numpy says how much it was; others say nothing
+            said = f" ({words})" if words else ""
+            LOG.error(f"not enough memory{said}: --max-memory works on a part of a frame at a time")
+            return 1
+        if not isinstance(error, ValueError | OSError | ImportError):
+            raise
         LOG.error(one_line(error))
         return 1
     return 0
+
+
+def _is_lack_of_memory(error: Exception) -> bool:
+    """Whether memory was refused; OpenCV and torch have errors of their own for that."""
+    return isinstance(error, MemoryError) or (
+        (type(error).__module__ == "cv2" or isinstance(error, RuntimeError))
+        and any(words in str(error) for words in ("Insufficient memory", "can't allocate memory", "out of memory"))
+    )
 
 
 if __name__ == "__main__":

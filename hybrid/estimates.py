@@ -6,7 +6,6 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
-from hybrid.oidn import HOLDS, denoise_oidn
+from hybrid.oidn import HOLDS, denoise_oidn, why_no_oidn
 from hybrid.plausibility import LOST, find_lost_light
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
@@ -229,18 +228,18 @@ def _choose(
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
-        if _has_oidn():
+        if (lacking := why_no_oidn()) is None:
             if quicker is not None:
                 return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", quicker)
             return _oidn(mode, keep, "OIDN is installed")
-        return EstimateSource("nlm", OfWindows(own), "no denoised picture in the file, and pyoidn is not installed")
+        return EstimateSource("nlm", OfWindows(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
     if spec == "nlm":
         return EstimateSource("nlm", OfWindows(own), "asked for")
     if spec in OIDN_MODES:
-        if not _has_oidn():
-            raise ImportError(f"estimate {spec}: pyoidn is not installed; expected: pip install 'ravg[compare]'")
+        if (lacking := why_no_oidn()) is not None:
+            raise ImportError(f"estimate {spec}: {lacking}; expected: pip install 'ravg[compare]'")
         return _oidn(spec, keep, "asked for")
     sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
@@ -248,10 +247,6 @@ def _choose(
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
     read = OfFrames(partial(_read_sequence, sequence), files=sequence)
     return EstimateSource("sequence", read, "asked for", sequence)
-
-
-def _has_oidn() -> bool:
-    return importlib.util.find_spec("pyoidn") is not None
 
 
 def _oidn(

@@ -83,6 +83,19 @@ def denoise_oidn(
     return _execute(images, quality, threads, scale, hdr=True, cleanAux=clean)
 
 
+@lru_cache(maxsize=1)
+def why_no_oidn() -> str | None:
+    """Say why OIDN cannot be had here: None where it can."""
+    try:
+        _device(0)
+    except ImportError as error:
+        # The package may be there, and not what it imports.
+        return "pyoidn is not installed" if isinstance(error.__cause__, ModuleNotFoundError) else f"pyoidn: {error}"
+    except (OSError, RuntimeError, AttributeError) as error:  # the library is not there, is another's, or has no device
+        return f"pyoidn does not work here: {' '.join(str(error).split())[:200]}"
+    return None
+
+
 def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np.float32]:
     """A contiguous float32 image, checked: OIDN reads raw memory."""
     if image.shape != color.shape or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -454,8 +454,9 @@ def read_comparison(path: Path) -> Comparison:
     ValueError
         If it is no such file.
     """
-    document = json.loads(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
     try:
+        document = json.loads(text)
         results = []
         for entry in document["results"]:
             statistics = {}
@@ -465,9 +466,18 @@ def read_comparison(path: Path) -> Comparison:
                 )
                 values = tuple(map(float, s["values"]))
                 statistics[key] = Statistic(mean, minimum, maximum, low, high, values, tuple(s["shots"]))
-            spread = None if entry["spread"] is None else tuple(map(float, entry["spread"]))
-            worth = None if entry["worth"] is None else float(entry["worth"])
-            results.append(MethodResult(**{**entry, "metrics": statistics, "spread": spread, "worth": worth}))
-        return Comparison(document["shot"], tuple(results), document["facts"])
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is no result of a comparison: expected {error}") from None
+            fastest, slowest = map(float, entry["spread"] or (0, 0))
+            spread = None if entry["spread"] is None else (fastest, slowest)
+            numbers: dict[str, Callable[[Any], float]] = {"peak_bytes": int, "worth": float}
+            numbers |= dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel"), float)
+            kept: dict[str, Any] = {
+                name: None if entry[name] is None else kind(entry[name]) for name, kind in numbers.items()
+            }
+            kept |= {name: str(entry[name]) for name in ("name", "label", "family", "sweep", "base")}
+            kept |= {"settings": dict(entry["settings"]), "metrics": statistics, "spread": spread}
+            results.append(MethodResult(**{**entry, **kept}))
+        facts = {str(name): str(value) for name, value in document["facts"].items()}
+        return Comparison(str(document["shot"]), tuple(results), facts)
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise ValueError(f"{path} is no result of a comparison: {words}") from None

@@ -6,6 +6,7 @@ import shutil
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -355,3 +356,23 @@ def test_compare_wants_something_to_compare(capsys, tmp_path):
     code, _, err = run(capsys, "compare", "--beside", tmp_path)
     assert code == 1
     assert "results.json" in err
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError("Unable to allocate 3.00 GiB for an array"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: you tried"),
+        cv2.error("OpenCV(4.11.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 7 bytes"),
+    ],
+)
+def test_a_lack_of_memory_is_one_line_whoever_says_so(shot_folder, capsys, monkeypatch, error):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("hybrid.plan.plan_shot", fail)
+    assert "not enough memory" in one_line_error(capsys, "inspect", shot_folder)
+    monkeypatch.setattr("hybrid.plan.plan_shot", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(["inspect", str(shot_folder)])

@@ -88,7 +88,7 @@ def test_a_denoiser_is_told_whether_guides_hold_noise(tmp_path, stages):
 
 def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: calls.append(mode) or color)
     shot = open_shot(SCENE.write(tmp_path))
     best = {"quality": "high", "prefilter": "high"}
@@ -231,10 +231,10 @@ def denoised(index, layers):
 def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeypatch):
     plain = open_shot(SCENE.write(tmp_path / "plain"))
     cycles = open_shot(SCENE.write(tmp_path / "cycles", edit=denoised))
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     assert choose_estimate("auto", cycles).name == "file"
     assert choose_estimate("auto", plain).name == "oidn-clean"
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: False)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: "pyoidn is not installed")
     source = choose_estimate("auto", plain, own=STANDARD)
     assert (source.name, source.estimates) == ("nlm", OfWindows(STANDARD))
     assert choose_estimate("none", plain).estimates is None
@@ -271,7 +271,7 @@ def test_of_a_sequence_that_cycles_has_denoised_the_denoised_picture_is_taken(tm
 
 def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     sources = [choose_estimate("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
@@ -285,7 +285,7 @@ def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
 def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_path, monkeypatch):
     """Whatever file was there was taken: of another mode, of other frames, of other guides, or none of ours."""
     made = []
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: made.append(mode) or 0.5 * color)
     folder, kept = SCENE.write(tmp_path / "noisy"), tmp_path / "kept"
 
@@ -316,7 +316,7 @@ def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_pa
 
 def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkeypatch, capfd):
     """They took the place of the output, frame by frame, and the output theirs."""
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: 0.5 * color)
     folder, out = SCENE.write(tmp_path / "noisy"), tmp_path / "out"
     words = ["pseudoref", str(folder), "-o", str(out), "--estimate", "oidn", "--keep-estimates"]
@@ -330,7 +330,7 @@ def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkey
 
 def test_pictures_are_kept_in_a_file_each(tmp_path, monkeypatch):
     """Also where one frame was asked for: its neighbours are denoised as well."""
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     folder, one = SCENE.write(tmp_path), str(tmp_path / "kept.exr")
     with pytest.raises(ValueError, match=r"kept\.exr' names one file for 5 frames, expected OUT\.####\.exr"):
         choose_estimate("oidn", open_shot(folder, frames=str(MIDDLE)), kept=one)

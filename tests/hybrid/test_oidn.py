@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from hybrid import oidn
 from hybrid.alignment.transfer import autoexposure
+from hybrid.cli import main
 from hybrid.oidn import denoise_oidn
+from tests.scenes import Scene
 
 Image = NDArray[np.float32]
 needs_oidn = [
@@ -37,6 +40,37 @@ def scene() -> tuple[Image, Image, Image, Image]:
 
 def rms(a: Image, b: Image) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+@pytest.fixture
+def forgotten():
+    """What was found out about OIDN is forgotten, before and after."""
+    caches = oidn.why_no_oidn, oidn._device
+    for cache in caches:
+        cache.cache_clear()
+    yield
+    for cache in caches:
+        cache.cache_clear()
+
+
+@pytest.mark.parametrize("how", ["absent", "broken", "old"])
+def test_where_its_library_is_missing_auto_does_without_and_says_so(monkeypatch, tmp_path, capsys, forgotten, how):
+    """The package was there, and the library that it loads was not: the first frame ended in an error."""
+
+    class Broken(ModuleType):
+        def __getattr__(self, name: str) -> None:
+            raise OSError("libOpenImageDenoise.so.2: no such file") if how == "broken" else AttributeError(name)
+
+    monkeypatch.setitem(sys.modules, "pyoidn", None if how == "absent" else Broken("pyoidn"))
+    folder = Scene(frames=1).write(tmp_path / "in")
+    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--estimate"]
+    assert main([*words, "auto"]) == 0
+    said = capsys.readouterr().err
+    expected = {"absent": "pyoidn is not installed", "broken": "libOpenImageDenoise.so.2: no such file"}
+    assert "estimates: nlm (no denoised picture in the file, and " in said
+    assert expected.get(how, "pyoidn does not work here: Device") in said
+    assert main([*words, "oidn"]) == 1
+    assert "error: estimate oidn: pyoidn" in capsys.readouterr().err
 
 
 class TestDenoise:

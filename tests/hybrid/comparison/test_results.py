@@ -107,7 +107,37 @@ def test_results_are_read_back_as_they_were(tmp_path: Path) -> None:
     assert again.facts == comparison.facts
     for before, after in zip(comparison.results, again.results, strict=True):
         assert replace(before, settings={}) == replace(after, settings={})
-    (tmp_path / "results.json").write_text('{"shot": "x"}')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"shot": "x"}',
+        "",
+        "null",
+        "[" * 100_000,
+        '{"shot": "x", "results": [{"metrics": []}], "facts": {}}',
+        '{"shot": "x", "results": "abc", "facts": {}}',
+        '{"shot": "x", "results": [null], "facts": null}',
+        '{"shot": "x", "results": [], "facts": []}',
+    ],
+    ids=lambda text: text[:40],
+)
+def test_a_file_that_is_no_result_is_said_to_be_none(tmp_path: Path, text: str) -> None:
+    """Lists where a mapping was expected, and lists of lists of lists, ended in a traceback."""
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(ValueError, match="is no result of a comparison") as caught:
+        read_comparison(tmp_path / "results.json")
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"), [("peak_bytes", "much"), ("spread", [1]), ("seconds_per_megapixel", {}), ("settings", 3)]
+)
+def test_a_result_with_a_value_of_another_kind_is_none(tmp_path: Path, entry: str, value: object) -> None:
+    document = json.loads(to_json(to_document(Comparison("Hall", tuple(RESULTS)))))
+    document["results"][0][entry] = value
+    (tmp_path / "results.json").write_text(json.dumps(document))
     with pytest.raises(ValueError, match="is no result of a comparison"):
         read_comparison(tmp_path / "results.json")
 
