@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.confidence import estimate_confidence, mix_centre
-from flow.guide import make_guide, pair_guides
+from flow.guide import GuidePair, make_guide, pair_guides
 from flow.motion import compose_flow, forward_backward_error
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
@@ -256,7 +256,7 @@ class Aligner:
         self.pair_facts: dict[tuple[int, int], PairFacts] = {}
         self.estimates: dict[int, Array | None] = {}
         self._flows: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
-        self._chains: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
+        self._chains: dict[tuple[int, int], tuple[Array, Mask]] = {}
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
         """Align the window around frame `number`.
@@ -356,7 +356,8 @@ class Aligner:
 
     def _without_fireflies(self, frame: Frame | None, prepared: PreparedFrame) -> tuple[Frame | None, PreparedFrame]:
         """Take out the single bright samples that neither neighbour shows: before anything is made of the frame."""
-        places = find_fireflies(prepared.irradiance)
+        with self.timings.stage("prepare"):
+            places = find_fireflies(prepared.irradiance)
         if not len(places):
             return frame, prepared
         known = np.zeros(len(places), bool)
@@ -376,23 +377,17 @@ class Aligner:
 
     def flow(self, start: int, end: int) -> tuple[Array, Mask] | None:
         """Flow from frame `start` to frame `end`, chained over the frames between; None beyond a gap or a cut."""
-        if (start, end) not in self._chains:
-            self._chains[start, end] = self._chain(start, end)
-        return self._chains[start, end]
-
-    def _chain(self, start: int, end: int) -> tuple[Array, Mask] | None:
         step = self.shot.step if end > start else -self.shot.step
-        flow: Array | None = None
-        valid: Mask | None = None
-        for a in range(start, end, step):
-            link = self._step(a, a + step)
-            if link is None:
+        if end == start + step:
+            return self._step(start, end)
+        if (start, end) not in self._chains:
+            first, last = self.flow(start, end - step), self._step(end - step, end)
+            if first is None or last is None:
                 return None
-            if flow is None or valid is None:
-                flow, valid = link
-            else:
-                flow, valid = compose_flow(flow, link[0], first_valid=valid, second_valid=link[1])
-        return None if flow is None or valid is None else (flow, valid)
+            with self.timings.stage("flow"):
+                chain = compose_flow(first[0], last[0], first_valid=first[1], second_valid=last[1])
+            self._chains[start, end] = chain
+        return self._chains[start, end]
 
     def _step(self, a: int, b: int) -> tuple[Array, Mask] | None:
         """Flow between neighbouring frames, computed once."""
@@ -401,40 +396,51 @@ class Aligner:
             if here is None or there is None:
                 return None
             with self.timings.stage("flow"):
-                self._flows[a, b] = self._measure_step(here, there)
+                self._flows[a, b], self._flows[b, a] = self._measure_steps(here, there)
         return self._flows[a, b]
 
-    def _measure_step(self, here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
+    def _measure_steps(
+        self, here: PreparedFrame, there: PreparedFrame
+    ) -> tuple[tuple[Array, Mask] | None, tuple[Array, Mask] | None]:
+        """Flows between neighbouring frames, there and back."""
         # What a pair calls for is decided from the pair alone: its flow is the same in every window.
         numbers = sorted((here.number, there.number))
         stages = self.stages_of(numbers)
         shape = here.irradiance.shape[:2]
         if not isinstance(self._decide, _Always) and self._facts_of_pair(*numbers).cut:
-            return None
+            return None, None
         if "warp" not in stages:
-            return np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
+            still = np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
+            return still, still
         dense = "dense-flow" in stages
-        vectors = None if dense else rendered_flow(here, there)
-        if vectors is None and not dense:
-            return None  # something moves, and nobody is to say where to
-        if vectors is not None and "refine" not in stages:
-            return vectors
-        exposure = measure_exposure(here.radiance)
-        guides = pair_guides(
-            make_guide(here.radiance, here.albedo, exposure=exposure),
-            make_guide(there.radiance, there.albedo, exposure=exposure),
+        forth, back = (None, None) if dense else (rendered_flow(here, there), rendered_flow(there, here))
+        if not dense and not ("refine" in stages and (forth or back)):
+            return forth, back  # where there are none, something moves, and nobody is to say where to
+        # Of the earlier frame, so that it is the same from whichever side the pair is seen.
+        exposure = measure_exposure(min(here, there, key=lambda frame: frame.number).radiance)
+        guides = [make_guide(frame.radiance, frame.albedo, exposure=exposure) for frame in (here, there)]
+        return (
+            self._correct(pair_guides(*guides), forth, back, dense=dense),
+            self._correct(pair_guides(*reversed(guides)), back, forth, dense=dense),
         )
-        if vectors is None:
-            return dense_flow(guides), np.ones(shape, bool)
-        flow, valid = vectors
-        back = rendered_flow(there, here)
+
+    def _correct(
+        self, guides: GuidePair, given: tuple[Array, Mask] | None, back: tuple[Array, Mask] | None, *, dense: bool
+    ) -> tuple[Array, Mask] | None:
+        """Find a flow in the pictures, or correct the renderer's where they say that it is wrong."""
+        if dense:
+            return dense_flow(guides), np.ones(guides.centre.shape[:2], bool)
+        if given is None:
+            return None
+        flow, valid = given
         # Hidden in the other frame: whatever matches there is another surface.
         visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
         flow, _ = select_flow([flow, self.refine(guides, flow)], guides, visible=visible)
         return flow, valid
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
-        self._chains = {ab: chain for ab, chain in self._chains.items() if number in ab}
+        # Those of this window serve the later ones, which see the same pairs from the other side.
+        self._chains = {ab: chain for ab, chain in self._chains.items() if set(ab) <= set(numbers)}
         self._expect_alike(number, numbers)
         stages = self.stages_of(numbers)
         if given:
@@ -717,7 +723,8 @@ def planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius
         return 0.0
     made = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
     steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
-    return (2 + 0.25) * (4 * max(radius - 1, 0) + steps)
+    chains = 2 * (radius + 1) * max(radius - 1, 0)
+    return (2 + 0.25) * (chains + steps)
 
 
 def can_refine(stages: Collection[str]) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
+from flow import tvl1
 from flow.guide import Guide, estimate_noise, pair_guides
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
@@ -59,6 +61,38 @@ def test_a_patch_of_wrong_vectors_is_replaced_and_the_rest_is_kept(shot: Shot) -
     # 9 px windows straddle the patch's border; within it half the error is the least that helps.
     assert np.hypot(*np.moveaxis(selected - shot.flow, -1, 0))[36:54, 46:74].mean() < 0.7
     assert (selected[:20] == start[:20]).all()
+
+
+def test_only_the_tiles_that_call_for_it_are_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wrong vectors in the corner where four tiles meet: there as in the whole frame, the rest is kept."""
+    height, width = 330, 470  # neither a multiple of a tile nor even at half size
+    rng = np.random.default_rng(5)
+    picture = np.clip(0.5 + 2 * cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), 2), 0, 1)
+    flow = np.broadcast_to(np.float32([4.25, -2.5]), (height, width, 2))
+    guides = plain(warp(picture, flow, interpolation="bicubic")[0], picture)
+    start = flow.copy()
+    start[110:146, 110:146] += 2
+    tiles = refine_flow(guides, start)
+    # What a tile is not called for keeps its vectors to the bit.
+    kept = np.ones((height, width), bool)
+    kept[:256, :256] = False
+    assert (tiles[kept] == start[kept]).all()
+    monkeypatch.setattr(tvl1, "_MOST_TILES", -1.0)
+    whole = refine_flow(guides, start)
+    assert (whole[kept] != start[kept]).any()  # so that the comparison above says something
+    length = np.hypot(*np.moveaxis(tiles - whole, -1, 0))[110:146, 110:146]
+    assert length.max() < 0.05  # a tenth of what is told from a right vector
+    assert error(tiles[110:146, 110:146], flow[110:146, 110:146]) < 0.2  # the bound the project sets itself
+
+
+def test_where_most_tiles_call_for_it_the_frame_is_refined_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    picture = np.clip(0.5 + 2 * cv2.GaussianBlur(rng.normal(size=(200, 300)).astype(np.float32), (0, 0), 2), 0, 1)
+    flow = np.broadcast_to(np.float32([1.5, -1.0]), (200, 300, 2))
+    guides = plain(warp(picture, flow, interpolation="bicubic")[0], picture)
+    found = refine_flow(guides, np.zeros_like(flow))
+    monkeypatch.setattr(tvl1, "_MOST_TILES", -1.0)
+    np.testing.assert_array_equal(found, refine_flow(guides, np.zeros_like(flow)))
 
 
 def test_dense_flow_needs_no_vectors(shot: Shot) -> None:
