@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.movies import check_movie, write_movie
-from hybrid.files.pictures import encode_srgb, write_png
+from hybrid.files.pictures import encode_bytes, write_png
 from nlm.average import replace_nonfinite
 
 Picture = NDArray[np.uint8]
@@ -164,7 +164,7 @@ class _Pairs:
 
     def _encoded(self, shot: Shot, number: int) -> Picture:
         color, _ = replace_nonfinite(shot.read_color(number))
-        return np.round(encode_srgb(color / self._exposure) * 255).astype(np.uint8)
+        return encode_bytes(color / self._exposure)
 
 
 def _wipe(pairs: _Pairs, rate: float) -> Iterator[Picture]:

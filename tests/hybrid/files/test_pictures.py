@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hybrid.files.pictures import encode_srgb, write_png
+from hybrid.files.pictures import encode_bytes, encode_srgb, write_png
 
 
 def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):
@@ -14,3 +14,12 @@ def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):
     # IEC 61966-2-1: 12.92 · 0.002, and 1.055 x^(1/2.4) − 0.055, times 255; what is beyond is cut.
     np.testing.assert_array_equal(found, [[[7, 118, 255], [0, 255, 188]]])
     assert [file.name for file in path.parent.iterdir()] == ["look.png"]
+
+
+def test_the_table_of_8_bits_gives_what_the_formula_gives():
+    linear = np.linspace(-0.1, 1.1, 100_003, dtype=np.float32).reshape(1, -1, 1)
+    table, formula = encode_bytes(linear), encode_srgb(linear) * 255
+    assert table.shape == linear.shape
+    # Half a step of 8 bits for rounding, and half of a table's step, a twentieth at most.
+    assert np.abs(table - formula).max() < 0.5 + 0.03
+    assert np.array_equal(table[0, [0, -1], 0], [0, 255])
