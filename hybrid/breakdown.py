@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.pictures import encode_srgb, write_png
-from nlm.average import replace_nonfinite
+from nlm.average import average, replace_nonfinite
 
 Array = NDArray[np.float32]
 
@@ -76,6 +77,35 @@ def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
     names = frame_names(len(parts))
     layers = {f"contribution.{name}": part for name, part in zip(names, parts, strict=True)}
     return {**layers, **{f"weight.{name}": weight for name, weight in zip(names, weights, strict=True)}}
+
+
+def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
+    """Layers that say what each stage did where.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        A window.
+    irradiance : (H, W, 3) array
+        What was made of it.
+
+    Returns
+    -------
+    dict of str to (H, W) array
+        All in [0, 1]. ``stage.align``: how far geometry trusts the other frames, their mean, those that are missing
+        aside. ``stage.gate``: the same after their light was compared. ``stage.network``: by which share the result
+        differs from the average of the estimates (of the colors, where there are none) over the frames so weighed,
+        |r − a| / (a + exposure), means over channels.
+    """
+    sides = [index for index in range(len(aligned.color)) if index != aligned.centre and aligned.trust[index].any()]
+    mean = average(aligned.color if aligned.estimate is None else aligned.estimate, aligned.confidence)
+    changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)
+    nothing = np.zeros(irradiance.shape[:2], np.float32)
+    return {
+        "stage.align": aligned.trust[sides].mean(axis=0) if sides else nothing,
+        "stage.gate": aligned.confidence[sides].mean(axis=0) if sides else nothing,
+        "stage.network": np.asarray(np.minimum(changed, 1), np.float32),
+    }
 
 
 def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, path: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import network
 from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
-from hybrid.breakdown import Breakdown, layers_of
+from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.pipeline import Denoised
 from hybrid.timing import Timings
 from network.checkpoint import load_model
@@ -138,7 +138,7 @@ class Denoiser:
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
-            extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3])
+            extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
         return Denoised(irradiance * aligned.modulation, _modulated(aovs, aligned), extra)
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:

@@ -165,7 +165,8 @@ def test_contributions_sum_to_the_result_and_weights_to_one(folder, weights):
     window, counted = align(folder), Breakdown()
     denoised = Denoiser(weights, precision="float32", tile=32, breakdown=counted)(window)
     names = ["before2", "before1", "centre", "after1", "after2"]
-    assert list(denoised.extra) == [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
+    added = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
+    assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
     parts = sum(denoised.extra[f"contribution.{name}"] for name in names)
     np.testing.assert_allclose(parts, denoised.color, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
     shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])
