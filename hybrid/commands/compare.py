@@ -18,6 +18,7 @@ from hybrid.commands.options import (
     LayerOption,
     MotionOption,
     ProfileOption,
+    RateOption,
     StrictOption,
     choose,
     judge_alike,
@@ -108,6 +109,13 @@ def compare(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    fps: RateOption = 24,
+    loops: Annotated[
+        bool,
+        typer.Option(
+            "--loops", help="also write a movie of each method in its own size, beside the page", rich_help_panel=OUTPUT
+        ),
+    ] = False,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -130,6 +138,12 @@ def compare(
         from hybrid.comparison.report import check_report
 
         check_report(output, [folder / "results.json" for folder in beside or ()])
+    if loops:
+        from hybrid.files.movies import check_movie
+
+        if output is None:
+            raise typer.BadParameter("--loops writes beside a page, expected --output with it")
+        check_movie(output / "loop.mp4")
     others = [read_comparison(folder / "results.json") for folder in beside or ()]
     if shot is None or not reference:
         if not others or shot is not None or reference:
@@ -188,7 +202,18 @@ def compare(
 
             judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
             images, truth = report_images(FrameStore(Path(folder)), comparison, judged)
-            page = write_report(output, comparison, images, truth, judged, others=others, exposure=exposure, cost=cost)
+            page = write_report(
+                output,
+                comparison,
+                images,
+                truth,
+                judged,
+                others=others,
+                exposure=exposure,
+                cost=cost,
+                rate=fps,
+                movies=loops,
+            )
             LOG.info(f"wrote {page}")
     _show(markdown, markdown_table([comparison, *others], cost), result_table(comparison.results))
 

@@ -110,7 +110,7 @@ PreviewOption = Annotated[
 ]
 RateOption = Annotated[
     float,
-    typer.Option("--fps", min=1, max=240, help="frames per second of a preview that plays", rich_help_panel=OUTPUT),
+    typer.Option("--fps", min=1, max=240, help="frames per second of what plays", rich_help_panel=OUTPUT),
 ]
 SheetOption = Annotated[
     Path | None,

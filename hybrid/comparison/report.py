@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from hybrid.comparison import chart, page
 from hybrid.comparison.embedding import ReportImages, embed_pictures
+from hybrid.comparison.loops import embed_loops, write_loops
 from hybrid.comparison.results import (
     CHART_METRICS,
     COSTS,
@@ -50,6 +51,9 @@ from hybrid.files.replace import check_outputs, write_file
 
 Array = NDArray[np.float32]
 
+# Frames per second that the page plays at, besides the one asked for.
+RATES = (4, 12, 24, 25, 30, 60)
+LOOPS = "loops"
 FILES = ("report.html", "results.json", "results.csv", "results.md", "chart.png")
 
 
@@ -64,6 +68,8 @@ def write_report(
     exposure: float = 1.0,
     cost: Cost = "seconds_per_megapixel",
     megabytes: float = 24.0,
+    rate: float = 24.0,
+    movies: bool = False,
 ) -> Path:
     """Write ``report.html``, ``results.json``, ``results.csv``, ``results.md`` and ``chart.png`` into a folder.
 
@@ -87,7 +93,12 @@ def write_report(
     cost : str
         One of `COSTS`: what the chart begins with, and what chart.png shows.
     megabytes : float
-        Limit on the embedded pictures. What is left out to keep it is said on the page.
+        Limit on the embedded pictures. What is left out to keep it is said on the page. Loops
+        (`hybrid.comparison.loops`) may take a sixth of it beside.
+    rate : float
+        Frames per second, as the page plays at first.
+    movies : bool
+        Whether the loops are written in their own size too, into a folder ``loops`` beside the page.
 
     Returns
     -------
@@ -101,17 +112,22 @@ def write_report(
     """
     results = comparison.results
     _check(results, images, reference, frames)
-    pictures = None
+    folder = Path(folder)
+    check_report(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures, labels = None, {r.name: r.label for r in results}
     if images and reference is not None:
-        labels = {r.name: r.label for r in results}
         pictures = embed_pictures(images, labels, reference, frames, megabytes * 1e6)
+    loops, beside = None, {}
+    if images and reference is not None and len(frames) > 1:
+        looped = {"exposure": exposure, "rate": rate}
+        loops = embed_loops(images, labels, reference, frames, **looped, limit=megabytes * 1e6 / 6)
+        if movies:
+            beside = write_loops(folder / LOOPS, images, reference, frames, **looped)
     metrics = present_metrics(results, METRICS)
     charted = [m for m in metrics if m.key in CHART_METRICS]
     costs = {key: COSTS[key] for key in (cost, *(c for c in COSTS if c != cost))}
     document = to_document(comparison)
-    folder = Path(folder)
-    check_report(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / "results.json", to_json(document, indent=1))
     write_file(folder / "results.csv", to_csv(results, metrics))
     write_file(folder / "results.md", markdown_table([comparison, *others], cost))
@@ -138,6 +154,10 @@ def write_report(
         stages=stage_values(results),
         shots=_shot_table([comparison, *others]),
         pictures=pictures,
+        loops=loops,
+        movies=[(labels.get(name, "Reference"), file) for name, file in beside.items()],
+        rates=sorted({*RATES, rate}),
+        fps=rate,
         data=to_plain_numbers(
             {
                 **document,
@@ -145,6 +165,7 @@ def write_report(
                 "cost": cost,
                 "exposure": exposure,
                 "pictures": pictures and pictures.info,
+                "loops": loops and loops.info,
             }
         ),
     )
@@ -168,7 +189,7 @@ def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
         If the folder has a file that a report would replace and that no comparison has left there, or that is read.
     """
     check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
-    there = [folder / name for name in FILES if (folder / name).exists()]
+    there = [folder / name for name in (*FILES, LOOPS) if (folder / name).exists()]
     if there and not is_comparison(folder / "results.json"):
         raise ValueError(f"{there[0]} is there, and of no earlier comparison: expected another folder")
 

@@ -23,7 +23,7 @@ from hybrid.comparison.tables import (
 
 # In this order they are one module script: each file is named after the part of the page that it runs.
 SCRIPTS = ("dom.js", "chart.js", "pictures.js", "painter.js", "stage.js", "slices.js", "viewer.js", "controls.js",
-           "start.js")  # fmt: skip
+           "loops.js", "start.js")  # fmt: skip
 
 _templates = Environment(
     loader=PackageLoader("hybrid.comparison", "page"),

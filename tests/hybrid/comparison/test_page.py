@@ -117,7 +117,7 @@ def test_nothing_from_a_name_becomes_markup(tmp_path: Path) -> None:
     page = write_report(tmp_path, Comparison(EVIL, (evil, gone), {EVIL: EVIL}), images, scene(1.0), [8])
     text = page.read_text(encoding="utf-8")
     assert "<img" not in text
-    assert text.count("</script>") == 2 + 3  # data, program; two pictures and a map
+    assert text.count("</script>") == 2 + 3  # data, program; two pictures and a map; one frame plays nothing
     assert text.count("{{data}}") > 5  # never filled in again
     assert "http" not in text.replace('http-equiv="Content-Security-Policy"', "")
 
@@ -168,7 +168,7 @@ def page(browser: Any, report_file: Path) -> Iterator[Any]:
 
 def arrange(page: Any, layout: str) -> None:
     """Choose an arrangement by its label; the radio button itself lies under it."""
-    page.locator(f".segments label:has(input[value={layout}])").click()
+    page.locator(f"#viewer .segments label:has(input[value={layout}])").click()
     until(page, f"document.querySelector('[name=layout][value={layout}]').checked")
 
 
@@ -317,6 +317,54 @@ def test_the_magnifier_shows_both_pictures_where_the_pointer_is(page: Any) -> No
     see(page, shown(page, "noisy"), (start + 180) / box["width"], middle)
 
 
+def loop_color(page: Any, x: float, y: float = 0.5) -> list[int]:
+    script = """([x, y]) => { const c = document.getElementById('loop-canvas');
+        return [...c.getContext('2d').getImageData(x * c.width, y * c.height, 1, 1).data].slice(0, 3); }"""
+    return list(page.evaluate(script, [x, y]))
+
+
+def see_loop(page: Any, method: str, x: float, number: int = 9) -> None:
+    """Wait until a place of the loops shows a method, as WebP with loss has it: within 6 of 255."""
+    level = LEVELS["reference"] * 1.5  # of the middle frame
+    ev = round(2 * float(np.log2(0.35 / (EXPOSURE * level)))) / 2
+    expected = shown(page, method, number, ev)
+    for _ in range(100):
+        found = loop_color(page, x)
+        if max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= 6:
+            return
+        page.wait_for_timeout(50)
+    pytest.fail(f"at {x:.2f} the loop is {found}, expected {expected}, {method} at frame {number}")
+
+
+def test_loops_of_any_two_methods_play_together(page: Any) -> None:
+    page.locator("#loops").scroll_into_view_if_needed()
+    see_loop(page, "noisy", 0.25, 8)
+    see_loop(page, "final", 0.75, 8)
+    page.select_option("#loop-right", label="Average")
+    see_loop(page, "average", 0.75, 8)
+    page.locator("#loop-frame").focus()
+    page.keyboard.press("ArrowRight")
+    until(page, "document.getElementById('loop-frame-text').textContent === 'frame 9'")
+    see_loop(page, "average", 0.75, 9)
+    see_loop(page, "noisy", 0.25, 9)
+    page.locator("#loop-split").focus()
+    page.keyboard.press("End")
+    see_loop(page, "noisy", 0.95, 9)
+    page.locator("label:has(input[name=loop-layout][value=pair])").click()
+    see_loop(page, "average", 0.95, 9)
+    assert page.locator("#loop-split").is_hidden()
+    page.locator("label:has(input[name=loop-layout][value=flicker])").click()
+    for method in ("noisy", "average", "noisy"):
+        see_loop(page, method, 0.5, 9)
+    page.select_option("#loop-rate", "60")
+    page.locator("#loop-play").click()
+    for number in (10, 8):
+        until(page, f"document.getElementById('loop-frame-text').textContent === 'frame {number}'")
+    page.locator("#loop-play").click()
+    assert page.locator("#loop-play").get_attribute("aria-pressed") == "false"
+    assert page.input_value("#rate") == "24"
+
+
 def test_one_pixel_is_where_it_belongs(page: Any) -> None:
     page.locator("#divider").focus()
     page.keyboard.press("End")
@@ -391,10 +439,11 @@ def test_a_family_can_be_hidden(page: Any) -> None:
 
 def test_everything_is_reached_with_the_tab_key(page: Any) -> None:
     reached = set()
-    for _ in range(60):
+    for _ in range(80):
         page.keyboard.press("Tab")
         reached.add(page.evaluate("document.activeElement.id || document.activeElement.getAttribute('class')"))
     wanted = {"axis-up", "axis-over", "left", "right", "view", "ev", "canvas", "divider", "play", "frame", "row"}
+    wanted |= {"loop-left", "loop-right", "loop-split", "loop-play", "loop-frame", "loop-rate"}
     assert wanted <= reached
 
 
