@@ -48,6 +48,9 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
         ours.recv(1)
         if not left.wait(PATIENCE):
             remove_unfinished()
+            from hybrid.files.exr import hold_library
+
+            hold_library(PATIENCE)  # or the report would go where the library's messages do
             report()
             sys.stderr.flush()
             os._exit(INTERRUPTED)

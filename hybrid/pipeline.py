@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
+from hybrid.beside import ReadAhead
 from hybrid.estimates import EstimateSource
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
@@ -68,6 +71,7 @@ class Finished:
     plan: Plan | None = None  # which stages ran, and why
     resumed: bool = False  # it was there already
     again: str = ""  # why it was made again, if it was there and an earlier run was to be resumed
+    seconds: float = 0.0  # that it took, but for what was read and written beside the work
 
 
 def check_written(
@@ -115,12 +119,16 @@ def denoise_frames(
     others: Sequence[tuple[Shot, Estimates | None]] = (),
     attributes: Mapping[str, str] | None = None,
     rows: int | None = None,
+    beside: bool = True,
     resume: bool = False,
     keep_going: bool = False,
     timings: Timings | None = None,
     before: SourcesOf | None = None,
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
+
+    While a frame is made, the next one that its successor needs is read in one thread, and the frame before it is
+    written in another.
 
     Parameters
     ----------
@@ -142,6 +150,9 @@ def denoise_frames(
         Written to the header of each file.
     rows : int, optional
         How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); all without. The result is the same.
+    beside : bool
+        Whether to read and write beside the work, which takes the memory of a frame that is read and one that is
+        written.
     resume : bool
         Leave frames alone that are there, whole, and would be made the same: with these attributes, of the same files.
     keep_going : bool
@@ -154,7 +165,8 @@ def denoise_frames(
     Yields
     ------
     Finished or Failed
-        After each frame has been written as a whole; or with `keep_going`, when it is given up.
+        In the order of the frames, each after it has been written as a whole, or with `keep_going`, given up; most
+        often when the next one has been made.
 
     Raises
     ------
@@ -169,60 +181,103 @@ def denoise_frames(
     """
     timings = timings or Timings()
     all_pictures = ((shot, estimates), *others)
-    aligner, *beside = (
-        Aligner(picture, rules, radius=radius, estimates=theirs, timings=timings) for picture, theirs in all_pictures
-    )
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
     sources = sources_of(all_pictures, radius, before)
     reach = reach_of(estimates, radius)
-    for number, path in paths.items():
-        try:
+    with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
+        readers = [ReadAhead(picture, reader, timings) for picture, _ in all_pictures]
+        aligners = [
+            Aligner(frames, rules, radius=radius, estimates=theirs, timings=timings)
+            for frames, (_, theirs) in zip(readers, all_pictures, strict=True)
+        ]
+
+        def make(number: int, following: int | None) -> Finished | Callable[[], Finished]:
+            """Make a frame; give what writes it, or what there is to say of one that is there."""
+            started, path = time.perf_counter(), paths[number]
             read_as = [picture.taken(number) for picture, _ in all_pictures]
             made_from = describe_sources(sources(number), layers=read_as, size=list(shot.shape))
             again = why_stale(path, {**(attributes or {}), MADE_FROM: made_from}) if resume else ""
             if again is None:
-                yield Finished(number, path, resumed=True)
-                continue
-            denoised, aligned = _denoise_frame(aligner, number, denoise, rows or shot.shape[0])
-            counted, pictures = [aligned], []
-            for (picture, _), other in zip(others, beside, strict=True):
-                theirs, counts = _denoise_frame(other, number, denoise, rows or shot.shape[0])
-                pictures.append((picture, {"color": theirs.color, **theirs.aovs}, theirs.extra))
-                counted.append(counts)
-            plan = as_run(rules.plan(*aligner.facts_of(aligner.around(number, radius))), aligned.stages)
+                return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
+            # The outermost frames are read only where something shines in the one beside them, or by a later window.
+            near = shot.near(number, reach - 1)
+            if following is not None:
+                near += shot.near(following, reach - (following == shot.numbers[-1]))
+            for frames in readers:
+                frames.expect(near if beside else ())
+            made = [_denoise_frame(aligner, number, denoise, rows or shot.shape[0]) for aligner in aligners]
+            counted = [counts for _, counts in made]
+            facts = aligners[0].facts_of(aligners[0].around(number, radius))
+            plan = as_run(rules.plan(*facts), counted[0].stages)
+            layers = [{"color": denoised.color, **denoised.aovs} for denoised, _ in made]
             with timings.stage("check"):
-                images = {"color": denoised.color, **denoised.aovs}
-                _check_picture(images, aligner, number)
-                for (_, layers, _), other in zip(pictures, beside, strict=True):
-                    _check_picture(layers, other, number)
-            with timings.stage("write"):
-                own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}
-                for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
-                    if read is not None:
-                        read.check_unchanged(n for n in shot.near(number, reach) if read.has(n))
-                clamped = shot.write(path, number, images, denoised.extra, {**(attributes or {}), **own}, pictures)
+                for aligner, images in zip(aligners, layers, strict=True):
+                    _check_picture(images, aligner, number)
+            own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}
+            pictures = [
+                (picture, images, denoised.extra)
+                for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
+            ]
+            extra = made[0][0].extra
             finished = Finished(
                 number=number,
                 path=path,
-                pixels=denoised.color[..., 0].size * len(counted),
+                pixels=layers[0]["color"][..., 0].size * len(counted),
                 repaired=sum(counts.repaired for counts in counted),
                 fireflies=sum(counts.fireflies for counts in counted),
                 removed=max(counts.removed for counts in counted),
                 outliers=sum(counts.outliers for counts in counted),
-                clamped=clamped,
                 plan=plan,
                 again=again,
+                seconds=time.perf_counter() - started,
             )
-            del denoised, aligned, pictures  # or they would still be there while the next window is made
-        except (ValueError, OSError) as error:
-            if not keep_going:
-                raise
-            yield Failed(number, error)
-        else:
-            yield finished
+
+            def write() -> Finished:
+                with timings.beside("write"):
+                    for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
+                        if read is not None:
+                            read.check_unchanged(n for n in shot.near(number, reach) if read.has(n))
+                    headed = {**(attributes or {}), **own}
+                    return replace(finished, clamped=shot.write(path, number, layers[0], extra, headed, pictures))
+
+            return write
+
+        written: tuple[int, Future[Finished]] | None = None
+
+        def settle() -> list[Finished | Failed]:
+            """What became of the frame that was being written, if one was."""
+            nonlocal written
+            if written is None:
+                return []
+            (number, waited), written = written, None
+            try:
+                with timings.stage("write"):
+                    return [waited.result()]
+            except (ValueError, OSError) as error:
+                if not keep_going:
+                    raise
+                return [Failed(number, error)]
+
+        for number, following in zip(paths, (*shot.numbers[1:], None), strict=True):
+            outcome: Finished | Failed | Callable[[], Finished]
+            try:
+                outcome = make(number, following)
+            except (Exception, KeyboardInterrupt) as error:
+                if not keep_going or not isinstance(error, ValueError | OSError):
+                    yield from settle()  # the frame before has been made all the same
+                    raise
+                outcome = Failed(number, error)
+            told = settle()
+            if isinstance(outcome, Finished | Failed):
+                told.append(outcome)
+            else:
+                written = number, writer.submit(outcome)
+            del outcome  # or the pictures would still be there while the next window is made
+            yield from told if beside else (*told, *settle())
+        yield from settle()
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import resource
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +14,20 @@ from pathlib import Path
 
 @dataclass
 class Stage:
-    """What one stage has cost so far: wall and CPU seconds, calls, and the process's peak memory after it."""
+    """What one stage has cost so far: wall and CPU seconds, calls, and the process's peak memory after it.
+
+    What goes on in a thread beside the work (`Timings.beside`) costs CPU seconds, and wall seconds only where it is
+    waited for.
+    """
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     calls: int = 0
     peak_bytes: int = 0
+
+
+# What tells the CPU time of another thread. Where it is missing (macOS) that counts when the thread's work has ended.
+_CLOCK_OF: Callable[[int], int] | None = getattr(time, "pthread_getcpuclockid", None)
 
 
 class Timings:
@@ -29,18 +38,51 @@ class Timings:
 
     def __init__(self) -> None:
         self.stages: dict[str, Stage] = {}
+        self._lock = threading.Lock()
+        # CPU seconds of what goes on beside the work: of what has ended, and the clocks of what has not.
+        self._ended = 0.0
+        self._running: dict[int, tuple[int, float]] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count what happens inside the ``with`` block as stage `name`."""
-        wall, cpu = time.perf_counter(), time.process_time()
+        """Count what happens inside the ``with`` block as stage `name`, less what goes on beside it."""
+        wall, cpu = time.perf_counter(), self._cpu_time()
         try:
             yield
         finally:
+            self._add(name, time.perf_counter() - wall, self._cpu_time() - cpu, calls=1)
+
+    @contextmanager
+    def beside(self, name: str) -> Iterator[None]:
+        """Count the CPU time of the ``with`` block, in a thread beside the work that takes it alone, as stage `name`'s.
+
+        Libraries that would start threads of their own in it are counted with the stage of the work.
+        """
+        thread, start = threading.get_ident(), time.thread_time()
+        if _CLOCK_OF is not None:
+            with self._lock:
+                self._running[thread] = _CLOCK_OF(thread), start
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._running.pop(thread, None)
+                spent = time.thread_time() - start
+                self._ended += spent
+            self._add(name, 0.0, spent, calls=0)
+
+    def _cpu_time(self) -> float:
+        """CPU seconds of the process, but for what has gone on beside the work."""
+        with self._lock:
+            beside = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
+            return time.process_time() - self._ended - beside
+
+    def _add(self, name: str, wall: float, cpu: float, *, calls: int) -> None:
+        with self._lock:
             entry = self.stages.setdefault(name, Stage())
-            entry.seconds += time.perf_counter() - wall
-            entry.cpu_seconds += time.process_time() - cpu
-            entry.calls += 1
+            entry.seconds += wall
+            entry.cpu_seconds += cpu
+            entry.calls += calls
             entry.peak_bytes = max(entry.peak_bytes, peak_memory())
 
     def rows(self, pixels: int) -> list[tuple[str, str, str, str]]:

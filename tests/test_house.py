@@ -107,7 +107,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/interrupt.py",
     "hybrid/memory.py",
     "hybrid/neural/train.py",
-    "hybrid/pipeline.py",
     "hybrid/simulate/evaluation.py",
     "hybrid/simulate/fixed.py",
     "hybrid/simulate/motion.py",

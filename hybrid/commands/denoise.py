@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -590,12 +589,12 @@ def _denoise(job: Job, record: Record) -> None:
         others=[(picture, theirs.estimates) for picture, theirs in job.others],
         attributes=attributes,
         rows=rows,
+        beside=limit is None,
         resume=job.resume,
         keep_going=job.keep_going,
         timings=timings,
         before=job.before,
     )
-    started = time.perf_counter()
     for finished in frames:
         if isinstance(finished, Failed):
             words = one_line(finished.error)
@@ -603,7 +602,6 @@ def _denoise(job: Job, record: Record) -> None:
             record.add(finished.number, "failed", error=words)
             record.write(timings)
             progress.advance(message=f"frame {finished.number} failed", frame=finished.number)
-            started = time.perf_counter()
             continue
         pixels += finished.pixels
         outliers += finished.outliers
@@ -619,7 +617,7 @@ def _denoise(job: Job, record: Record) -> None:
             LOG.warning(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
         if finished.clamped:
             LOG.warning(f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504")
-        seconds, started = round(time.perf_counter() - started, 3), time.perf_counter()
+        seconds = round(finished.seconds, 3)
         state, words = ("there", "was there") if finished.resumed else ("made", f"{seconds:.1f} s")
         facts = {"file": finished.path.name, "seconds": seconds, "light_removed": finished.removed}
         stages = sorted(finished.plan.stages) if finished.plan else None

@@ -403,6 +403,17 @@ class _Listener:
 _LIBRARY_LOCK = threading.Lock()
 
 
+def hold_library(seconds: float) -> None:
+    """Let nothing be read or written from now on, once what is under way has ended: descriptor 2 is the process's own.
+
+    Parameters
+    ----------
+    seconds : float
+        How long to wait for that.
+    """
+    _LIBRARY_LOCK.acquire(timeout=seconds)
+
+
 @contextmanager
 def _library_messages() -> Iterator[list[str]]:
     """Gather what OpenEXR says about a damaged file, which it prints instead of raising.

@@ -218,6 +218,7 @@ class Shot:
         self._held: OrderedDict[int, Frame] = OrderedDict()
         self._states: dict[Path, Source] = {}
         self._known: dict[object, Layers] = {}
+        self._kinds: dict[Path, object] = {}
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -362,14 +363,16 @@ class Shot:
         return self._read(self.path(number))
 
     def layers(self, number: int) -> Layers:
-        """Which channels of a frame's file are taken for what; reads the header only.
+        """Which channels of a frame's file are taken for what; reads the header only, if it has not been read yet.
 
         Raises
         ------
         ExrError
             If the file cannot be read, lacks a layer, or has another one where the first frame has its own.
         """
-        return self._find(self.header(number))
+        path = self.path(number)
+        kind = self._kinds.get(path)
+        return self._find(self.header(number)) if kind not in self._known else self._like_first(path, self._known[kind])
 
     def taken(self, number: int) -> str:
         """What is taken for what of a frame, and how it is read, in words: where these differ, so does the picture."""
@@ -384,19 +387,29 @@ class Shot:
 
     def _find(self, image: ExrImage) -> Layers:
         """The layers of a file, which must be those of the first frame; a guide may be missing."""
-        layers, first = self._find_alone(image), self._first_layers
+        return self._like_first(image.path, self._known[self._kind(image)])
+
+    def _like_first(self, path: Path, found: Layers) -> Layers:
+        layers, first = self._as_judged(found), self._first_layers
         for role in (*ROLES, "target"):
             here, there = getattr(layers, role), getattr(first, role)
             if here is not None and there is not None and here.channels != there.channels:
-                raise ExrError(f"{image.path}: {role} is {here}, that of frame {self.numbers[0]} is {there}")
+                raise ExrError(f"{path}: {role} is {here}, that of frame {self.numbers[0]} is {there}")
         return layers
 
     def _find_alone(self, image: ExrImage) -> Layers:
-        # Files of the same channels have the same layers: found once, not with every header that is read.
+        return self._as_judged(self._known[self._kind(image)])
+
+    def _kind(self, image: ExrImage) -> object:
+        """What a file has, by which its layers are known: found once, not with every header that is read."""
         kind = tuple((part.name, part.view, tuple(part.channels)) for part in image.parts)
         if kind not in self._known:
             self._known[kind] = find_layers(image, self._overrides, self.profile, self._aovs, self._elsewhere)
-        found = self._known[kind].without(self._left_out)
+        self._kinds[image.path] = kind
+        return kind
+
+    def _as_judged(self, layers: Layers) -> Layers:
+        found = layers.without(self._left_out)
         if found.motion is not None and self._convention is not None:
             found = replace(found, motion_convention=self._convention)
         return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)

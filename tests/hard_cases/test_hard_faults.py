@@ -216,6 +216,35 @@ def test_a_stop_is_heard_in_the_midst_of_compiled_code(tmp_path, number):
     assert list(tmp_path.iterdir()) == []
 
 
+READING = """
+import hashlib, os, sys, threading, time
+from hybrid.files import exr
+from hybrid.interrupt import interruptible
+
+def read():
+    with exr._library_messages():
+        os.write(1, b"begun\\n")
+        time.sleep(1.5)
+
+with interruptible(lambda: print("2 of 5", file=sys.stderr, flush=True)):
+    threading.Thread(target=read, daemon=True).start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000_000)
+"""
+
+
+def test_the_report_of_a_stop_is_seen_while_a_file_is_read_beside_the_work():
+    """Messages of the library for files are listened for on the descriptor that the report goes to."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    child = subprocess.Popen(
+        [sys.executable, "-c", READING], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert child.stdout.readline() == "begun\n"
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert said == "2 of 5\n"
+
+
 WRITING = """
 import pathlib, sys, time
 from hybrid.files.replace import replace_file

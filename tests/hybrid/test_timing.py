@@ -1,5 +1,7 @@
 import subprocess
 import sys
+import threading
+import time
 from contextlib import suppress
 
 import numpy as np
@@ -25,6 +27,38 @@ def test_a_stage_that_fails_is_counted_too():
     with pytest.raises(KeyError), timings.stage("flow"):
         raise KeyError
     assert timings.stages["flow"].calls == 1
+
+
+def burn(seconds):
+    start = time.thread_time()
+    while time.thread_time() - start < seconds:
+        pass
+
+
+def test_what_goes_on_beside_the_work_is_counted_there_and_not_with_the_work():
+    """CPU time, not the clock: half a second of it in a thread, over two stages of the work."""
+    timings, half = Timings(), threading.Event()
+
+    def read():
+        with timings.beside("read"):
+            burn(0.25)
+            half.set()
+            burn(0.25)
+
+    thread = threading.Thread(target=read)
+    with timings.stage("warp"):
+        thread.start()
+        assert half.wait(60)
+    with timings.stage("flow"):
+        thread.join()
+    with timings.stage("check"):
+        burn(0.1)
+    stages = timings.stages
+    assert stages["read"].cpu_seconds == pytest.approx(0.5, rel=0.2)
+    assert stages["read"].seconds == 0
+    assert stages["warp"].cpu_seconds < 0.1
+    assert stages["flow"].cpu_seconds < 0.1
+    assert stages["check"].cpu_seconds == pytest.approx(0.1, rel=0.5)
 
 
 PEAK = """
