@@ -94,10 +94,10 @@ class Trunk(nn.Module):
         self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
         for widths in ENCODERS[config.size]:
             skips.append(width)
-            self.encoder.append(_convolutions(width, widths))
+            self.encoder.append(_Convolutions(width, widths))
             width = widths[-1]
         for skip, widths in zip(reversed(skips[:-1]), DECODERS[config.size], strict=True):
-            self.decoder.append(_convolutions(width + skip, widths))
+            self.decoder.append(_Convolutions(width + skip, widths))
             width = widths[-1]
         self.last = nn.Conv2d(width, 3, 3, padding=1)
 
@@ -182,13 +182,35 @@ class Trunk(nn.Module):
         return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
 
 
-def _convolutions(width: int, widths: Sequence[int]) -> nn.Sequential:
-    """3×3 convolutions to these widths, a ReLU after each."""
-    layers: list[nn.Module] = []
-    for following in widths:
-        layers += [nn.Conv2d(width, following, 3, padding=1), nn.ReLU(inplace=True)]
-        width = following
-    return nn.Sequential(*layers)
+class _Convolutions(nn.Sequential):
+    """3×3 convolutions, a ReLU after each.
+
+    On CPUs that have bfloat16 torch compiles the two into one operation; called without its compiler, it gives the same
+    bits in two thirds of the time: the ReLU alone reads and writes all features once more.
+    """
+
+    def __init__(self, width: int, widths: Sequence[int]) -> None:
+        layers: list[nn.Module] = []
+        for following in widths:
+            layers += [nn.Conv2d(width, following, 3, padding=1), nn.ReLU(inplace=True)]
+            width = following
+        super().__init__(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Run them."""
+        fused = _FUSED and not torch.is_grad_enabled() and x.dtype == torch.bfloat16 and x.device.type == "cpu"
+        one = [1, 1]  # stride, padding and dilation
+        for layer in self:
+            if not fused:
+                x = layer(x)
+            elif isinstance(layer, nn.Conv2d):
+                weights = layer.weight, layer.bias
+                x = torch.ops.mkldnn._convolution_pointwise(x, *weights, one, one, one, 1, "relu", [], "")
+        return x
+
+
+# Where oneDNN is built in; elsewhere the two run one after the other.
+_FUSED = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("torch")
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from network import trunk
 from network.trunk import (
@@ -400,3 +400,19 @@ def test_curves_and_their_inverses() -> None:
     assert pu_inverse(torch.zeros(1)).item() == 0
     y = torch.linspace(0, 1, 400)
     torch.testing.assert_close(srgb_inverse(srgb_forward(y)), y, rtol=0, atol=1e-6)
+
+
+@pytest.mark.skipif(not trunk._FUSED, reason="torch without oneDNN")
+def test_fused_convolutions_give_the_same_bits(made_up: Trunk, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = torch.rand(1, made_up.config.inputs, 48, 64, generator=torch.Generator().manual_seed(1))
+    rounded = round_trunk(made_up)
+    apart: list[nn.Module] = []
+    for layer in rounded.modules():
+        if isinstance(layer, nn.ReLU):
+            layer.register_forward_hook(lambda module, *_: apart.append(module))
+    with torch.no_grad():
+        fused = rounded(picture)
+        assert not apart
+        monkeypatch.setattr(trunk, "_FUSED", False)
+        assert torch.equal(fused, rounded(picture))
+    assert apart
