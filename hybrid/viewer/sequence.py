@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.exr import ExrImage, Layer, component_of, read_exr
-from hybrid.files.layers import Layers, find_layers
+from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, read_exr
+from hybrid.files.layers import Layers, find_colors, find_layers
 from hybrid.files.pictures import encode_srgb
+from hybrid.files.profile import find_profile
 from hybrid.files.sequences import find_files, parse_frames
 from hybrid.files.sources import MADE_FROM
 from hybrid.records import read_records, sequence_name
@@ -72,14 +73,14 @@ class Sequence:
     def layers(self, number: int) -> tuple[list[str], str]:
         """Names of the layers of a frame, and of the one to begin with; from the header."""
         image = read_exr(self._path(number), pixels=False)
-        taken = find_layers(image)
+        taken = _layers(image)
         first = taken.target if self.finished else taken.color
         return [_name(layer) for layer in image.layers], _name(first)
 
     def exposure(self, number: int) -> float:
         """What the color of a frame is divided by for a mean of 0.18."""
         image = read_exr(self._path(number))
-        color, _ = replace_nonfinite(image.pixels(find_layers(image).color.channels))
+        color, _ = replace_nonfinite(image.pixels(_layers(image).color.channels))
         return float(measure_exposure(color) / 0.18)
 
     def picture(self, number: int, name: str, gain: float, ev: float) -> Picture:
@@ -119,7 +120,7 @@ class Sequence:
         if pixels is None:
             pixels = _on_display_window(image, layer)
             self._keep(key, pixels)
-        return self._encode(pixels, layer, find_layers(image), gain, ev)
+        return self._encode(pixels, layer, _layers(image), gain, ev)
 
     def facts(self, number: int) -> dict[str, Any]:
         """What a frame's header says of its making, and the mean weight of each frame of its window, if it has them."""
@@ -132,12 +133,15 @@ class Sequence:
             settings = json.loads(made.get("settings", "{}")).items()
             made = {name: value for name, value in made.items() if name != "settings"}
             made |= {name: str(value) for name, value in settings if value not in (None, False)}
+        # Of one of several pictures they are called after it: Back.Combined.weight.before1.
         weights = {
-            layer.name.removeprefix("weight."): layer for layer in image.layers if layer.name.startswith("weight.")
+            layer.name.replace("weight.", ""): layer
+            for layer in image.layers
+            if "weight" in layer.name.split(".")[-2:-1]
         }
         if weights:
             image = read_exr(path)
-        ordered = sorted(weights, key=lambda name: _time_of(name))
+        ordered = sorted(weights, key=_time_of)
         means = {name: float(image.pixels(weights[name].channels).mean()) for name in ordered}
         return {"file": path.name, "made": made, "weights": means}
 
@@ -184,10 +188,20 @@ class Sequence:
             return self._ranges[name]
 
 
-def _time_of(name: str) -> int:
-    """Where a frame of the window stands in time: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
+def _layers(image: ExrImage) -> Layers:
+    """What is taken for what; of files with several pictures, of the first."""
+    try:
+        return find_layers(image)
+    except ExrError:
+        profile = find_profile(image)
+        return find_layers(image, {"color": find_colors(image, profile)[0]}, profile)
+
+
+def _time_of(name: str) -> tuple[str, int]:
+    """Of which picture, and where in time: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
+    picture, _, name = name.rpartition(".")
     digits = name.strip("abcdefghijklmnopqrstuvwxyz")
-    return (-1 if name.startswith("before") else 1) * int(digits or 0)
+    return picture, (-1 if name.startswith("before") else 1) * int(digits or 0)
 
 
 def _name(layer: Layer) -> str:

@@ -161,6 +161,22 @@ def test_facts_tell_how_a_frame_was_made_and_what_its_neighbours_weigh(tmp_path)
     assert list(facts["weights"].items()) == list(weights.items()), "in the order of time"
 
 
+def test_of_several_pictures_the_first_is_shown_and_the_weights_of_all_are_told(tmp_path):
+    flat = np.ones((4, 4), np.float32)
+    layers = {f"{name}.Combined": np.ones((4, 4, 3), np.float32) for name in ("Back", "Front")}
+    layers |= {
+        f"{name}.Combined.weight.{frame}": flat / 2 for name in ("Back", "Front") for frame in ("centre", "before1")
+    }
+    write_layers(tmp_path / "a.1.exr", layers)
+    watched = Sequence(str(tmp_path), finished=True)
+    names, first = watched.layers(1)
+    assert first == "Back.Combined"
+    assert {"Front.Combined", "Front.Combined.weight.centre"} <= set(names)
+    assert watched.picture(1, "Front.Combined", 1, 0).mean() == 255
+    told = watched.facts(1)["weights"]
+    assert list(told) == [f"{name}.Combined.{frame}" for name in ("Back", "Front") for frame in ("before1", "centre")]
+
+
 def test_the_record_is_what_lies_beside_the_frames(tmp_path):
     Scene(frames=1).write(tmp_path)
     watched = Sequence(str(tmp_path), finished=True)
