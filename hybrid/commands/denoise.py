@@ -575,7 +575,8 @@ def _denoise(job: Job, record: Record) -> None:
         "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
     }
     judged = list(job.judgement.findings)
-    record.write(timings, layers=layers, judged=[vars(finding) for finding in judged])
+    judgement = [vars(finding) for finding in judged]
+    record.write(timings, layers=layers, warnings=shot.warnings, judged=judgement)
     pixels, outliers = 0, 0
     plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))

@@ -276,6 +276,17 @@ def test_a_cut_anywhere_is_noticed_said_once_and_nothing_is_averaged_over_it(tmp
         np.testing.assert_array_equal(made[number], alone[number])
 
 
+def test_a_gap_in_the_numbers_is_said_and_in_the_record(tmp_path) -> None:
+    spec = write(tmp_path / "gap")
+    (tmp_path / "gap" / "shot.0011.exr").unlink()
+    _, said = denoised(spec, tmp_path / "out", "--preset", "draft")
+    words = "missing frames 11: the windows beside them are narrower"
+    assert warnings(said) == [f"warning: {words}"]
+    (record,) = (tmp_path / "out" / "ravg").glob("*.json")
+    assert json.loads(record.read_text())["warnings"] == [words]
+    assert stops(spec)
+
+
 def test_a_light_that_is_switched_on_is_no_cut(tmp_path) -> None:
     def edit(index: int, channels: Channels) -> None:
         if index >= 2:
