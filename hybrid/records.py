@@ -244,13 +244,51 @@ def goes_on(document: Mapping[str, Any]) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
+    """A record; None where the file is none, or says of anything what cannot be."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return None
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return document if _is_record(document) else None
+    except (OSError, ValueError, RecursionError):
         return None
-    if not isinstance(document, dict) or not {"ravg", "asked", "frames", "started", "state"} <= document.keys():
-        return None
-    return document
+
+
+def _is_record(document: Any) -> bool:
+    """Whether a document is what `Record` writes: what is read of it elsewhere is there, and of its kind."""
+    if not isinstance(document, dict):
+        return False
+    get = document.get
+    texts, times = ("state", "host", "ravg"), ("started",)
+    return (
+        all(isinstance(get(name), str) for name in texts)
+        and all(_is_amount(get(name)) for name in times)
+        and all(_is_amount(get(name, 0)) for name in ("updated", "peak_bytes"))
+        and isinstance(get("error", ""), str)
+        and type(get("process")) is int
+        and 0 < document["process"] < 2**31
+        and isinstance(get("asked"), list)
+        and len(document["asked"]) > 0
+        and all(type(number) is int and abs(number) < 2**63 for number in document["asked"])
+        and isinstance(get("frames"), dict)
+        and all(_is_entry(number, entry) for number, entry in document["frames"].items())
+    )
+
+
+def _is_entry(number: str, entry: Any) -> bool:
+    if not (re.fullmatch("-?[0-9]{1,19}", number) and isinstance(entry, dict)):
+        return False
+    if entry.get("state") == "failed":
+        return isinstance(entry.get("error"), str)
+    file = entry.get("file")
+    # A name alone: what lies in another folder is no frame of this one.
+    plain = isinstance(file, str) and file not in ("", ".", "..") and not {"/", "\0"} & {*file}
+    return entry.get("state") in ("made", "there") and plain and _is_amount(entry.get("seconds"))
+
+
+def _is_amount(value: Any) -> bool:
+    """Whether this is a number of seconds or bytes."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def _range(numbers: Sequence[int]) -> str:

@@ -100,6 +100,62 @@ def test_another_file_is_not_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d.update(asked=None),
+        lambda d: d.update(asked=[]),
+        lambda d: d.update(asked=["1"]),
+        lambda d: d.update(asked=[10**400]),
+        lambda d: d.update(frames=[]),
+        lambda d: d.update(started="yesterday"),
+        lambda d: d.update(started=float("inf")),
+        lambda d: d.update(state={}),
+        lambda d: d.update(host=None),
+        lambda d: d.update(process=-1),
+        lambda d: d.update(process=10**30),
+        lambda d: d.update(peak_bytes="much"),
+        lambda d: d.update(error=[]),
+        lambda d: d["frames"].update({"x": {"state": "made"}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": 3, "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "../1.exr", "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "/dev/null", "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "a\0", "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "1.exr", "seconds": "x"}}),
+        lambda d: d["frames"].update({"1": {"state": "failed"}}),
+        lambda d: d["frames"].update({"1": None}),
+    ],
+)
+def test_a_record_that_says_what_cannot_be_is_none(tmp_path, change):
+    """Status ended in tracebacks, and believed in frames that lay elsewhere."""
+    (tmp_path / "1.exr").touch()
+    record = Record(tmp_path, "shot", [1])
+    record.add(1, "made", file="shot.1.exr", seconds=1.0)
+    record.write(Timings())
+    assert len(list(read_records(tmp_path))) == 1
+    document = json.loads(record.path.read_text())
+    change(document)
+    record.path.write_text(json.dumps(document))
+    assert list(read_records(tmp_path)) == []
+    with pytest.raises(ValueError, match="no record of ravg"):
+        Record(tmp_path, "shot", [1])
+
+
+@pytest.mark.parametrize("kind", ["nested", "pipe", "folder", "link to itself"])
+def test_what_is_no_file_among_the_records_is_left_out(tmp_path, kind):
+    made(tmp_path, Record(tmp_path, "shot", [1]), 1)
+    path = tmp_path / FOLDER / "other.1.json"
+    if kind == "nested":
+        path.write_text("[" * 100_000)
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(path)
+    assert gather_status(tmp_path).finished == {1}
+
+
+@pytest.mark.parametrize(
     ("file", "name"), [("a.0001.exr", "a"), ("a_v2-7.exr", "a_v2"), ("done.exr", "done"), ("0001.exr", "")]
 )
 def test_names_of_sequences(tmp_path, file, name):
