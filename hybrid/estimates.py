@@ -307,7 +307,7 @@ class Kept:
         """
         path, shot = self.places[frame.number], self._shot
         files = shot.states(shot.near(frame.number, self._reach))
-        made_from = describe_sources(files, layers=shot.taken(frame.number), **self._facts)
+        made_from = describe_sources(files, frame=frame.number, layers=shot.taken(frame.number), **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
                 raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")

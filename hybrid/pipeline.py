@@ -198,7 +198,8 @@ def denoise_frames(
             """Make a frame; give what writes it, or what there is to say of one that is there."""
             started, path = time.perf_counter(), paths[number]
             read_as = [picture.taken(number) for picture, _ in all_pictures]
-            made_from = describe_sources(sources(number), layers=read_as, size=list(shot.shape))
+            # With its number: in a shot that one window holds, all frames are made from the same files.
+            made_from = describe_sources(sources(number), frame=number, layers=read_as, size=list(shot.shape))
             again = why_stale(path, {**(attributes or {}), MADE_FROM: made_from}) if resume else ""
             if again is None:
                 return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)

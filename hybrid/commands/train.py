@@ -305,8 +305,12 @@ def train(
     Fine-tune on your own footage, without any reference: ravg prepare it, then --init fast --rate 1e-4.
     """
     import_neural()
+    from hybrid.files.replace import check_outputs
     from hybrid.neural import train_network
 
+    read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
+    read += [(what, Path(path)) for what, path in (("init", init), ("vgg", vgg)) if path and Path(path).is_file()]
+    check_outputs([("output", output), ("state", Path(f"{output}.state"))], read)
     config = TrainConfig(
         steps=steps,
         minutes=minutes,

@@ -333,14 +333,16 @@ class Shot:
         numbers : iterable of int
             Frame numbers.
         what : str
-            What to call them: ``frame 1001``, with the name of the file where it holds a layer alone.
+            What to call them: ``frame 1001``, with the roles of the layers that a file holds alone.
         """
         found = {}
         for number in numbers:
-            for index, path in enumerate(self.paths(number)):
+            for path in self.paths(number):
                 if path not in self._states:
                     self._states[path] = identify(path)
-                found[f"{what} {number}{f' {path.name}' if index else ''}"] = self._states[path]
+                # Not by the file's name: sequences in folders of their own have the same names.
+                roles = sorted(role for role, other in self._apart.items() if other.files[number] == path)
+                found[" ".join([what, str(number), *roles])] = self._states[path]
         return found
 
     def check_unchanged(self, numbers: Iterable[int]) -> None:

@@ -203,10 +203,10 @@ def pattern_of(path: Path) -> Pattern:
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.name)
     if match is None:
         return Pattern(path.parent, path.name, 0)
-    before = match[1]
+    before, digits = match[1], len(match[2])
     if before.endswith("-") and _sign(before[:-1]):
-        before = before[:-1]
-    return Pattern(path.parent, before, len(match[2]), match[3])
+        before, digits = before[:-1], digits + 1  # as "%04d" counts: -002, -001, 0000
+    return Pattern(path.parent, before, digits, match[3])
 
 
 def _sign(before: str) -> str:
@@ -235,10 +235,11 @@ def parse_frames(frames: str) -> list[int]:
     """Ascending frame numbers of a range like 1001-1010x2."""
     try:
         numbers = list(FrameSet(frames))
-    except ValueError:
+    except (ValueError, ArithmeticError):  # the latter for numbers of hundreds of digits
         numbers = []
     if not numbers or any(number != int(number) for number in numbers):
-        raise ValueError(f"frames {frames!r} is not a range of frames, expected one like 1001-1010x2")
+        shown = frames if len(frames) < 60 else f"{frames[:56]}…"
+        raise ValueError(f"frames {shown!r} is not a range of frames, expected one like 1001-1010x2")
     return sorted({int(number) for number in numbers})
 
 

@@ -154,6 +154,20 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
     assert {int(number) for number, _ in reasons} == {n for n in again if f"shot.{n}.exr" in before}
 
 
+def test_a_frame_in_the_place_of_another_is_made_again(tmp_path, capsys):
+    """One window held the whole shot, so all frames were made from the same files."""
+    folder, out = Scene().write(tmp_path / "in"), tmp_path / "out"
+    assert draft(folder, out) == 0
+    whole = contents(out)
+    (out / "shot.1001.exr").replace(out / "shot.1002.exr")
+    shutil.copy(out / "shot.1003.exr", out / "shot.1001.exr")
+    assert draft(folder, out, "--resume") == 0
+    assert contents(out) == whole
+    said = capsys.readouterr().err
+    assert "frame 1001 is made again: frame was 1003, is 1001" in said
+    assert "1 of 3 frames were finished already" in said
+
+
 def test_a_frame_that_is_rendered_again_while_it_is_used_ends_the_run(tmp_path, capsys, monkeypatch):
     """Half of what was written came from the old file, half from the new, and --resume found it finished."""
     scene, out = Scene(height=24, width=32, frames=4), tmp_path / "out"

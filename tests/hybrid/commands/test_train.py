@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from dataclasses import fields
 
@@ -220,6 +221,21 @@ def test_every_option_arrives_where_it_belongs(asked):
     assert settings == {
         "preset": "quality", "init": "balanced", "validation": ["a", "b", "c"], "threads": 2, "resume": True,
     }  # fmt: skip
+
+
+def test_training_writes_over_no_clip_and_not_over_what_it_starts_from(tmp_path, capsys):
+    for name in ("wall.0000.safetensors", "mine.safetensors", "own.safetensors.state"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "link.safetensors").symlink_to("wall.0000.safetensors")
+    for output, said in (
+        ("wall.0000.safetensors", "output .* would overwrite an input: clip"),
+        ("link.safetensors", "output .* would overwrite an input: clip"),
+        ("mine.safetensors", "output .* would overwrite an input"),
+    ):
+        options = ("--steps", 1, "--init", tmp_path / "mine.safetensors")
+        assert run("train", tmp_path, "-o", tmp_path / output, *options) == 1
+        assert re.search(said, capsys.readouterr().err)
+        assert (tmp_path / output).read_text() in ("wall.0000.safetensors", "mine.safetensors")
 
 
 def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):

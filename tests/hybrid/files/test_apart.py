@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,21 @@ def test_a_layer_that_was_made_again_makes_the_frame_again(tmp_path: Path, capsy
     (albedo / "albedo.0010.exr").write_bytes((albedo / "albedo.0011.exr").read_bytes())
     assert main([*command, "--resume"]) == 0
     assert finished.stat().st_mtime_ns != first
+
+
+@pytest.mark.parametrize("role", ["albedo", "normal"])
+def test_sequences_of_one_name_in_several_folders_are_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], role: str
+) -> None:
+    """A folder for each layer, with equal names in all: what stood for one of them stood for all."""
+    split(tmp_path, {name: f"{name}/####.exr" for name in (*ROLES, "color")})
+    named = [word for name in ROLES for word in ("--layer", f"{name}={tmp_path / name / '####.exr'}")]
+    words = ["pseudoref", str(tmp_path / "color"), "-o", str(tmp_path / "out"), "--preset", "draft", *named]
+    assert main(words) == 0
+    path = tmp_path / role / "0010.exr"
+    os.utime(path, (1e9, 1e9))
+    assert main([*words, "--resume"]) == 0
+    assert f"frame 10 {role}, 0010.exr, has changed" in capsys.readouterr().err
 
 
 def test_a_missing_frame_is_an_error_that_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

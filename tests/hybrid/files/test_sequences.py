@@ -134,6 +134,24 @@ def test_hidden_files_folders_and_other_digits_are_no_frames(tmp_path):
     assert list(find_files(f"{tmp_path}/a.####.exr")[0]) == [1, 4]
 
 
+@pytest.mark.parametrize("form", ["{:04d}", "{:d}", "{:03d}"])
+def test_negative_numbers_are_padded_with_their_sign(tmp_path, form):
+    """A folder from -2 to 10 was said to hold two sequences: ### and ####."""
+    numbers = [-12, -2, -1, 0, 1, 10]
+    for number in numbers:
+        (tmp_path / f"a.{form.format(number)}.exr").touch()
+    files, _ = find_files(str(tmp_path))
+    assert list(files) == numbers
+    assert [path.name for path in files.values()] == [f"a.{form.format(number)}.exr" for number in numbers]
+
+
+@pytest.mark.parametrize("frames", ["1-" + "9" * 400, "1-2x" + "9" * 400, "9" * 400 + "-1x-" + "9" * 400])
+def test_ranges_of_hundreds_of_digits_are_none(frames):
+    with pytest.raises(ValueError, match="is not a range") as caught:
+        parse_frames(frames)
+    assert len(str(caught.value)) < 200
+
+
 def test_millions_of_missing_frames_are_not_counted_one_by_one(tmp_path):
     """Three files that were numbered by their dates took all memory."""
     shot = Shot({1: tmp_path / "a", 3: tmp_path / "b", 10**15: tmp_path / "c"})
