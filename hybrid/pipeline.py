@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
+from hybrid.alignment.prepare import PreparedFrame
 from hybrid.beside import ReadAhead
 from hybrid.estimates import EstimateSource
 from hybrid.files.frames import Shot, output_path
@@ -20,6 +21,7 @@ from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_lost_light, find_nonfinite
 from hybrid.timing import Timings
+from nlm.fireflies import RECURS
 
 Array = NDArray[np.float32]
 
@@ -314,8 +316,20 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
                 whole[name] = np.empty((height, width, *layer.shape[2:]), np.float32)
             whole[name][band] = layer[aligned.inner]
         del aligned, part, named
+    whole["color", ""] = _with_lamps(whole["color", ""], aligner.frame(number))
     kinds = {kind: {name: layer for (k, name), layer in whole.items() if k == kind} for kind in ("aovs", "extra")}
     return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), counts
+
+
+def _with_lamps(color: Array, frame: PreparedFrame | None) -> Array:
+    """The picture, with the lamps of a pixel that estimates have lost as they were rendered.
+
+    Denoisers of single frames take them for fireflies; that the next frame shows them too they cannot know.
+    """
+    if frame is None or frame.lamps is None:
+        return color
+    lost = frame.lamps & (color.mean(axis=-1) < RECURS * frame.radiance.mean(axis=-1))
+    return np.where(lost[..., None], frame.radiance, color)
 
 
 def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -> None:

@@ -366,9 +366,10 @@ class Aligner:
                 _, there = self._read_once(neighbour)
                 flow, valid = rendered_flow(prepared, there) or (None, None)
                 known |= recurring(places, prepared.irradiance, there.irradiance, flow, valid)
+        lamps = replace_fireflies(prepared.irradiance, places[known])[1] if known.any() else None
         places = places[~known]
         clean, _, removed = replace_fireflies(prepared.irradiance, places)
-        prepared = replace(prepared, irradiance=clean, fireflies=len(places), removed=removed)
+        prepared = replace(prepared, irradiance=clean, fireflies=len(places), removed=removed, lamps=lamps)
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
 
     def frame(self, number: int) -> PreparedFrame | None:

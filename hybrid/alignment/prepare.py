@@ -70,6 +70,8 @@ class PreparedFrame:
         Single bright samples that were taken out.
     removed : float
         Share of the light that went with them, in [0, 1].
+    lamps : (H, W) bool array or None
+        Single bright pixels that a neighbour shows as well; None where there are none.
     """
 
     number: int
@@ -86,6 +88,7 @@ class PreparedFrame:
     demodulated: bool
     fireflies: int = 0
     removed: float = 0.0
+    lamps: Mask | None = None
 
     @cached_property
     def light(self) -> Array:

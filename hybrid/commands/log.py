@@ -151,10 +151,11 @@ LONGEST = 2000
 
 def one_line(error: BaseException) -> str:
     """What an error says, without line breaks and without what would command a terminal."""
+    said = str(error)
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return printable(f"{error.filename}: {error.strerror}")
-    words = printable(" ".join(str(error).split()))
-    return words if len(words) <= LONGEST else f"{words[:LONGEST]}…"
+        said = f"{error.filename}: {error.strerror}"
+    words = printable(" ".join(said.split()))
+    return words if len(words) <= LONGEST else f"{words[: LONGEST // 2]}…{words[-LONGEST // 2 :]}"
 
 
 def printable(words: str) -> str:

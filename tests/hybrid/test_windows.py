@@ -138,6 +138,30 @@ def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
     assert (window.color[2] * window.modulation)[20, 30].mean() == pytest.approx(500, rel=1e-3)
 
 
+@pytest.mark.parametrize("step", [(0, 0), (2, 1)])
+def test_a_lamp_that_estimates_have_lost_is_as_it_was_rendered(tmp_path, step):
+    """OIDN, which sees one frame, takes a lamp of a pixel for a firefly: a hundredth of its light was left."""
+
+    def lit(index, layers):
+        layers["ViewLayer.Combined"][20 + step[1] * index, 30 + step[0] * index] = 500
+
+    shot = open_shot(replace(CALM, frames=5, step=step).write(tmp_path / "in", edit=lit))
+    blind = OfFrames(lambda frame: np.minimum(frame.color, 5))
+
+    def run(out, rules):
+        for _ in denoise_frames(shot, out, lambda w: Denoised(gated_average(w)), rules, estimates=blind):
+            pass
+        return read_exr(out / "shot.1003.exr").pixels(("ViewLayer.Combined.R",))[..., 0]
+
+    made = run(tmp_path / "out", Rules())
+    off = run(tmp_path / "off", Rules(off=frozenset({"fireflies"})))
+    at = 20 + 2 * step[1], 30 + 2 * step[0]
+    assert made[at] == pytest.approx(500)  # times the albedo that it was divided by
+    assert off[at] < 6
+    made[at] = off[at]
+    np.testing.assert_array_equal(made, off)
+
+
 def test_what_fireflies_take_with_them_is_counted(tmp_path):
     shot = open_shot(CALM.write(tmp_path, edit=burnt))
     window = Aligner(shot, Rules()).align(1009)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hybrid.cli import main
-from hybrid.commands.log import LOG, Progress, end_log, start_log
+from hybrid.commands.log import LOG, Progress, end_log, one_line, start_log
 
 ROOT = Path(__file__).parents[3]
 
@@ -144,3 +144,11 @@ def test_the_first_run_says_that_it_compiles_and_later_ones_do_not(shot_folder, 
     said = [subprocess.run(command, **options, capture_output=True, text=True, check=True).stderr for _ in range(2)]
     assert ["compiling for this processor" in words for words in said] == [True, False]
     assert said[0].count("compiling") == 1
+
+
+def test_an_error_quotes_no_more_than_some_lines_of_a_path():
+    """A path of 6,000 characters stood in the message, twice."""
+    for error in (OSError(36, "File name too long", "x" * 6000), ValueError("x" * 6000 + " File name too long")):
+        said = one_line(error)
+        assert len(said) < 2100
+        assert said.endswith("File name too long")
