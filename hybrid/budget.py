@@ -49,7 +49,11 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot, rules: Rules, estimate: str, load: Callable[[str], tuple[DenoiseWindow, int]]
+    shot: Shot,
+    rules: Rules,
+    estimate: str,
+    load: Callable[[str], tuple[DenoiseWindow, int]],
+    device: str = "cpu",
 ) -> Iterator[Measured]:
     """Measure the presets on the middle of the shot, the most accurate first.
 
@@ -63,6 +67,8 @@ def measure_presets(
         As for `hybrid.estimates.choose_estimate`.
     load : callable
         From a preset to its estimator and the frames on each side that it looks at.
+    device : str
+        Of OIDN, as for `hybrid.estimates.choose_estimate`.
 
     Yields
     ------
@@ -84,7 +90,7 @@ def measure_presets(
     reading = time.perf_counter() - start
     for preset in reversed(MODE_OF):
         denoise, radius = load(preset)
-        source = choose_estimate(estimate, shot, mode=MODE_OF[preset])
+        source = choose_estimate(estimate, shot, mode=MODE_OF[preset], device=device)
         # A sequence's pictures are whole; what is measured is a part.
         given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
         aligner = Aligner(part, rules, radius=radius, estimates=given)

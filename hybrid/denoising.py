@@ -23,6 +23,7 @@ def denoise_shot(
     estimate: str | None = None,
     stages: Collection[str] = (),
     no_stages: Collection[str] = (),
+    device: str = "auto",
     resume: bool = False,
     keep_going: bool = False,
 ) -> Iterator[Finished | Failed]:
@@ -45,6 +46,9 @@ def denoise_shot(
         network, "none" without one.
     stages, no_stages : collection of str
         Stages that run, or do not, whatever was measured.
+    device : str
+        What networks are computed on, OIDN's and ravg's alike: "cpu", "cuda", "hip", "sycl" or "metal"; "auto": what is
+        there.
     resume : bool
         Leave frames alone that are there and would be made the same.
     keep_going : bool
@@ -77,17 +81,17 @@ def denoise_shot(
     if weights is None and preset in CLASSICAL_PRESETS:
         radius, own = 2, CLASSICAL_PRESETS[preset]
         off |= NEURAL_STAGES
-        source = choose_estimate(estimate or "none", shot, own=own)
+        source = choose_estimate(estimate or "none", shot, own=own, device=device)
         make = partial(filter_window, preset=own) if source.estimates is None else gated_average
         denoise = lambda aligned: Denoised(make(aligned))  # noqa: E731 - as the command has it
     else:
         from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-        network = Denoiser(weights or shipped_weights(preset))
+        network = Denoiser(weights or shipped_weights(preset), device=device)
         denoise, radius = network, network.radius
         if network.takes_estimate:
             mode = MODE_OF[preset] if weights is None else "oidn-clean"
-            source = choose_estimate(estimate or "auto", shot, mode=mode)
+            source = choose_estimate(estimate or "auto", shot, mode=mode, device=device)
         else:
             source = EstimateSource("none", None, "this network takes none")
     check_written(shot, str(output), [source], {"weights": weights}, {})

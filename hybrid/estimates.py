@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
-from hybrid.oidn import HOLDS, denoise_oidn, why_no_oidn
+from hybrid.oidn import HOLDS, denoise_oidn, find_device, why_no_oidn
 from hybrid.plausibility import LOST, find_lost_light
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
@@ -154,6 +154,8 @@ class EstimateSource:
         The finished sequence it is read from, if it is one.
     kept : tuple of Path
         Where pictures are kept, if they are.
+    device : str or None
+        What OIDN computes on, if it does.
     """
 
     name: str
@@ -161,6 +163,7 @@ class EstimateSource:
     reason: str
     files: Shot | None = None
     kept: tuple[Path, ...] = ()
+    device: str | None = None
 
 
 def choose_estimate(
@@ -172,6 +175,7 @@ def choose_estimate(
     mode: str = "oidn-clean",
     forced: str = "",
     quicker: Callable[..., Array] | None = None,
+    device: str = "cpu",
 ) -> EstimateSource:
     """Find the estimates that are asked for.
 
@@ -195,7 +199,9 @@ def choose_estimate(
         What the user has forced (`hybrid.plan.Rules.forced`), on which guides and fireflies depend: pictures are kept
         for that.
     quicker : callable, optional
-        What "auto" has in the place of `hybrid.oidn.denoise_oidn`, with the same parameters.
+        What "auto" has in the place of `hybrid.oidn.denoise_oidn` on a processor, with the same parameters.
+    device : str
+        Of OIDN, as for `hybrid.oidn.find_device`.
 
     Returns
     -------
@@ -206,12 +212,13 @@ def choose_estimate(
     ImportError
         If OIDN is asked for by name and not installed.
     ValueError
-        If a sequence lacks frames of the shot, or `kept` is one file for several, neighbours among them.
+        If a sequence lacks frames of the shot, or `kept` is one file for several, neighbours among them; if OIDN is to
+        run on a device that is not there.
     FileNotFoundError
         If there is no such sequence.
     """
     keep = None if kept is None else partial(Kept, shot, kept, forced)
-    source = _choose(spec, shot, own, mode, keep, quicker)
+    source = _choose(spec, shot, own, mode, keep, quicker, device)
     if kept is not None and source.name not in OIDN_MODES:
         return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
     return source
@@ -222,16 +229,17 @@ def _choose(
     shot: Shot,
     own: ClassicalPreset,
     mode: str,
-    keep: Callable[[str, bool], Kept] | None,
+    keep: Callable[[str, bool, str], Kept] | None,
     quicker: Callable[..., Array] | None,
+    device: str,
 ) -> EstimateSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if (lacking := why_no_oidn()) is None:
-            if quicker is not None:
-                return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", quicker)
-            return _oidn(mode, keep, "OIDN is installed")
+            if quicker is not None and find_device(device) == "cpu":
+                return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", "cpu", quicker)
+            return _oidn(mode, keep, "OIDN is installed", device)
         return EstimateSource("nlm", OfWindows(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
@@ -240,7 +248,7 @@ def _choose(
     if spec in OIDN_MODES:
         if (lacking := why_no_oidn()) is not None:
             raise ImportError(f"estimate {spec}: {lacking}; expected: pip install 'ravg[compare]'")
-        return _oidn(spec, keep, "asked for")
+        return _oidn(spec, keep, "asked for", device)
     sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
@@ -251,16 +259,19 @@ def _choose(
 
 def _oidn(
     mode: str,
-    keep: Callable[[str, bool], Kept] | None,
+    keep: Callable[[str, bool, str], Kept] | None,
     reason: str,
-    denoise: Callable[..., Array] | None = None,
+    device: str,
+    quicker: Callable[..., Array] | None = None,
 ) -> EstimateSource:
-    run: Callable[..., Array] = partial(_run_mode, mode, denoise=denoise)
-    kept = None if keep is None else keep(mode, denoise is not None)
+    device = find_device(device)
+    run: Callable[..., Array] = partial(_run_mode, mode, denoise=quicker or partial(denoise_oidn, device=device))
+    kept = None if keep is None else keep(mode, quicker is not None, device)
     if kept is not None:
         run = partial(kept.read_or_run, run=run)
     estimates = OfGuidedFrames(run, HOLDS) if mode == "oidn-clean" else OfFrames(run, HOLDS)
-    return EstimateSource(mode, estimates, reason, kept=() if kept is None else tuple(kept.places.values()))
+    places = () if kept is None else tuple(kept.places.values())
+    return EstimateSource(mode, estimates, reason, kept=places, device=device)
 
 
 class Kept:
@@ -278,6 +289,8 @@ class Kept:
         A key of `OIDN_MODES`.
     quicker : bool
         Whether OIDN's networks run elsewhere, less exactly.
+    device : str
+        What they run on.
 
     Raises
     ------
@@ -285,7 +298,7 @@ class Kept:
         If it is one name for several frames, neighbours among them, or would overwrite an input.
     """
 
-    def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool) -> None:
+    def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool, device: str) -> None:
         # Of neighbours too that were not asked for.
         path = Path(spec)
         if shot.picture:
@@ -293,7 +306,7 @@ class Kept:
             path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
         self.places = {number: output_path(path, shot, number, beside=True) for number in shot.files}
         self._shot = shot
-        self._facts = {"estimate": mode, "quicker": quicker, "forced": forced, **versions("pyoidn")}
+        self._facts = {"estimate": mode, "quicker": quicker, "device": device, "forced": forced, **versions("pyoidn")}
         # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.
         self._reach = 1 + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
 
@@ -317,9 +330,7 @@ class Kept:
         return shot.remade({frame.number: path}).read(frame.number).color
 
 
-def _run_mode(
-    mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array] | None = None
-) -> Array:
+def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array]) -> Array:
     """Run a mode of OIDN; guides without noise are declared clean as they are."""
     settings = OIDN_MODES[mode] if noisy_guides else {**OIDN_MODES[mode], "prefilter": None, "clean": True}
     return estimate_oidn(frame, denoise, **settings)

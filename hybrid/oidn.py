@@ -5,6 +5,8 @@ Needs the optional package ``pyoidn`` (extra ``ravg[compare]``), imported at the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -17,6 +19,8 @@ Quality = Literal["high", "balanced", "fast"]
 MEMORY_MB = 1024
 # Bytes that it then takes, its code and buffers included, by measurement.
 HOLDS = 1400 * 2**20
+# In the order in which "auto" takes them.
+DEVICES = ("cuda", "hip", "sycl", "metal", "cpu")
 
 
 def denoise_oidn(
@@ -29,8 +33,9 @@ def denoise_oidn(
     clean: bool = False,
     scale: float | None = None,
     threads: int = 0,
+    device: str = "cpu",
 ) -> NDArray[np.float32]:
-    """Denoise one frame with OIDN's ray-tracing filter in HDR mode, on the CPU.
+    """Denoise one frame with OIDN's ray-tracing filter in HDR mode.
 
     Parameters
     ----------
@@ -53,6 +58,8 @@ def denoise_oidn(
         whole frame's (`hybrid.alignment.transfer.autoexposure`).
     threads : int
         0 leaves the choice to OIDN (all cores).
+    device : str
+        "cpu", "cuda", "hip", "sycl" or "metal" (`find_device`).
 
     Returns
     -------
@@ -66,7 +73,7 @@ def denoise_oidn(
     ValueError
         If shapes differ, values are not finite, the quality is unknown, or there is a normal alone.
     RuntimeError
-        If OIDN reports an error.
+        If OIDN reports an error, or has no such device here.
 
     References
     ----------
@@ -78,16 +85,16 @@ def denoise_oidn(
         raise ValueError("normal without albedo: OIDN has no such filter; pass both, or neither")
     if prefilter is not None:
         for name in guides:
-            images[name] = _execute({name: images[name]}, prefilter, threads)
+            images[name] = _execute({name: images[name]}, prefilter, threads, device)
     clean = (prefilter is not None or clean) and bool(guides)
-    return _execute(images, quality, threads, scale, hdr=True, cleanAux=clean)
+    return _execute(images, quality, threads, device, scale, hdr=True, cleanAux=clean)
 
 
 @lru_cache(maxsize=1)
 def why_no_oidn() -> str | None:
     """Say why OIDN cannot be had here: None where it can."""
     try:
-        _device(0)
+        _device(0, "cpu")
     except ImportError as error:
         # The package may be there, and not what it imports.
         return "pyoidn is not installed" if isinstance(error.__cause__, ModuleNotFoundError) else f"pyoidn: {error}"
@@ -107,10 +114,15 @@ def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np
 
 
 def _execute(
-    images: dict[str, NDArray[np.float32]], quality: str, threads: int, scale: float | None = None, **flags: bool
+    images: dict[str, NDArray[np.float32]],
+    quality: str,
+    threads: int,
+    where: str,
+    scale: float | None = None,
+    **flags: bool,
 ) -> NDArray[np.float32]:
     """Run one filter over `images`."""
-    oidn, device = _device(threads)
+    oidn, device = _device(threads, where)
     qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,
                  "fast": oidn.OIDN_QUALITY_FAST}  # fmt: skip
     if quality not in qualities:
@@ -118,31 +130,97 @@ def _execute(
     output = np.empty_like(next(iter(images.values())))
     rt = oidn.Filter(device, oidn.OIDN_FILTER_TYPE_RT)
     try:  # not `with`: pyoidn 2.5.1's __exit__ returns true, which swallows the exception
-        for name, image in {**images, "output": output}.items():
-            rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3)
-        for flag, value in flags.items():
-            rt.set_bool(flag, value)
-        if scale is not None:
-            rt.set_float("inputScale", scale)
-        rt.set_quality(qualities[quality])
-        rt.set_int("maxMemoryMB", MEMORY_MB)
-        rt.commit()
-        rt.execute()
-        _check(device)
+        with _reachable(oidn, device, {**images, "output": output}) as given:
+            for name, image in given.items():
+                height, width = output.shape[:2]
+                rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3, width, height)
+            for flag, value in flags.items():
+                rt.set_bool(flag, value)
+            if scale is not None:
+                rt.set_float("inputScale", scale)
+            rt.set_quality(qualities[quality])
+            rt.set_int("maxMemoryMB", MEMORY_MB)
+            rt.commit()
+            rt.execute()
+            _check(device)
+            if given["output"] is not output:
+                given["output"].read(0, output.nbytes, output)
+                _check(device)
     finally:
         rt.release()
     return output
 
 
+@contextmanager
+def _reachable(oidn: Any, device: Any, images: dict[str, NDArray[np.float32]]) -> Iterator[dict[str, Any]]:
+    """The images where the device can reach them: as they are, or copied to buffers of its own."""
+    if _reads_memory(device):
+        yield dict(images)
+        return
+    buffers = {name: oidn.Buffer(device, image.nbytes) for name, image in images.items()}
+    try:
+        for name, buffer in buffers.items():
+            buffer.write(0, images[name].nbytes, images[name])
+        _check(device)
+        yield buffers
+    finally:
+        for buffer in buffers.values():
+            buffer.release()
+
+
+def _reads_memory(device: Any) -> bool:
+    """Whether a device reads what a program has allocated, as processors and few others do."""
+    return bool(device.get_bool("systemMemorySupported"))
+
+
+def find_device(name: str) -> str:
+    """Find a device of OIDN.
+
+    Parameters
+    ----------
+    name : str
+        "auto": the first that is there of cuda, hip, sycl, metal, cpu; or one of these.
+
+    Returns
+    -------
+    str
+        Its name.
+
+    Raises
+    ------
+    ImportError
+        If pyoidn is not installed.
+    ValueError
+        If it is not there; names those that are.
+    """
+    for kind in DEVICES if name == "auto" else (name,):
+        if _has_device(kind):
+            return kind
+    there = [kind for kind in DEVICES if _has_device(kind)]
+    raise ValueError(f"device is {name!r}, expected one that OIDN can use here: auto, {', '.join(there)}")
+
+
+def _has_device(kind: str) -> bool:
+    try:
+        _device(0, kind)
+    except RuntimeError:
+        return False
+    return True
+
+
 @lru_cache(maxsize=2)
-def _device(threads: int) -> tuple[Any, Any]:
+def _device(threads: int, kind: str) -> tuple[Any, Any]:
     """The module and a device with that many threads; making one costs as much as a small frame."""
+    if kind not in DEVICES:
+        raise ValueError(f"device is {kind!r}, expected one of {', '.join(DEVICES)}")
     try:
         import pyoidn  # an optional peer
     except ImportError as error:
         raise ImportError("OIDN needs the package pyoidn: install the extra ravg[compare]") from error
-    device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
-    device.set_int("numThreads", threads)
+    device = pyoidn.Device(getattr(pyoidn, f"OIDN_DEVICE_TYPE_{kind.upper()}"))
+    _check(device)
+    if kind == "cpu":
+        device.set_int("numThreads", threads)
     device.commit()
     _check(device)
     return pyoidn, device

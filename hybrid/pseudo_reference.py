@@ -149,13 +149,15 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
         return average(aligned.estimate, aligned.confidence) * aligned.modulation
 
 
-def gather_and_denoise(aligned: AlignedWindow, *, timings: Timings | None = None) -> Array:
+def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
     """Gather the samples of the window at the centre, and have OIDN denoise it once more: our best without training.
 
     Parameters
     ----------
     aligned : AlignedWindow
         With estimates; the cheapest do (`oidn-fast`).
+    device : str
+        Of OIDN, as for `hybrid.oidn.denoise_oidn`.
     timings : Timings, optional
         Where to count the stages "gather" and "denoise".
 
@@ -197,6 +199,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, timings: Timings | None = None
             prefilter="balanced" if noisy else None,
             clean=not noisy,
             scale=autoexposure(aligned.picture),
+            device=device,
         )
     with timings.stage("gather"):
         mixed = np.asarray(average + np.float32(SECOND_LOOK) * (seen - average), np.float32)

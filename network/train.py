@@ -28,6 +28,7 @@ from torch.utils.data import DataLoader
 from network import losses
 from network.checkpoint import describe, new_partial, save_model
 from network.clips import Clips, Samples, whole_frames
+from network.devices import find_device
 from network.kernels import Filtered, mean_of
 from network.models import Model, channels_last, filter_window
 from network.perceptual import Perceptual, load_vgg19
@@ -294,11 +295,8 @@ def _in_group() -> bool:
 
 def _device(name: str) -> torch.device:
     """Where to train; in a group each process has a GPU of its own."""
-    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
-        return torch.device("cpu")
-    if not torch.cuda.is_available():
-        raise ValueError("device: expected a GPU that torch can use, got none")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+    _, device = find_device(name)
+    return device if device.type == "cpu" else torch.device(device.type, int(os.environ.get("LOCAL_RANK", 0)))
 
 
 def _batches(samples: Samples, config: TrainConfig, first: int, rank: int, world: int) -> Iterator[dict[str, Tensor]]:

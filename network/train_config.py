@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 LOSSES = ("l1", "smape", "relmse", "display", "perceptual")
 TERMS = ("temporal", "power", "spatial")
-DEVICES = ("auto", "cpu", "cuda")
+DEVICES = ("auto", "cpu", "cuda", "hip", "sycl", "metal")
 
 
 @dataclass(frozen=True)

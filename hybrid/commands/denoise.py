@@ -20,6 +20,7 @@ from hybrid.commands.options import (
     RESOURCES,
     WHAT,
     AovOption,
+    DeviceOption,
     EstimateOption,
     FramesOption,
     KeepGoingOption,
@@ -82,6 +83,7 @@ def pseudoref(
     contact: SheetOption = None,
     stages: OnOption = None,
     no_stages: OffOption = None,
+    device: DeviceOption = "auto",
     resume: ResumeOption = False,
     keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
@@ -97,6 +99,7 @@ def pseudoref(
     if each_view(pseudoref, given):
         return
     from hybrid.estimates import choose_estimate
+    from hybrid.oidn import find_device
     from hybrid.pipeline import Denoised
     from hybrid.plan import NEURAL_STAGES
     from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL, gated_average, gather_and_denoise
@@ -120,14 +123,17 @@ def pseudoref(
     with _on_record(context, shot, opened, output):
         (opened, *others), judgement = judge_input(opened, strict=strict)
     timings = Timings()
-    choose = partial(choose_estimate, estimate, own=chosen, kept=keep_estimates, forced=rules.forced)
+    choose = partial(choose_estimate, estimate, own=chosen, kept=keep_estimates, forced=rules.forced, device=device)
     source, beside = choose(opened), [(other, choose(other)) for other in others]
     sources = [source, *(theirs for _, theirs in beside)]
     _spare_inputs(opened, output, sources, {"profile": profile}, preview=preview, contact=contact)
     if source.estimates is None:
         make = partial(estimate_centre, preset=chosen, timings=timings)
     else:
-        make = partial(gather_and_denoise if gathers else gated_average, timings=timings)
+        make = partial(gated_average, timings=timings)
+    second_look = find_device(device) if gathers else None
+    if second_look is not None:
+        make = partial(gather_and_denoise, device=second_look, timings=timings)
     _run(
         Job(
             shot,
@@ -138,7 +144,13 @@ def pseudoref(
             source,
             command="pseudoref",
             preset=preset,
-            settings={"layer": layer, "profile": profile, "motion": motion, "estimate": estimate},
+            settings={
+                "layer": layer,
+                "profile": profile,
+                "motion": motion,
+                "estimate": estimate,
+                "device": {"oidn": where} if (where := second_look or source.device) else {},
+            },
             rules=rules,
             resume=resume,
             keep_going=keep_going,
@@ -229,6 +241,7 @@ def denoise(
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"], typer.Option(help="of the network", rich_help_panel=RESOURCES)
     ] = "auto",
+    device: DeviceOption = "auto",
     resume: ResumeOption = False,
     keep_going: KeepGoingOption = False,
     max_memory: MemoryOption = None,
@@ -267,18 +280,28 @@ def denoise(
     chosen: str = preset
     rules = rules_of(stages, no_stages)
     if budget is not None:
-        chosen = _fitting(opened, budget, estimate, rules, precision)
+        chosen = _fitting(opened, budget, estimate, rules, precision, device)
     path = weights or neural.shipped_weights(chosen)
     if tile is None:
         tile = neural.TILE if max_memory is None else neural.SMALL_TILE
-    denoiser = neural.Denoiser(path, tile=tile, precision=precision, threshold=threshold, timings=timings)
+    denoiser = neural.Denoiser(
+        path, tile=tile, precision=precision, device=device, threshold=threshold, timings=timings
+    )
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         ahead = reach_of(None, denoiser.radius) * (passes - 1)  # what the first pass makes
-        quicker = neural.denoise_unet if denoiser.precision == "bfloat16" and neural.has_unet() else None
-        choose = partial(choose_estimate, wanted, mode=mode, quicker=quicker, kept=keep_estimates, forced=rules.forced)
+        in_torch = denoiser.precision == "bfloat16" and denoiser.device == "cpu" and neural.has_unet()
+        choose = partial(
+            choose_estimate,
+            wanted,
+            mode=mode,
+            quicker=neural.denoise_unet if in_torch else None,
+            kept=keep_estimates,
+            forced=rules.forced,
+            device=device,
+        )
         source, beside = choose(opened.around(ahead)), [(other, choose(other.around(ahead))) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
@@ -299,6 +322,7 @@ def denoise(
         "breakdown": breakdown is not None,
         "precision": denoiser.precision,
         "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        "device": {"network": denoiser.device, **({"oidn": source.device} if source.device else {})},
     }
     job = Job(
         shot,
@@ -399,7 +423,7 @@ def _expect_all(shot: Shot, keep_going: bool) -> None:
         raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
 
 
-def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str) -> str:
+def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str, device: str) -> str:
     """The most accurate preset that is measured to fit a time per frame, or the fastest; says what was measured."""
     from hybrid.budget import measure_presets, parse_budget
 
@@ -408,11 +432,11 @@ def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: st
         seconds = parse_budget(budget)
 
     def load(preset: str) -> tuple[DenoiseWindow, int]:
-        denoiser = neural.Denoiser(neural.shipped_weights(preset), precision=precision)
+        denoiser = neural.Denoiser(neural.shipped_weights(preset), precision=precision, device=device)
         return denoiser, denoiser.radius
 
     tried = []
-    for measured in measure_presets(shot, rules, "nlm" if estimate == "none" else estimate, load):
+    for measured in measure_presets(shot, rules, "nlm" if estimate == "none" else estimate, load, device):
         tried.append(f"{measured.preset} {measured.seconds:.2g} s")
         fits = measured.seconds <= seconds
         if fits:

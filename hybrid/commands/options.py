@@ -26,6 +26,16 @@ Thing = TypeVar("Thing")
 INPUT, WHAT, OUTPUT, RESOURCES = "Input", "What to run", "Output", "Resources"
 
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
+DeviceOption = Annotated[
+    Device,
+    typer.Option(
+        "--device",
+        envvar="RAVG_DEVICE",
+        help="what computes networks, OIDN's and ravg's alike; auto: the first that is there of cuda, hip, sycl, "
+        "metal, cpu",
+        rich_help_panel=RESOURCES,
+    ),
+]
 
 # What a folder is not called: somebody wants pictures of a kind that is not written.
 _OTHER_KINDS = re.compile(r"\.(avi|bmp|dpx|gif|hdr|jpe?g|mkv|mov|mp4|pfm|png|tga|tiff?|webp)", re.IGNORECASE)

@@ -17,6 +17,7 @@ from hybrid.commands.options import (
     OUTPUT,
     RESOURCES,
     WHAT,
+    DeviceOption,
     FramesOption,
     LayerOption,
     MotionOption,
@@ -278,9 +279,7 @@ def train(
         int, typer.Option(help="disjoint sets of clips, one an epoch", rich_help_panel=TRAINING)
     ] = DEFAULTS.sampler.sets,
     seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = DEFAULTS.seed,
-    device: Annotated[
-        str, typer.Option(envvar="RAVG_DEVICE", help="auto, cpu or cuda", rich_help_panel=RESOURCES)
-    ] = DEFAULTS.device,
+    device: DeviceOption = "auto",
     threads: Annotated[int | None, typer.Option(help="of torch and numba", rich_help_panel=RESOURCES)] = None,
     workers: Annotated[
         int, typer.Option(help="processes that read clips", rich_help_panel=RESOURCES)

@@ -21,6 +21,7 @@ from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.pipeline import Denoised
 from hybrid.timing import Timings
 from network.checkpoint import load_model
+from network.devices import find_device
 from network.models import denoise_tile, for_inference, window_length
 from network.stabilizer import Stabilizer
 
@@ -52,8 +53,10 @@ def shipped_weights(preset: str) -> Path:
     return path
 
 
-def has_bfloat16() -> bool:
-    """Whether this processor computes in bfloat16 faster than in float32 (AVX-512 bf16 or AMX)."""
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a device computes in bfloat16 faster than in float32; a processor with AVX-512 bf16 or AMX."""
+    if device.type != "cpu":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
@@ -69,6 +72,8 @@ class Denoiser:
         Side of the squares that the network sees at once, pixels; a halo is added around each.
     precision : str
         One of `PRECISIONS`; "auto" takes bfloat16 where the processor has it.
+    device : str
+        What it computes on, as for `network.devices.find_device`.
     threshold : float, optional
         t·K of the kernels, in [0, 1); higher stays closer to the input. Without: what it was trained with.
     breakdown : Breakdown, optional
@@ -88,6 +93,7 @@ class Denoiser:
         *,
         tile: int = TILE,
         precision: str = "auto",
+        device: str = "cpu",
         threshold: float | None = None,
         breakdown: Breakdown | None = None,
         timings: Timings | None = None,
@@ -98,9 +104,10 @@ class Denoiser:
             raise ValueError(f"tile is {tile}, expected at least 16 pixels")
         if threshold is not None and not 0 <= threshold < 1:
             raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
-        half = precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+        self.device, self._device = find_device(device)
+        half = precision == "bfloat16" or (precision == "auto" and has_bfloat16(self._device))
         self.precision = "bfloat16" if half else "float32"
-        self.model = for_inference(load_model(weights), half)
+        self.model = for_inference(load_model(weights), half).to(self._device)
         self.tile = tile
         self.threshold = threshold
         self.breakdown = breakdown
@@ -160,7 +167,7 @@ class Denoiser:
         frames, height, width = color.shape[:3]
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
         given = {name: layer for name, layer in layers.items() if name != "aovs"}
-        exposure = exposure_of(aligned)
+        exposure = exposure_of(aligned).to(self._device)
         irradiance, filtered = np.empty_like(color[centre]), np.empty_like(others[centre])
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
@@ -177,12 +184,12 @@ class Denoiser:
             if through is not None:
                 filtered[inner] = image_of(through)[offset]
             if parts is not None:
-                tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).numpy()
+                tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
                 parts[:, *inner] = tile[:, *offset]
         return irradiance, filtered, parts
 
     def _cut(self, layer: Array, outer: Block) -> torch.Tensor:
-        return tensor_of(_pad(layer[:, *outer], self.model.multiple))
+        return tensor_of(_pad(layer[:, *outer], self.model.multiple)).to(self._device)
 
 
 def _modulated(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
@@ -219,7 +226,7 @@ def tensor_of(window: Array) -> torch.Tensor:
 
 def image_of(tensor: torch.Tensor) -> Array:
     """(1, C, H, W) to (H, W, C)."""
-    return tensor[0].permute(1, 2, 0).float().numpy()
+    return tensor[0].permute(1, 2, 0).float().cpu().numpy()
 
 
 def _pad(window: Array, multiple: int) -> Array:

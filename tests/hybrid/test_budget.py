@@ -66,7 +66,7 @@ def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, caplog, ask
 
     monkeypatch.setattr(budget, "measure_presets", measure)
     with caplog.at_level("INFO"):
-        assert _fitting(shot, asked, "nlm", Rules(), "float32") == chosen
+        assert _fitting(shot, asked, "nlm", Rules(), "float32", "cpu") == chosen
     assert len(measured) == tried  # nothing is measured that is not needed
     said = caplog.text
     assert f"preset: {chosen}" in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from importlib.util import find_spec
 from types import ModuleType
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from hybrid import oidn
 from hybrid.alignment.transfer import autoexposure
 from hybrid.cli import main
+from hybrid.files.exr import read_exr
 from hybrid.oidn import denoise_oidn
+from hybrid.records import read_records
 from tests.scenes import Scene
 
 Image = NDArray[np.float32]
@@ -130,7 +133,7 @@ class TestDenoise:
 
     def test_error_of_the_library_is_raised(self, scene) -> None:
         with pytest.raises(RuntimeError, match="OIDN: unsupported combination"):
-            oidn._execute({"color": scene[1], "normal": scene[3]}, "high", 1, hdr=True)
+            oidn._execute({"color": scene[1], "normal": scene[3]}, "high", 1, "cpu", hdr=True)
 
     def test_unknown_quality_is_an_error(self, scene) -> None:
         with pytest.raises(ValueError, match="quality must be one of high, balanced, fast"):
@@ -155,3 +158,58 @@ def test_missing_package_names_the_extra(scene, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     with pytest.raises(ImportError, match=r"ravg\[compare\]"):
         denoise_oidn(scene[1])
+
+
+class TestDevices:
+    pytestmark = needs_oidn
+
+    def test_a_processor_is_there_and_auto_is_one_of_those_there(self):
+        assert oidn.find_device("cpu") == "cpu"
+        assert oidn._has_device(oidn.find_device("auto"))
+
+    def test_the_first_that_is_there_is_taken(self, monkeypatch):
+        monkeypatch.setattr(oidn, "_has_device", lambda kind: kind in {"sycl", "cpu"})
+        assert oidn.find_device("auto") == "sycl"
+        assert oidn.find_device("cpu") == "cpu"
+        with pytest.raises(
+            ValueError, match=r"device is 'cuda', expected one that OIDN can use here: auto, sycl, cpu$"
+        ):
+            oidn.find_device("cuda")
+
+    def test_one_that_is_not_there_is_never_computed_on(self, scene):
+        """Whichever are missing here; no machine has all of them."""
+        missing = [kind for kind in oidn.DEVICES if not oidn._has_device(kind)]
+        assert missing
+        for kind in missing:
+            with pytest.raises(RuntimeError, match="unsupported device type"):
+                denoise_oidn(scene[1], device=kind)
+        with pytest.raises(ValueError, match="device is 'gpu', expected one of"):
+            denoise_oidn(scene[1], device="gpu")
+
+    def test_a_device_that_cannot_read_our_memory_is_given_copies(self, scene, monkeypatch):
+        _, color, albedo, normal = scene
+        expected = denoise_oidn(color, albedo, normal, prefilter="balanced", threads=1)
+        asked = []
+        monkeypatch.setattr(oidn, "_reads_memory", lambda device: bool(asked.append(device)))
+        np.testing.assert_array_equal(denoise_oidn(color, albedo, normal, prefilter="balanced", threads=1), expected)
+        assert len(asked) == 3  # two guides and the picture
+
+    def test_the_command_names_what_was_asked_for_and_what_is_there(self, tmp_path, capsys):
+        missing = next(kind for kind in oidn.DEVICES if not oidn._has_device(kind))
+        shot, out = Scene(frames=3).write(tmp_path / "in"), tmp_path / "out"
+        words = ["pseudoref", str(shot), "-o", str(out), "--preset", "draft", "--estimate", "oidn-fast", "-q"]
+        assert main([*words, "--device", missing]) == 1
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert line.startswith(f"error: device is '{missing}', expected one that OIDN can use here: auto, ")
+        assert not list(out.glob("*.exr"))
+        assert main([*words, "--device", "gpu"]) == 2
+
+    def test_the_record_and_the_file_say_where_it_ran(self, tmp_path):
+        shot, out = Scene(frames=1).write(tmp_path / "in"), tmp_path / "out"
+        words = ["pseudoref", str(shot), "-o", str(out), "--preset", "draft", "-q", "--estimate"]
+        for estimate, expected in (("oidn-fast", {"oidn": "cpu"}), ("none", {})):
+            assert main([*words, estimate, "--device", "cpu"]) == 0
+            *_, (_, record) = read_records(out)
+            assert record["options"]["device"] == expected
+            (path,) = out.glob("*.exr")
+            assert json.loads(read_exr(path).parts[0].header["ravg/settings"])["device"] == expected

@@ -1,0 +1,47 @@
+"""What torch computes on, by the names that OIDN has too."""
+
+from __future__ import annotations
+
+import torch
+
+from network.train_config import DEVICES
+
+
+def find_device(name: str) -> tuple[str, torch.device]:
+    """Find a device of torch.
+
+    Parameters
+    ----------
+    name : str
+        One of `network.train_config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, metal, cpu.
+
+    Returns
+    -------
+    tuple of str and torch.device
+        Its name, and the device.
+
+    Raises
+    ------
+    ValueError
+        If it is not there; names those that are.
+    """
+    there = {**_accelerators(), "cpu": torch.device("cpu")}
+    if name == "auto":
+        return next(iter(there.items()))
+    if name not in there:
+        known = name in DEVICES
+        what = "one that torch can use here" if known else "one that there is"
+        raise ValueError(f"device is {name!r}, expected {what}: auto, {', '.join(there)}")
+    return name, there[name]
+
+
+def _accelerators() -> dict[str, torch.device]:
+    """Those that torch can use here."""
+    found = {}
+    if torch.cuda.is_available():  # torch calls AMD's so too
+        found["hip" if torch.version.hip else "cuda"] = torch.device("cuda")
+    if torch.xpu.is_available():
+        found["sycl"] = torch.device("xpu")
+    if torch.backends.mps.is_available():
+        found["metal"] = torch.device("mps")
+    return found

@@ -1,0 +1,55 @@
+"""What torch computes on goes by the names that OIDN has."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network import devices
+from network.devices import find_device
+from network.train_config import DEVICES
+
+pytestmark = pytest.mark.neural
+
+
+def only(monkeypatch, *, cuda=False, hip=None, xpu=False, mps=False):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.version, "hip", hip)
+    monkeypatch.setattr(torch.xpu, "is_available", lambda: xpu)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: mps)
+
+
+def test_a_processor_is_always_there():
+    assert find_device("cpu") == ("cpu", torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("there", "name", "kind"),
+    [
+        ({}, "cpu", "cpu"),
+        ({"cuda": True}, "cuda", "cuda"),
+        ({"cuda": True, "hip": "6.2"}, "hip", "cuda"),
+        ({"xpu": True}, "sycl", "xpu"),
+        ({"mps": True}, "metal", "mps"),
+        ({"cuda": True, "xpu": True}, "cuda", "cuda"),
+    ],
+)
+def test_auto_takes_the_first_that_is_there_by_its_name(monkeypatch, there, name, kind):
+    only(monkeypatch, **there)
+    assert find_device("auto") == find_device(name) == (name, torch.device(kind))
+
+
+def test_one_that_is_not_there_is_named_with_those_that_are(monkeypatch):
+    only(monkeypatch, xpu=True)
+    with pytest.raises(ValueError, match=r"device is 'cuda', expected one that torch can use here: auto, sycl, cpu$"):
+        find_device("cuda")
+    with pytest.raises(ValueError, match="device is 'gpu', expected one that there is"):
+        find_device("gpu")
+
+
+def test_every_name_is_a_name_of_oidns_too():
+    from hybrid.oidn import DEVICES as THEIRS
+
+    assert set(DEVICES) == {"auto", *THEIRS}
+    assert set(devices._accelerators()) <= set(THEIRS)
