@@ -198,7 +198,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         unexplained=unexplained,
         fixed_noise=fixed_noise(here, there, moves=changed > 0),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
-        cut=min(changed, unexplained) > CUT and _is_cut(here, there, smalls, vectors),
+        cut=changed > CUT and _is_cut(here, there, smalls, vectors),
     )
 
 
@@ -210,6 +210,8 @@ def _is_cut(
 ) -> bool:
     """Whether neither the vectors nor a flow found in the pictures connects two frames that differ much."""
     shown = smalls[0].textured(), smalls[1].textured()
+    if vectors is not None and _changed(*shown, _reduced(vectors, smalls[0])) <= CUT:
+        return False
     found = _search(shown[0].light, shown[1].light)
     if _changed(*shown, found) <= CUT * _changed(*shown, None):
         return False

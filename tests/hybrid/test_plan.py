@@ -128,3 +128,20 @@ def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_
     # Grain of a standard deviation of 0.3: what is left of it says so, within what a 5×5 box of it varies.
     truth = (0.3 * scene.clean(2)["ViewLayer.Combined"] / window.modulation) ** 2
     assert np.median(window.variance / truth) == pytest.approx(1, abs=0.35)
+
+
+def test_a_cut_is_seen_in_the_texture_where_both_sides_are_lit_alike(tmp_path):
+    """What would be averaged over it is light divided by the albedo, which alone would not tell."""
+
+    def cut(index, layers):
+        if index >= 2:
+            for name in ("ViewLayer.Combined", "ViewLayer.Denoising Albedo"):
+                layers[name][:] = layers[name][::-1].copy()
+
+    scene = Scene(frames=4, height=64, width=96, noise=0.2)
+    assert plan_shot(open_shot(scene.write(tmp_path / "cut", edit=cut))).cuts == ((1002, 1003),)
+    assert plan_shot(open_shot(scene.write(tmp_path / "blind", edit=cut, without={"Vector"}))).cuts == ((1002, 1003),)
+    assert plan_shot(open_shot(scene.write(tmp_path / "whole"))).cuts == ()
+    fast = Scene(frames=4, height=64, width=96, noise=0.2, step=(9, 4))
+    assert plan_shot(open_shot(fast.write(tmp_path / "fast"))).cuts == ()
+    assert plan_shot(open_shot(fast.write(tmp_path / "searched", without={"Vector"}))).cuts == ()
