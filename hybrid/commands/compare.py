@@ -23,6 +23,7 @@ from hybrid.commands.options import (
     choose,
     judge_alike,
     open_input,
+    say_cuts,
 )
 
 if TYPE_CHECKING:
@@ -127,9 +128,11 @@ def compare(
 
     from hybrid.comparison.compare import compare_shot
     from hybrid.comparison.results import Comparison, Cost, join, read_comparison
+    from hybrid.comparison.running import run_apart
     from hybrid.comparison.samples import samples_of
     from hybrid.comparison.store import FrameStore
     from hybrid.comparison.tables import markdown_table, result_table
+    from hybrid.plan import plan_shot
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]
@@ -162,13 +165,13 @@ def compare(
     noisy = alike["shot"]
     clean = [_open_beside(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
+    plan = run_apart(plan_shot, noisy)
+    said += [finding.message for finding in say_cuts(plan, (), strict=strict)]
     if sweep:
         from hybrid.comparison.methods import METHODS
         from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
-        from hybrid.plan import plan_shot
 
-        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}}
-        chosen |= sweep_methods(plan_shot(noisy))
+        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
     pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
     levels = [
         (open_input(pattern, frames, layer, profile=profile), _number(count, "--level")) for pattern, count in pairs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,3 +89,20 @@ def test_layers_are_judged_as_everywhere(tmp_path: Path, capsys: pytest.CaptureF
     assert said in " ".join(capsys.readouterr().err.split())
     assert main([*words, "--motion", "sideways"]) == 2
     assert main([*words, "--profile", "nobody"]) == 2
+
+
+def test_a_cut_is_said_before_methods_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def cut(index: int, layers: dict[str, np.ndarray]) -> None:
+        if index:
+            for name in ("ViewLayer.Combined", "ViewLayer.Denoising Albedo"):
+                layers[name][:] = layers[name][::-1].copy()
+
+    scene, bare = replace(SMALL, height=64, width=96), {"Denoising Normal", "Depth", "Vector"}
+    noisy = scene.write(tmp_path / "noisy", edit=cut, without=bare)
+    clean = scene.write(tmp_path / "clean", edit=cut, without=bare, clean=True)
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1"]
+    assert main([*words, "--strict"]) == 1
+    said = "frames 1001 and 1002 show something else: nothing is averaged over this cut"
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert main(words) == 0
+    assert said in " ".join(capsys.readouterr().err.split())
