@@ -2,48 +2,15 @@
 
 from __future__ import annotations
 
-from functools import reduce
-
 import cv2
 import numpy as np
 from numba import njit
 
-from flow.motion import forward_backward_error
+from flow.warp import interpolate, locate, weigh
 from loops.cores import on_all_cores
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
-
-
-def _agree_forward_backward(flow: np.ndarray, reverse: np.ndarray, first_row: int) -> np.ndarray:
-    """Sundaram's test: 1 where going there and back ends near the start."""
-    error = forward_backward_error(flow, reverse, first_row=first_row)
-    # The loop is f + r, so r at the arrival is about -f within the error: |r| is taken as |f| + error at most.
-    length = np.hypot(flow[..., 0], flow[..., 1])
-    return np.asarray(error**2 < 0.01 * (length**2 + (length + error) ** 2) + 0.5)
-
-
-def _agree_albedo(albedo: np.ndarray, warped: np.ndarray) -> np.ndarray:
-    """exp(-d² / σ²) of the difference, relative where the albedo is above 1 (emitters, sky)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = np.atleast_3d(albedo - warped)
-        # Plane by plane: several times faster than a reduction over so short an axis.
-        planes = (image[..., c] for image in map(np.atleast_3d, (albedo, warped)) for c in range(image.shape[-1]))
-        greatest = reduce(np.maximum, planes)
-        scale = np.square(np.maximum(greatest, 1))
-        return np.asarray(np.exp(-np.einsum("yxc,yxc->yx", difference, difference) / (scale * _ALBEDO_SIGMA**2)))
-
-
-def _agree_normal(normal: np.ndarray, warped: np.ndarray) -> np.ndarray:
-    """clamp((n·n' - 0.8) / 0.2) of the directions; 1 where neither has a surface, 0 where only one has."""
-    square, warped_square, product = (
-        np.einsum("yxc,yxc->yx", a, b) for a, b in ((normal, normal), (warped, warped), (normal, warped))
-    )
-    # Below a tenth of the samples on a surface, the direction is that of a stray sample.
-    surface, warped_surface = square > 0.01, warped_square > 0.01
-    cosine = product / np.sqrt(np.maximum(square * warped_square, 1e-4))
-    agreement = np.clip((cosine - 0.8) / 0.2, 0, 1)
-    return np.asarray(np.where(surface & warped_surface, agreement, surface == warped_surface))
 
 
 def estimate_confidence(
@@ -107,16 +74,67 @@ def estimate_confidence(
     if inside.shape != shape:
         raise ValueError(f"inside has shape {inside.shape}, expected {shape}")
 
-    confidence = inside.astype(np.float32)
-    if reverse is not None:
-        confidence *= _agree_forward_backward(flow, reverse, first_row)
-    with np.errstate(invalid="ignore"):
-        if albedo is not None and warped_albedo is not None:
-            confidence *= _agree_albedo(albedo, warped_albedo)
-        if normal is not None and warped_normal is not None:
-            confidence *= _agree_normal(normal, warped_normal)
-    confidence = np.nan_to_num(confidence, nan=0.0).astype(np.float32)
+    confidence = np.empty(shape, np.float32)
+    absent = np.empty((0, 0, 0), np.float32)
+    layers = [
+        absent if layer is None else np.ascontiguousarray(layer, np.float32).reshape(*layer.shape[:2], -1)
+        for layer in (flow, reverse, albedo, warped_albedo, normal, warped_normal)
+    ]
+    on_all_cores(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _agree(
+    first: int, last: int, inside: np.ndarray, flow: np.ndarray, reverse: np.ndarray, albedo: np.ndarray,
+    warped_albedo: np.ndarray, normal: np.ndarray, warped_normal: np.ndarray, first_row: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Multiply how far motion, albedo and normal agree; layers of no size are left out."""
+    one = np.float32(1)
+    for y in range(first, last):
+        for x in range(out.shape[1]):
+            out[y, x] = 0
+            if not inside[y, x]:
+                continue
+            u, v = flow[y, x, 0], flow[y, x, 1]
+            if reverse.size:
+                height, width = reverse.shape[:2]
+                place = locate(np.float32(x) + u, np.float32(first_row + y) + v, width, height)
+                weights = weigh(place)
+                # Sundaram's test: there and back ends near the start.
+                error = np.hypot(
+                    interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
+                )
+                # The loop is f + r, so r at the arrival is about -f within the error: |r| is |f| + error at most.
+                length = np.hypot(u, v)
+                bound = np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
+                if not error**2 < bound:
+                    continue
+            weight = one
+            if albedo.size:
+                difference, greatest = np.float32(0), one
+                for c in range(albedo.shape[2]):
+                    a, b = albedo[y, x, c], warped_albedo[y, x, c]
+                    difference += (a - b) ** 2
+                    greatest = max(greatest, max(a, b))
+                # Relative where the albedo is above 1 (emitters, sky).
+                weight *= np.exp(-difference / (greatest * greatest * np.float32(_ALBEDO_SIGMA**2)))
+            if normal.size:
+                square, warped_square, product = np.float32(0), np.float32(0), np.float32(0)
+                for c in range(normal.shape[2]):
+                    a, b = normal[y, x, c], warped_normal[y, x, c]
+                    square += a * a
+                    warped_square += b * b
+                    product += a * b
+                # Below a tenth of the samples on a surface, the direction is that of a stray sample.
+                surface, warped_surface = square > np.float32(0.01), warped_square > np.float32(0.01)
+                if surface and warped_surface:
+                    cosine = product / np.sqrt(max(square * warped_square, np.float32(1e-4)))
+                    weight *= min(max((cosine - np.float32(0.8)) / np.float32(0.2), np.float32(0)), one)
+                elif surface != warped_surface:
+                    continue
+            if weight > 0:  # not where a guide is not finite
+                out[y, x] = weight
 
 
 def mix_centre(

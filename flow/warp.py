@@ -179,7 +179,12 @@ _KERNELS: dict[str, Callable[..., None]] = {"nearest": _nearest, "bilinear": _bi
 
 
 def warp(
-    image: np.ndarray, flow: np.ndarray, *, interpolation: str = "bilinear", first_row: int = 0
+    image: np.ndarray,
+    flow: np.ndarray,
+    *,
+    interpolation: str = "bilinear",
+    first_row: int = 0,
+    out: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sample an image, or a stack of any number of AOV channels, where a flow points.
 
@@ -195,6 +200,8 @@ def warp(
         so that it never rings (nor goes below zero) beside a firefly; or "nearest", which leaves noise as it is.
     first_row : int
         The image's row that the first row of `flow` belongs to.
+    out : float32 array, optional
+        Contiguous, of the shape of the result: where it is written. Without: a new one.
 
     Returns
     -------
@@ -207,7 +214,7 @@ def warp(
     Raises
     ------
     ValueError
-        If the shapes do not agree, or `interpolation` is unknown.
+        If the shapes do not agree, `out` is not contiguous float32, or `interpolation` is unknown.
 
     Notes
     -----
@@ -226,11 +233,15 @@ def warp(
     _check_rows(flow, image.shape[:2], first_row)
     source = np.ascontiguousarray(image, np.float32).reshape(*image.shape[:2], -1)
     shape = flow.shape[:2]
-    warped = np.empty((*shape, source.shape[2]), np.float32)
+    whole = *shape, *image.shape[2:]
+    if out is not None and (out.shape != whole or out.dtype != np.float32 or not out.flags.c_contiguous):
+        raise ValueError(f"out is {out.dtype} of shape {out.shape}, expected contiguous float32 of shape {whole}")
+    result = np.empty(whole, np.float32) if out is None else out
+    warped = result.reshape(*shape, source.shape[2])
     inside = np.empty(shape, np.bool_)
     vectors = np.ascontiguousarray(flow, np.float32)
     on_all_cores(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
-    return warped.reshape(*shape, *image.shape[2:]), inside
+    return result, inside
 
 
 def _check_rows(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> None:

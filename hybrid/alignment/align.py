@@ -482,8 +482,8 @@ class Aligner:
 
         Returns them, the confidence that geometry has in them, and what it could be at most: where they show anything.
         """
-        shape = len(numbers), *layers["valid"].shape[:2]
-        window = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n != "valid"}
+        shape = len(numbers), *layers["color"].shape[:2]
+        window = {name: np.empty((*shape, layer.shape[-1]), np.float32) for name, layer in layers.items()}
         confidence, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         for index, neighbour in enumerate(numbers):
             there, link, back = self.frame(neighbour), None, None
@@ -494,15 +494,12 @@ class Aligner:
                 for name, kept in window.items():
                     kept[index] = layers[name]
                 if neighbour == number:
-                    confidence[index] = seen[index] = layers["valid"][..., 0]
+                    confidence[index] = seen[index] = self._frames[number].valid[rows]
                 continue
             with self.timings.stage("warp"):
                 flow, known = link[0][rows], link[1][rows]
-                warped, inside = self._warp(there, layers, flow, rows)
-                for name, kept in window.items():
-                    kept[index] = warped[name]
-                # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
-                measured = known & inside & (warped["valid"][..., 0] > 0.999)
+                warped = {name: kept[index] for name, kept in window.items()}
+                measured = known & self._warp(there, flow, rows, warped)
                 novelty = _novelty(flow) if "fixed-noise" in stages else 1.0
                 seen[index] = novelty * measured
                 confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
@@ -531,17 +528,20 @@ class Aligner:
                 np.copyto(estimates[index], moved, where=seen[index, ..., None] > 0)
         return estimates
 
-    def _warp(
-        self, there: PreparedFrame, wanted: Collection[str], flow: Array, rows: slice
-    ) -> tuple[dict[str, Array], Mask]:
-        """Warp a neighbour's layers to these rows of the centre."""
-        layers = _layers(there, light="light" in wanted, alpha=f"aov {ALPHA}" in wanted)
+    def _warp(self, there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> Mask:
+        """Warp a neighbour's layers to these rows of the centre, into `warped`; say where they show its color."""
+        layers = _layers(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
         if not flow.any():
-            return {name: layers[name][rows] for name in wanted}, np.ones(flow.shape[:2], bool)
-        warped = {}
-        for name, layer in ((name, layers[name]) for name in wanted):
-            warped[name], inside = warp(layer, flow, first_row=rows.start)
-        return warped, inside
+            for name, out in warped.items():
+                out[...] = layers[name][rows]
+            return there.valid[rows]
+        for name, out in warped.items():
+            _, inside = warp(layers[name], flow, first_row=rows.start, out=out)
+        if there.valid.all():
+            return inside
+        # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
+        share, _ = warp(there.valid.astype(np.float32), flow, first_row=rows.start)
+        return np.asarray(inside & (share > 0.999))
 
     def _trust(
         self,
@@ -597,8 +597,7 @@ class Aligner:
             modulation = remodulate(modulation, clean)
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
-            estimates = estimates / modulation
-        if estimates is not None:
+            estimates /= modulation
             gate = color_gate(estimates, color[middle], bright.exposure)
             floor = np.minimum(seen, AGREEING) * gate
             confidence = np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)
@@ -684,7 +683,6 @@ def _layers(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -
         "normal": frame.normal,
         **{f"aov {name}": layer for name, layer in frame.aovs.items()},
         f"aov {ALPHA}": frame.alpha if alpha else None,
-        "valid": frame.valid[..., None].astype(np.float32),
     }
     return {name: layer for name, layer in named.items() if layer is not None}
 

@@ -145,3 +145,23 @@ def test_errors_name_the_argument() -> None:
         warp(image, np.zeros((5, 4, 2)))
     with pytest.raises(ValueError, match="image has shape"):
         warp(np.zeros((0, 5)), np.zeros((0, 5, 2)))
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic", "nearest"])
+def test_the_result_is_written_where_it_is_asked_for(interpolation: str) -> None:
+    rng = np.random.default_rng(7)
+    image, flow = rng.random((9, 11, 3), np.float32), rng.normal(size=(9, 11, 2)).astype(np.float32)
+    window = np.zeros((2, 9, 11, 3), np.float32)
+    warped, inside = warp(image, flow, interpolation=interpolation, out=window[1])
+    expected, expected_inside = warp(image, flow, interpolation=interpolation)
+    assert np.shares_memory(warped, window)
+    np.testing.assert_array_equal(window[1], expected)
+    np.testing.assert_array_equal(inside, expected_inside)
+    assert not window[0].any()
+
+
+@pytest.mark.parametrize("out", [np.zeros((9, 11, 2), np.float32), np.zeros((9, 11, 3)), np.zeros((3, 9, 11), "f4").T])
+def test_a_place_that_does_not_fit_is_refused(out: np.ndarray) -> None:
+    image, flow = np.zeros((9, 11, 3), np.float32), np.zeros((9, 11, 2), np.float32)
+    with pytest.raises(ValueError, match="out is float"):
+        warp(image, flow, out=out)
