@@ -285,6 +285,8 @@ async function showFacts() {
     if (answer.ok) facts = await answer.json();
   }
   pairs($("#frame-facts dl"), { file: facts.file, ...facts.made });
+  const hint = version !== undefined && Object.keys(facts.weights).length === 0;
+  $("#no-weights").hidden = !hint;
   $("#weights").replaceChildren(...Object.entries(facts.weights).map(([frame, weight]) => {
     const row = document.createElement("div"), meter = document.createElement("meter");
     meter.value = weight;

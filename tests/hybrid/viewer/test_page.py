@@ -215,6 +215,7 @@ def test_what_the_run_did_is_told_and_is_no_markup(page):
     assert "nothing changes its light" in page.text_content("#plan")
     assert EVIL in page.text_content("#record dl")
     assert page.evaluate("window.pwned") is None
+    assert "denoise --breakdown" in page.locator("#no-weights").inner_text()
 
 
 def test_weights_of_the_frames_are_shown(browser, tmp_path):
@@ -230,6 +231,7 @@ def test_weights_of_the_frames_are_shown(browser, tmp_path):
         tab.goto(server.url)
         tab.wait_for_selector("#weights meter")
         assert tab.text_content("#weights") == "before10.200centre0.500after10.300"
+        assert tab.locator("#no-weights").is_hidden()
         tab.select_option('[data-side="b"] .layer', "weight.centre")
         settle(tab, 1)
         assert pixel(tab, 0.75) == pytest.approx([128] * 3, abs=1)
