@@ -214,7 +214,7 @@ def denoise_frames(
             made = [_denoise_frame(aligner, number, denoise, rows or shot.shape[0]) for aligner in aligners]
             counted = [counts for _, counts in made]
             facts = aligners[0].facts_of(aligners[0].around(number, radius))
-            plan = as_run(rules.plan(*facts), counted[0].stages)
+            plan = as_run(rules.plan(*facts), counted[0].stages, counted[0].shares)
             layers = [{"color": denoised.color, **denoised.aovs} for denoised, _ in made]
             with timings.stage("check"):
                 for aligner, images in zip(aligners, layers, strict=True):
@@ -292,6 +292,7 @@ class _Counts:
     removed: float
     outliers: int
     stages: frozenset[str]
+    shares: dict[str, float]
 
 
 def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, _Counts]:
@@ -304,7 +305,8 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
         aligned = aligner.align(number, band)
         part = denoise(aligned)
         outliers += aligned.outliers
-        counts = _Counts(aligned.repaired, aligned.fireflies, aligned.removed, outliers, aligned.stages)
+        taken = aligned.repaired, aligned.fireflies, aligned.removed
+        counts = _Counts(*taken, outliers, aligned.stages, aligned.shares)
         named = {("color", ""): part.color}
         named |= {("aovs", name): layer for name, layer in part.aovs.items()}
         named |= {("extra", name): layer for name, layer in part.extra.items()}

@@ -6,7 +6,7 @@ figure that was measured, the threshold it was held against, and the reason in w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,7 +113,7 @@ class Plan:
         )
 
 
-def as_run(plan: Plan, stages: Collection[str]) -> Plan:
+def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | None = None) -> Plan:
     """Say of the plan of a window what ran.
 
     Where there are estimates the gate compares them in any case.
@@ -124,19 +124,23 @@ def as_run(plan: Plan, stages: Collection[str]) -> Plan:
         Of a window.
     stages : collection of str
         That ran.
+    shares : mapping of str to float, optional
+        On what share of the picture, in [0, 1], for those that run only where they are called for.
 
     Returns
     -------
     Plan
     """
     words = "estimates are compared in any case; measured: "
-    return replace(
-        plan,
-        decisions=tuple(
-            replace(d, on=True, reason=words + d.reason) if d.stage in stages and not d.on else d
-            for d in plan.decisions
-        ),
-    )
+    decisions = []
+    for decision in plan.decisions:
+        reason = decision.reason
+        if decision.stage in stages and not decision.on:
+            reason = words + reason
+        if shares is not None and decision.stage in shares:
+            reason += f"; it ran on {shares[decision.stage]:.0%} of it"
+        decisions.append(replace(decision, on=decision.on or decision.stage in stages, reason=reason))
+    return replace(plan, decisions=tuple(decisions))
 
 
 @dataclass(frozen=True)

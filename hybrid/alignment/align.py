@@ -7,7 +7,7 @@ both read the `AlignedWindow` that it returns, and nothing after it warps again.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Protocol
@@ -100,6 +100,8 @@ class AlignedWindow:
         The rows that were asked for. Those around them are there because the result depends on them.
     stages : frozenset of str
         The stages that made it.
+    shares : dict of str to float
+        On what share of the picture a stage ran that runs only where it is called for, in [0, 1].
     """
 
     number: int
@@ -123,6 +125,7 @@ class AlignedWindow:
     moments: NDArray[np.float64]
     inner: slice
     stages: frozenset[str]
+    shares: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def guide(self) -> Array | None:
@@ -256,6 +259,7 @@ class Aligner:
         self.pair_facts: dict[tuple[int, int], PairFacts] = {}
         self.estimates: dict[int, Array | None] = {}
         self._flows: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
+        self._refined: dict[tuple[int, int], float] = {}  # on what share of the picture
         self._chains: dict[tuple[int, int], tuple[Array, Mask]] = {}
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
@@ -305,6 +309,7 @@ class Aligner:
         self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
         self._small = {n: small for n, small in self._small.items() if n in numbers}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
+        self._refined = {ab: share for ab, share in self._refined.items() if ab in self._flows}
         self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in numbers}
         for n in numbers:
             if n not in self._frames and self.shot.has(n):
@@ -420,24 +425,31 @@ class Aligner:
         # Of the earlier frame, so that it is the same from whichever side the pair is seen.
         exposure = measure_exposure(min(here, there, key=lambda frame: frame.number).radiance)
         guides = [make_guide(frame.radiance, frame.albedo, exposure=exposure) for frame in (here, there)]
+        if dense:
+            ones = np.ones(shape, bool)
+            return (dense_flow(pair_guides(*guides)), ones), (dense_flow(pair_guides(*reversed(guides))), ones)
+        pair = here.number, there.number
         return (
-            self._correct(pair_guides(*guides), forth, back, dense=dense),
-            self._correct(pair_guides(*reversed(guides)), back, forth, dense=dense),
+            self._correct(pair, pair_guides(*guides), forth, back),
+            self._correct(pair[::-1], pair_guides(*reversed(guides)), back, forth),
         )
 
     def _correct(
-        self, guides: GuidePair, given: tuple[Array, Mask] | None, back: tuple[Array, Mask] | None, *, dense: bool
+        self,
+        pair: tuple[int, int],
+        guides: GuidePair,
+        given: tuple[Array, Mask] | None,
+        back: tuple[Array, Mask] | None,
     ) -> tuple[Array, Mask] | None:
-        """Find a flow in the pictures, or correct the renderer's where they say that it is wrong."""
-        if dense:
-            return dense_flow(guides), np.ones(guides.centre.shape[:2], bool)
+        """Correct the renderer's flow where the pictures say that it is wrong."""
         if given is None:
             return None
         flow, valid = given
         # Hidden in the other frame: whatever matches there is another surface.
         visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
-        flow, _ = select_flow([flow, self.refine(guides, flow)], guides, visible=visible)
-        return flow, valid
+        refined = self.refine(guides, flow)
+        self._refined[pair] = float(np.mean((refined != flow).any(axis=-1)))
+        return select_flow([flow, refined], guides, visible=visible)[0], valid
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
         # Those of this window serve the later ones, which see the same pairs from the other side.
@@ -522,10 +534,12 @@ class Aligner:
             with self.timings.stage("warp"):
                 # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth up to
                 # 0.5 dB here.
-                moved = there[rows]
                 if link[0].any():
-                    moved, _ = warp(there, link[0][rows], interpolation="bicubic", first_row=rows.start)
-                np.copyto(estimates[index], moved, where=seen[index, ..., None] > 0)
+                    flow = link[0][rows]
+                    warp(there, flow, interpolation="bicubic", first_row=rows.start, out=estimates[index])
+                else:
+                    estimates[index] = there[rows]
+                np.copyto(estimates[index], alone[rows], where=seen[index, ..., None] == 0)
         return estimates
 
     def _warp(self, there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> Mask:
@@ -587,6 +601,8 @@ class Aligner:
         lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
         bright = lit.as_light if "light" in window else lit.as_rendered
         outliers = 0
+        near = {*self.around(centre.number, self.radius)}
+        refined = [share for pair, share in self._refined.items() if {*pair} <= near]
         if "outliers" in stages:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected[:, inner]))
@@ -625,6 +641,7 @@ class Aligner:
             moments=bright.moments,
             inner=inner,
             stages=stages,
+            shares={"refine": float(np.mean(refined))} if refined else {},
         )
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from hybrid.alignment.align import Aligner
 from hybrid.files.frames import open_shot
-from hybrid.plan import STAGES, Rules, plan_shot
+from hybrid.plan import STAGES, Rules, as_run, plan_shot
 from tests.scenes import Scene
 
 
@@ -51,6 +51,15 @@ def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gat
     found = decisions(Scene().write(tmp_path, edit=reflect))
     assert found["refine"].on
     assert found["gate"].on
+
+
+def test_what_ran_on_a_part_of_the_picture_says_on_how_much(shot_folder):
+    plan = plan_shot(open_shot(shot_folder))
+    ran = {d.stage: d for d in as_run(plan, {"refine", "warp"}, {"refine": 0.19}).decisions}
+    before = {d.stage: d for d in plan.decisions}
+    assert ran["refine"].on
+    assert ran["refine"].reason.endswith("; it ran on 19% of it")
+    assert ran["warp"] == before["warp"]
 
 
 def test_fireflies_call_for_rejection(tmp_path):

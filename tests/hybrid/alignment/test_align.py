@@ -58,6 +58,18 @@ def test_what_refines_is_given_the_vectors_of_the_renderer(fast_folder):
     assert found == [(-12.8, -8.1), (12.8, 8.1)]
 
 
+@pytest.mark.parametrize("part", [0.0, 0.25, 1.0])
+def test_the_window_says_on_what_share_of_the_picture_vectors_were_solved_for(fast_folder, part):
+    def solve(guides, start):
+        solved = start.copy()
+        solved[: round(part * len(start))] += 1
+        return solved
+
+    aligner = Aligner(open_shot(fast_folder), STAGES | {"refine"}, radius=1, refine=solve)
+    assert aligner.align(FAST.first + 1).shares == {"refine": pytest.approx(part)}
+    assert Aligner(open_shot(fast_folder), STAGES, radius=1).align(FAST.first + 1).shares == {}
+
+
 def test_without_refinement_nothing_is_refined(fast_folder):
     def fail(guides, start):
         raise AssertionError("refined")
