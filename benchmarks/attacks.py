@@ -153,7 +153,7 @@ def row_15() -> Cases:
         ("a frame in the middle gone", [], [], lambda f: (f / "in" / "shot.1003.exr").unlink()),
         ("another compression, the same pixels", [], [], lambda f: write(f / "in" / "shot.1002.exr", _layers_of(f / "in" / "shot.1002.exr"))),
         ("outputs that were exchanged", [], [], lambda f: _exchange(f / "out" / "shot.1002.exr", f / "out" / "shot.1005.exr")),
-        ("an output made read-only and old", [], ["--preset", "draft", "--no-effects", "gate"], lambda f: os.chmod(f / "out" / "shot.1002.exr", 0o444)),
+        ("an output made read-only and old", [], ["--preset", "draft", "--no-stages", "gate"], lambda f: os.chmod(f / "out" / "shot.1002.exr", 0o444)),
     ):  # fmt: skip
         yield name, partial(as_fresh, before, after, change)
     layered = partial(as_fresh, [], [], edit=two_layers)
@@ -820,7 +820,7 @@ def row_23() -> Cases:
             [],
         ),
     )
-    yield "another option", partial(stereo, nothing, ["--no-effects", "warp"])
+    yield "another option", partial(stereo, nothing, ["--no-stages", "warp"])
     for output in ("out.####.exr", "in/shot.%V.####.exr", "out.exr"):
         yield f"stereo to {output}", partial(stereo_refused, output)
     yield "two views in one file", partial(views_in_a_file, both_views)

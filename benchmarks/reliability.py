@@ -114,7 +114,7 @@ EVENTS: dict[str, Edit] = {
     "a firefly": sparks(1),
     "five fireflies": sparks(5, 800),
 }
-FORCED = "--effects", "warp", "--effects", "gate", "--effects", "outliers"
+FORCED = "--stages", "warp", "--stages", "gate", "--stages", "outliers"
 
 
 def odd_window(edit: Edit, given: bool, folder: Path) -> str | None:
@@ -509,8 +509,8 @@ CHANGES: dict[str, Callable[[Project], object]] = {
 }
 OPTIONS: dict[str, Sequence[object]] = {
     "a layer left out": ("--layer", "normal=Denoising Albedo"),
-    "a stage forced on": ("--effects", "refine"),
-    "a stage forced off": ("--no-effects", "gate"),
+    "a stage forced on": ("--stages", "refine"),
+    "a stage forced off": ("--no-stages", "gate"),
     "another preset": ("--preset", "final", "--estimate", "none"),
     "no estimates": ("--estimate", "none"),
     "our own estimates": ("--estimate", "nlm"),
@@ -1174,7 +1174,7 @@ def row_13() -> Cases:
         ["--max-memory", "0"], ["--max-memory", "0G"], ["-o", ""], ["-o", "x.tif"], ["-o", "x.####.png"],
         ["--layer", "color="], ["--layer", "=x"], ["--layer", "nonsense=x"], ["--layer", "albedo"],
         ["--max-memory", ""], ["--max-memory", "-1G"], ["--preset", "best"], ["--frames", ""], ["--frames", "1-x"],
-        ["--effects", "magic"], ["--preview", "x.tif"], ["--max-pixels", "0"],
+        ["--stages", "magic"], ["--preview", "x.tif"], ["--max-pixels", "0"],
     ):  # fmt: skip
         yield f"usage: {' '.join(map(str, words))}", partial(usage, words)
 

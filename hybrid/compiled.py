@@ -53,7 +53,7 @@ def _temporary_folder() -> str | None:
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
-        LOG.warning("compiled loops cannot be kept anywhere: each run compiles them for about a minute")
+        LOG.warning("compiled loops cannot be kept anywhere: each run compiles them for some fifteen seconds")
         return None
     LOG.info(f"compiled loops are kept in {folder}: neither where ravg is installed nor in ~/.cache can be written to")
     return str(folder)

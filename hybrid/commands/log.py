@@ -319,7 +319,7 @@ def tell_of_compiling() -> Iterator[None]:
 
         def on_start(self, event: Any) -> None:
             if not self.said:
-                LOG.info("compiling for this processor, once: it takes about a minute, and is kept for later runs")
+                LOG.info("compiling for this processor, once: some fifteen seconds, and kept for later runs")
             self.said = True
 
         def on_end(self, event: Any) -> None:

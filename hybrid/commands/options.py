@@ -128,13 +128,11 @@ SheetOption = Annotated[
 ]
 OnOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--stages", "--effects", metavar="NAME", help="run a stage, whatever the plan says", rich_help_panel=WHAT
-    ),
+    typer.Option("--stages", metavar="NAME", help="run a stage, whatever the plan says", rich_help_panel=WHAT),
 ]
 OffOption = Annotated[
     list[str] | None,
-    typer.Option("--no-stages", "--no-effects", metavar="NAME", help="do not run a stage", rich_help_panel=WHAT),
+    typer.Option("--no-stages", metavar="NAME", help="do not run a stage", rich_help_panel=WHAT),
 ]
 EstimateOption = Annotated[
     str,

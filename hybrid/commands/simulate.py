@@ -34,7 +34,7 @@ def simulate(
         ),
     ],
     frames: Annotated[
-        str, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010", rich_help_panel=INPUT)
+        str, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2", rich_help_panel=INPUT)
     ] = "1-7",
     size: Annotated[str, typer.Option(metavar="WxH", help="of what is rendered", rich_help_panel=WHAT)] = "320x180",
     film: Annotated[
@@ -68,7 +68,7 @@ def simulate(
     ] = None,
     motion: Annotated[
         Literal["auto", "keep", "add"],
-        typer.Option(help="auto: add motion to a file that has none", rich_help_panel=WHAT),
+        typer.Option("--animate", help="auto: add motion to a file that has none", rich_help_panel=WHAT),
     ] = "auto",
     movers: Annotated[
         int | None,

@@ -80,7 +80,7 @@ def test_resume_makes_only_what_is_missing_damaged_or_outdated(tmp_path, capsys)
     assert made_again() == {"shot.1001.exr"}
     assert {path.name: path.read_bytes() for path in out.glob("*.exr")} == whole
     # other settings, other pixels: the wall moves, so the plan has what is forced off here
-    assert len(made_again("--no-effects", "warp")) == 3
+    assert len(made_again("--no-stages", "warp")) == 3
     assert len(made_again("--preset", "standard")) == 3
     assert len(made_again()) == 3
     # a frame that was rendered again changes itself and its neighbours
@@ -448,7 +448,7 @@ def test_memory_that_is_kept_is_not_fetched_page_by_page():
 def test_one_thread_or_two_give_the_same_bytes(tmp_path):
     folder = Scene(height=80, width=96).write(tmp_path / "in")
     for count in ("1", "2"):
-        words = ["-m", "hybrid.cli", "pseudoref", str(folder), "-o", str(tmp_path / count), "--effects", "refine"]
+        words = ["-m", "hybrid.cli", "pseudoref", str(folder), "-o", str(tmp_path / count), "--stages", "refine"]
         done = run_alone(*words, NUMBA_NUM_THREADS=count, OMP_NUM_THREADS=count)
         assert done.returncode == 0, done.stderr
     assert contents(tmp_path / "1") == contents(tmp_path / "2")

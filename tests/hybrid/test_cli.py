@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 
-from hybrid.cli import main
+from hybrid.cli import app, main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr, write_layers
 from hybrid.records import read_records
@@ -42,6 +43,31 @@ def test_options_have_one_name_and_one_group_everywhere(command, capsys):
     assert "--output" in out or command == "inspect"
     groups = [line for line in out.splitlines() if line.startswith("╭")]
     assert len(groups) >= 4
+
+
+# Of these each command says more: what comes out, of which networks, what is random, how many of what.
+SAID_BY_EACH = {
+    "--output",
+    "--preset",
+    "--seed",
+    "--threads",
+    "--tile",
+    "--levels",
+    "--reference",
+    "--resume",
+    "--beside",
+}
+
+
+def test_an_option_of_one_name_says_the_same_in_every_command():
+    said: dict[str, dict[str, set[str]]] = {}
+    for name, command in typer.main.get_command(app).commands.items():
+        for parameter in command.params:
+            for option in parameter.opts:
+                said.setdefault(option, {}).setdefault(parameter.help, set()).add(name)
+    assert {"denoise", "pseudoref", "inspect"} <= set.union(*said["--stages"].values())
+    differ = {option for option, helps in said.items() if len(helps) > 1 and option.startswith("--")}
+    assert differ <= SAID_BY_EACH | {"--estimate"}  # prepare has it "as for denoise"
 
 
 def test_inspect_as_json(shot_folder, capsys):
@@ -104,7 +130,7 @@ def test_pseudoref_writes_denoised_frames_that_keep_everything_else(tmp_path, ca
 
 
 def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
-    _, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-effects", "warp")
+    _, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-stages", "warp")
     assert "not run: warp (forced" in " ".join(err.split())
 
 
@@ -179,7 +205,7 @@ def test_fireflies_are_counted_in_every_window_they_are_in(tmp_path, capsys):
             layers["ViewLayer.Combined"][20, 30] = layers["ViewLayer.Combined"][10, 40] = 1e5
 
     folder, out = Scene().write(tmp_path / "in", edit=sparks), tmp_path / "out"
-    stages = ["--effects", "outliers", "--no-effects", "fireflies"]  # which would take them out of their frame before
+    stages = ["--stages", "outliers", "--no-stages", "fireflies"]  # which would take them out of their frame before
     code, _, err = run(capsys, "pseudoref", folder, "-o", out, "--preset", "draft", *stages)
     assert code == 0, err
     ((_, report),) = read_records(out)
@@ -267,7 +293,7 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["compare", "SHOT", "--reference", "SHOT", "--clock", "sun"],
         ["simulate", "random", "-o", "OUT", "--size", "large"],
         ["simulate", "random", "-o", "OUT", "--frames", "a-b"],
-        ["simulate", "random", "-o", "OUT", "--motion", "perhaps"],
+        ["simulate", "random", "-o", "OUT", "--animate", "perhaps"],
         ["simulate", "random", "-o", "OUT", "--jobs", "0"],
     ],
 )

@@ -267,8 +267,8 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
         first = []
         for folder in folders:
             out = tmp_path / f"{folder.name}{passes}"
-            options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--effects", "warp"]
-            code = run("denoise", folder, "-o", out, "--passes", passes, "--no-effects", "refine", *options)
+            options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--stages", "warp"]
+            code = run("denoise", folder, "-o", out, "--passes", passes, "--no-stages", "refine", *options)
             assert code == 0, capsys.readouterr().err
             left = {item.name for item in out.iterdir()}  # nothing of the first pass
             assert left == {"ravg", *(f"shot.{number}.exr" for number in (1001, 1002, 1003))}
@@ -279,7 +279,7 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
 
 
 # All stages said, so that no plan is measured on other frames, or on a denoised picture.
-STAGES = ["--effects", "demodulate,warp", "--no-effects", "outliers,refine,gate,fixed-noise,prefilter,alpha,skip"]
+STAGES = ["--stages", "demodulate,warp", "--no-stages", "outliers,refine,gate,fixed-noise,prefilter,alpha,skip"]
 
 
 def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, monkeypatch):
