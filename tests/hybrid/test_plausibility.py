@@ -14,7 +14,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.frames import Shot, open_shot
 from hybrid.plan import plan_shot
 from hybrid.plausibility import find_cut, find_lost_light, find_nonfinite, judge_layers
 from tests.hybrid.test_renderers import denoised
@@ -23,6 +23,7 @@ from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_ve
 FRAMES = truths()
 REFERENCE = open_shot(SHOT / "reference.0010.exr").read(10).color
 LIGHT = "ViewLayer.Combined"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "shot"
 
 
 def cycles(truth: Truth) -> Channels:
@@ -204,6 +205,16 @@ def test_what_makes_sense_gives_no_finding() -> None:
     assert judgement.findings == ()
     assert judgement.motion is not None
     assert judgement.variance_scale is None
+
+
+def test_no_frame_is_read_twice_and_a_second_pair_only_where_one_leaves_a_question(tmp_path, monkeypatch) -> None:
+    bundled, wrong = EXAMPLE / "noisy.####.exr", write(tmp_path, vector(lambda v: -v))
+    read = Shot.read
+    for spec, motion, count in ((bundled, None, 2), (bundled, "auto", 2), (wrong, None, 4)):
+        numbers: list[int] = []
+        monkeypatch.setattr(Shot, "read", lambda shot, number, seen=numbers: seen.append(number) or read(shot, number))
+        judge_layers(open_shot(spec, keep=0, motion=motion))
+        assert len(numbers) == len(set(numbers)) == count, (spec, motion)
 
 
 def test_the_judgement_is_of_the_shot_and_not_of_the_frames_asked_for(tmp_path) -> None:
