@@ -502,7 +502,6 @@ CHANGES: dict[str, Callable[[Project], object]] = {
         shutil.copy2(x, p.estimates / x.name) for x in p.frames.iterdir()
     ],
     "an output that is another frame's": lambda p: shutil.copy2(p.out / "shot.1005.exr", p.out / "shot.1004.exr"),
-    "an output that somebody has painted on": lambda p: rendered_again(p.out / "shot.1004.exr", time.time() + 5),
     "an output cut short": lambda p: os.truncate(p.out / "shot.1004.exr", 3000),
     "an empty output": lambda p: os.truncate(p.out / "shot.1004.exr", 0),
     "an output that is an input": lambda p: shutil.copy2(p.frame(1004), p.out / "shot.1004.exr"),
