@@ -275,6 +275,7 @@ def try_case(case: Case) -> str | None:
 def try_rows(table: Rows, rows: Sequence[int]) -> dict[int, tuple[int, int]]:
     """Row → cases, and how many of them hold; what does not goes to standard error."""
     _import_all()
+    _warm_up()
     counts = {}
     for row in rows:
         cases = holding = 0
@@ -296,7 +297,8 @@ def try_rows(table: Rows, rows: Sequence[int]) -> dict[int, tuple[int, int]]:
 def _import_all() -> None:
     """Import what is tried, so that processes that are forked need not."""
     sys.path.insert(0, str(PACKAGES))
-    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    # One thread, of a kind that a process may be forked from.
+    os.environ |= {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}
     cv2.setNumThreads(1)
     for package in OURS:
         found = importlib.import_module(package)
@@ -306,6 +308,22 @@ def _import_all() -> None:
                     importlib.import_module(module.name)
     if not Path(sys.modules["hybrid"].__file__ or "").is_relative_to(PACKAGES):
         raise RuntimeError(f"hybrid is not that of {PACKAGES}")
+
+
+def _warm_up() -> None:
+    """Load the compiled loops here, once, and not in each process that is forked."""
+    from hybrid.cli import main
+
+    kept = [os.dup(descriptor) for descriptor in (1, 2)]
+    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere:
+        for descriptor in (1, 2):
+            os.dup2(nowhere.fileno(), descriptor)
+        for preset in ("draft", "final"):
+            noisy = shot(Path(folder, "in"), 3, step=(2, 1))
+            main(["pseudoref", str(noisy), "-o", str(Path(folder, preset)), "--preset", preset])
+    for descriptor, original in zip((1, 2), kept, strict=True):
+        os.dup2(original, descriptor)
+        os.close(original)
 
 
 def run(table: Rows, script: str, about: str, argv: Sequence[str] | None = None) -> int:
