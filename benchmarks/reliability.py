@@ -122,8 +122,11 @@ def odd_window(edit: Edit, given: bool, folder: Path) -> str | None:
     noisy, clean = shot(folder / "in", 18, edit), shot(folder / "clean", 18, edit, noise=0)
     more = ["--estimate", blurred(folder / "single", noisy)] if given else []
     for out, forced in (("planned", ()), ("forced", FORCED)):
-        if failed := ravg("pseudoref", noisy, "-o", folder / out, *DRAFT, *more, *forced).failed:
-            return failed
+        done = ravg("pseudoref", noisy, "-o", folder / out, *more, *forced)
+        if given and f"error: the estimate of frame {1001 + ODD}: it has" in done.said:
+            return None  # what has spread a firefly's light all over a small picture is not believed
+        if done.failed:
+            return done.failed
     for index in range(ODD - 3, ODD + 4):
         name = f"shot.{1001 + index:04d}.exr"
         truth = color(clean / name)
@@ -161,7 +164,7 @@ def row_1() -> Cases:
             yield f"{name}{', beside estimates' * given}", partial(odd_window, edit, given)
         yield f"{name}, in chunks", partial(same_in_chunks, edit)
     yield "inspect says where the light changes", partial(told_where, flare(5), "gate", "1005-1009")
-    yield "inspect says where something moves", partial(told_where, burst, "warp", "1006-1012")
+    yield "inspect says where something moves", partial(told_where, burst, "warp", "1006-1011")
     yield "inspect says where fireflies are", partial(told_where, sparks(1), "fireflies", "1005-1009")
 
 

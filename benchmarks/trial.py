@@ -321,6 +321,8 @@ def _warm_up() -> None:
         for preset in ("draft", "final"):
             noisy = shot(Path(folder, "in"), 3, step=(2, 1))
             main(["pseudoref", str(noisy), "-o", str(Path(folder, preset)), "--preset", preset])
+        for words in (["denoise", "--help"], ["inspect", str(noisy)]):
+            main(words)
     for descriptor, original in zip((1, 2), kept, strict=True):
         os.dup2(original, descriptor)
         os.close(original)

@@ -35,6 +35,9 @@ SAME = 2.0**-10
 # Means of 9×9 of guides that differ by more, in units of albedo, show something else; a lens leaves noise of 0.05 in a
 # pixel, and a tenth of it in these.
 GUIDE_CHANGE = 0.02
+# Noise hides in 9×9 pixels what means of larger areas show: where they differ by more than a twentieth, and by eight
+# times what noise makes them differ by; samples that a pixel filter spreads are alike in several pixels.
+AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
 # A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32
@@ -189,13 +192,14 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         factor = smalls[0].factor
         flow = vectors[0][factor // 2 :: factor, factor // 2 :: factor]
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
-    unexplained = changed if vectors is None else _changed(*smalls, _reduced(vectors, smalls[0]))
+    reduced = None if vectors is None else _reduced(vectors, smalls[0])
+    unexplained = changed if reduced is None else _changed(*smalls, reduced)
     return PairFacts(
         numbers=(here.number, there.number),
         vectors=vectors is not None,
         speed=speed,
         changed=changed,
-        unexplained=unexplained,
+        unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
         fixed_noise=fixed_noise(here, there, moves=changed > 0),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=changed > CUT and _is_cut(here, there, smalls, vectors),
@@ -297,6 +301,32 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
     # noise brings one in a thousand.
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
+
+
+def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
+    """Share of the picture in areas whose mean light differs by more than noise, along `vectors`.
+
+    Areas are of 32×32 pixels, or the whole picture at once. Differences are relative to the light of both, or to a
+    twentieth of the exposure in the dark. They are not tone-mapped: of less noise, as after warping, that makes light.
+    """
+    shape = here.light.shape[:2]
+    both, light, inside = [here.irradiance, there.irradiance], there.light, np.ones(shape, bool)
+    if vectors is not None:
+        (both[1], inside), (light, _) = warp(there.irradiance, vectors[0]), warp(there.light, vectors[0])
+        inside &= vectors[1]
+    floor = np.float32(0.05 * measure_exposure(here.light))
+    level = 0.5 * (_level(here.light) + _level(light)) + floor
+    difference = np.where(inside, (_level(both[1]) - _level(both[0])) / level, np.float32(0))
+    sums = np.stack([difference, np.square(difference), inside.astype(np.float32)], axis=-1)
+    shares = [0.0]
+    for side in {min(AREA, *shape), min(shape)} - {*range(8)}:  # of fewer pixels nobody knows the noise
+        mean, square, known = np.moveaxis(_means(sums, side).astype(np.float64), 2, 0)
+        full = known > 0.5
+        mean, square = mean[full] / known[full], square[full] / known[full]
+        error = np.sqrt(np.maximum(square - np.square(mean), 0) / (side**2 * known[full]))
+        changed = (np.abs(mean) > AREA_CHANGE) & (np.abs(mean) > AREA_NOISE * error)
+        shares.append(float(changed.sum() / full.size))
+    return max(shares)
 
 
 def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mask]:

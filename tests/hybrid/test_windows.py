@@ -276,6 +276,20 @@ def flow_of(shot, rules):
     return aligner.flow(1002, 1003)
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.18, 0.84])
+@pytest.mark.parametrize("step", [(0, 0), (2, 1)])
+def test_another_exposure_shows_through_noise_that_hides_it_in_small_areas(tmp_path, factor, step):
+    """9×9 pixels of a noisy frame did not tell 18 % of light: two frames before it came out 2 % too bright."""
+
+    def edit(index, layers):
+        if index == 4:
+            layers["ViewLayer.Combined"] *= np.float32(factor)
+
+    scene = Scene(frames=8, step=step, height=64, width=96, noise=0.45)
+    found = {d.stage: d for d in plan_shot(open_shot(scene.write(tmp_path, edit=edit))).decisions}
+    assert found["gate"].frames == (() if factor == 1 else tuple(range(1003, 1008)))
+
+
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_without_vectors_a_drift_of_one_pixel_shows_in_the_guides(tmp_path, noise):
     """Noise hides it in the color; averaged as if it stood still, such a shot lost 3 to 5 dB."""
