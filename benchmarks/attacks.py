@@ -683,7 +683,8 @@ def together(words: Sequence[Sequence[object]], folder: Path) -> str | None:
     if failed := [text.strip()[-200:] for text, process in zip(said, running, strict=True) if process.returncode]:
         return failed[0]
     for index, more in enumerate(words):
-        if failed := ravg("pseudoref", "in", "-o", f"alone{index}", *more, folder=folder).failed:
+        options = [word for word in more if word != "--frames" and not str(word).startswith("100")]
+        if failed := ravg("pseudoref", "in", "-o", f"alone{index}", *options, folder=folder).failed:
             return str(failed)
     for name in sorted(names(folder / "in")):
         if all(differ(folder / f"alone{index}", folder / "out", {name}) for index in range(len(words))):
