@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -108,9 +109,11 @@ def result_table(results: Sequence[MethodResult]) -> Table:
     """
     columns = [m for m in present_metrics(results, METRICS) if m.key in CHART_METRICS]
     verdicts = {m.key: best_and_ties(results, m) for m in columns}
-    table = Table("method")
+    # Within 80 columns names break between words, and no figure breaks.
+    table = Table("method", box=SIMPLE_HEAD, padding=0, show_edge=False)
     for heading in (*map(column_title, columns), "s / MP", "CPU-s / MP", "peak", "worth"):
-        table.add_column(heading, justify="right")
+        widest = len("1.23 GiB") if heading == "peak" else max(map(len, heading.split()))
+        table.add_column(heading, justify="right", min_width=widest)
     for r in results:
         if r.absent_reason is not None:
             table.add_row(escape(r.label), *("–" for _ in table.columns[1:]), style="dim")
@@ -119,7 +122,7 @@ def result_table(results: Sequence[MethodResult]) -> Table:
         for m in columns:
             text = format_value(r.metrics[m.key].mean, m) if m.key in r.metrics else "–"
             best, ties = verdicts[m.key]
-            cells.append(f"[bold]{text}[/]" if r.name == best else f"≈ {text}" if r.name in ties else text)
+            cells.append(f"[bold]{text}[/]" if r.name == best else f"≈{text}" if r.name in ties else text)
         costs = format_seconds(r.seconds_per_megapixel), format_seconds(r.cpu_seconds_per_megapixel)
         table.add_row(escape(r.label), *cells, *costs, format_bytes(r.peak_bytes), format_worth(r.worth))
     absent = [f"{r.label}: {r.absent_reason}" for r in results if r.absent_reason is not None]

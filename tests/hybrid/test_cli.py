@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -33,6 +35,21 @@ def test_help_works(capsys, word):
 
 def test_the_version_is_that_of_the_package(capsys):
     assert run(capsys, "--version")[:2] == (0, f"ravg {version('ravg')}\n")
+
+
+def test_completion_can_be_had_and_completes(capsys, monkeypatch):
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    code, out, _ = run(capsys, "--show-completion", "bash")
+    assert code == 0
+    assert "_RAVG_COMPLETE=complete_bash" in out
+    done = subprocess.run(
+        [sys.executable, "-m", "hybrid.cli"],
+        env={**os.environ, "_RAVG_COMPLETE": "complete_bash", "COMP_WORDS": "ravg den", "COMP_CWORD": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["denoise"]
 
 
 @pytest.mark.parametrize("command", ["inspect", "denoise", "pseudoref", "compare", "prepare", "train", "simulate"])
