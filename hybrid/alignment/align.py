@@ -424,15 +424,13 @@ class Aligner:
             return forth, back  # where there are none, something moves, and nobody is to say where to
         # Of the earlier frame, so that it is the same from whichever side the pair is seen.
         exposure = measure_exposure(min(here, there, key=lambda frame: frame.number).radiance)
-        guides = [make_guide(frame.radiance, frame.albedo, exposure=exposure) for frame in (here, there)]
+        guides = pair_guides(*(make_guide(frame.radiance, frame.albedo, exposure=exposure) for frame in (here, there)))
+        reverse = guides._replace(centre=guides.neighbour, neighbour=guides.centre)
         if dense:
             ones = np.ones(shape, bool)
-            return (dense_flow(pair_guides(*guides)), ones), (dense_flow(pair_guides(*reversed(guides))), ones)
+            return (dense_flow(guides), ones), (dense_flow(reverse), ones)
         pair = here.number, there.number
-        return (
-            self._correct(pair, pair_guides(*guides), forth, back),
-            self._correct(pair[::-1], pair_guides(*reversed(guides)), back, forth),
-        )
+        return self._correct(pair, guides, forth, back), self._correct(pair[::-1], reverse, back, forth)
 
     def _correct(
         self,
