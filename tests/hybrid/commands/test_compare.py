@@ -38,7 +38,7 @@ def test_a_hostile_name_is_shown_as_it_is(
     code = main(["compare", *map(str, words), "--rounds", "1", "-o", str(tmp_path / "out" / "report")])
     printed = capsys.readouterr()
     assert code == 0, printed.err
-    assert f" {name} " in printed.out
+    assert f"\n{name} " in printed.out
     page = (tmp_path / "out" / "report" / "report.html").read_text(encoding="utf-8")
     assert "<img" not in page
     assert {path.name for path in tmp_path.iterdir()} == {"noisy", "clean", "out"}

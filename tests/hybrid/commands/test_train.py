@@ -320,7 +320,8 @@ def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
         assert run("denoise", folder, "-o", tmp_path / f"out{passes}", *options) == 0
         noisy.append([cv2.imread(str(path))[: SCENE.height, : SCENE.width] for path in pictures])
     np.testing.assert_array_equal(*noisy)
-    np.testing.assert_array_equal(*noisy[0])  # both are exposed alike
+    preview, parts = (picture.astype(int) for picture in noisy[0])
+    np.testing.assert_allclose(preview, parts, atol=1)  # both are exposed alike; roundings differ
 
 
 def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):

@@ -88,6 +88,6 @@ def test_methods_are_told_apart_by_names_that_a_command_line_can_list() -> None:
 def test_a_missing_estimate_makes_a_method_absent(shot: Shot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from hybrid import estimates
 
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: False)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: "pyoidn is not installed")
     with pytest.raises(ImportError, match="pyoidn is not installed"):
         next(METHODS["gated OIDN"].run(shot))

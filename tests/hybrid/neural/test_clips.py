@@ -85,7 +85,7 @@ def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_p
 def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path, monkeypatch):
     found: list[Clip] = []
     monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
-    monkeypatch.setattr(estimates, "_has_oidn", lambda: True)
+    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
     for place in (estimates, pseudo_reference):
         monkeypatch.setattr(place, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
