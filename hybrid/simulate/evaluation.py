@@ -195,10 +195,14 @@ def lens(rng: Rng, frames: range) -> None:
                     name="marble")  # fmt: skip
     place(marble, (0.034, -0.03, 0.0085))
     move(marble, frames, velocity=(-0.0016, 0.008, 0), spin=(-0.94, -0.19, 0))
-    # Behind, lower than the table: a glass at its edge, candles and lamps of the room, a lantern that is carried by.
-    tumbler = plain("glass", (1, 1, 1), Roughness=0, Transmission_Weight=1, IOR=1.45)
-    glass = [(0, 0), (0.03, 0), (0.036, 0.09), (0.0345, 0.09), (0.029, 0.008), (0, 0.007)]
-    place(turned(glass, tumbler, name="glass"), (0.1, 0.33, 0.0))
+    # Behind: a mug near the table's edge; lower, candles and lamps of the room, a lantern that is carried by.
+    # Nothing here is glass, whose caustics of small lamps would be noise in the references.
+    mug = [(0, 0.002), (0.03, 0), (0.034, 0.004), (0.035, 0.09), (0.0335, 0.0915), (0.032, 0.09), (0.031, 0.008),
+           (0, 0.006)]  # fmt: skip
+    place(turned(mug, china, name="mug"), (0.1, 0.33, 0))
+    place(turned([(0.0351, 0.064), (0.0353, 0.078)], blue, name="line"), (0.1, 0.33, 0))
+    handle = [(0.034, 0.074), (0.052, 0.076), (0.06, 0.06), (0.058, 0.038), (0.049, 0.025), (0.034, 0.02)]
+    place(wire([(x, 0, z) for x, z in handle], 0.0042, china, "handle"), (0.1, 0.33, 0), (0, 0, -0.4))
     wall = two_tone("plaster", (0.09, 0.055, 0.04), (0.2, 0.13, 0.1), scale=3, bump=0.002)
     add_box((0, 4.6, 0), (8, 0.1, 4), wall)
     shelf = wood(gloss=0.5)
