@@ -1,9 +1,9 @@
 """Whether --max-memory is kept at 3840×2160, and that the result does not depend on it.
 
-    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12]
+    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12] [--frames 3]
 
 The bundled shot is tiled to 3840×2160, and its third frame is denoised with each limit, and with none, in a process of
-its own. Peak memory is the operating system's count of that process. The exit code is 1 where a limit was broken, or
+its own. With `--frames 1-5` all are, as in a chunk of a farm: the next frame is read and the last one written meanwhile. Peak memory is the operating system's count of that process. The exit code is 1 where a limit was broken, or
 where the pictures differ by more than 1e-5 of their mean.
 """
 
@@ -34,7 +34,7 @@ def tile_shot(folder: Path, repeat: int) -> None:
         write_layers(folder / f"tiled.{number:04d}.exr", layers, half=False)
 
 
-def run(command: str, folder: Path, out: Path, limit: str | None) -> dict[str, object]:
+def run(command: str, frames: str, folder: Path, out: Path, limit: str | None) -> dict[str, object]:
     """Run a command; its peak memory, or why it refused."""
     first, *rest = command.split()
     words = [
@@ -46,7 +46,7 @@ def run(command: str, folder: Path, out: Path, limit: str | None) -> dict[str, o
         "-o",
         str(out),
         "--frames",
-        "3",
+        frames,
         *rest,
     ]
     done = subprocess.run([*words, *(["--max-memory", limit] if limit else [])], capture_output=True, text=True)
@@ -62,7 +62,8 @@ def run(command: str, folder: Path, out: Path, limit: str | None) -> dict[str, o
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--commands", nargs="+", default=["pseudoref --preset draft", "denoise --estimate none"])
-    parser.add_argument("--limits", nargs="+", default=["8G", "6G", "4G"])
+    parser.add_argument("--limits", nargs="*", default=["8G", "6G", "4G"])
+    parser.add_argument("--frames", default="3", help="of the five that there are, the third among them")
     parser.add_argument(
         "--repeat", type=int, default=12, help="tiles along each side: 12 for 3840×2160, 6 for 1920×1080"
     )
@@ -80,7 +81,8 @@ def main(argv: list[str] | None = None) -> int:
                     "command": command,
                     "size": f"{320 * options.repeat}x{180 * options.repeat}",
                     "limit": limit,
-                    **run(command, folder, out, limit),
+                    "frames": options.frames,
+                    **run(command, options.frames, folder, out, limit),
                 }
                 if "peak_gib" in result:
                     image = read_exr(out / "tiled.0003.exr")

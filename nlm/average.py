@@ -282,7 +282,7 @@ def _reject_outliers(
 ) -> None:
     T, H, W, C = window.shape
     for y in range(first, last):
-        values = np.empty(9 * T, np.float32)
+        ordered = np.empty(9 * T, np.float32)
         mean = np.empty(C, np.float32)
         top, bottom = max(y - 1, 0), min(y + 2, H)
         # three columns' sums, so that most pixels are passed over at little cost
@@ -313,9 +313,13 @@ def _reject_outliers(
                 for ny in range(top, bottom):
                     for nx in range(left, right):
                         if weight[t, ny, nx] > 0:
-                            values[n] = level[t, ny, nx]
+                            # put in its place: `np.sort` would take a second to compile
+                            value, i = level[t, ny, nx], n
+                            while i > 0 and ordered[i - 1] > value:
+                                ordered[i] = ordered[i - 1]
+                                i -= 1
+                            ordered[i] = value
                             n += 1
-            ordered = np.sort(values[:n])
             # the lower median: of two values the greater one would be its own yardstick
             median, upper = ordered[(n - 1) // 2], ordered[max(n - max(frames, 2), 0)]
             lit = 0
