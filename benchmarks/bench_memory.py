@@ -1,10 +1,12 @@
 """Whether --max-memory is kept at 3840×2160, and that the result does not depend on it.
 
-    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12] [--frames 3]
+    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12]
+        [--frames 3]
 
 The bundled shot is tiled to 3840×2160, and its third frame is denoised with each limit, and with none, in a process of
-its own. With `--frames 1-5` all are, as in a chunk of a farm: the next frame is read and the last one written meanwhile. Peak memory is the operating system's count of that process. The exit code is 1 where a limit was broken, or
-where the pictures differ by more than 1e-5 of their mean.
+its own. With `--frames 1-5` all are, as in a chunk of a farm: a frame is read and one is written meanwhile. Peak memory
+is the operating system's count of that process. The exit code is 1 where a limit was broken, or where the pictures
+differ by more than 1e-5 of their mean.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
-from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable, tell_of_compiling
+from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable
 from hybrid.commands.options import (
     OUTPUT,
     RESOURCES,
@@ -534,7 +534,7 @@ def _run(job: Job) -> None:
         record.write(job.timings, "stopped")
 
     try:
-        with interruptible(report), tell_of_compiling():
+        with interruptible(report):
             _denoise(job, record)
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None

@@ -310,26 +310,6 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def tell_of_compiling() -> Iterator[None]:
-    """Say so, once, where loops are compiled: only the first run on a machine has to wait for that."""
-    from numba.core import event
-
-    class FirstOne(event.Listener):
-        said = False
-
-        def on_start(self, event: Any) -> None:
-            if not self.said:
-                LOG.info("compiling for this processor, once: some fifteen seconds, and kept for later runs")
-            self.said = True
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with event.install_listener("numba:compile", FirstOne()):
-        yield
-
-
-@contextmanager
 def lasting_streams() -> Iterator[None]:
     """Let the work go on where standard output or error is closed or knows only ASCII."""
     before = sys.stdout, sys.stderr

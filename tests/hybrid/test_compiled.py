@@ -120,3 +120,31 @@ def test_a_damaged_file_is_made_again(tmp_path, kind, share):
     value, _, found, _ = run(tmp_path, **home)
     assert (value, found) == ("42", 0)
     assert run(tmp_path, **home)[2] == 1
+
+
+COUNT = """
+import sys
+from numba.core import event
+from hybrid.cli import main
+
+with event.install_recorder("numba:compile") as compiled:
+    code = main(sys.argv[1:])
+print(*(each.data["dispatcher"].__name__ for _, each in compiled.buffer if each.is_start))
+sys.exit(code)
+"""
+
+
+def test_the_longest_loop_is_compiled_beside_the_first_run_and_found_there(shot_folder, tmp_path):
+    """Where it were compiled for other types, the first run would wait for it, and compile it again."""
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    words = ["pseudoref", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
+    made = [
+        subprocess.run(
+            [sys.executable, "-c", COUNT, *words], env=env, cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert "_reject_outliers" in made[0]
+    assert "_filter" not in made[0]
+    assert made[1] == []
+    assert list((tmp_path / "cache").rglob("nonlocal_means._filter-*.nbc"))
