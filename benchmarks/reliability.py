@@ -30,9 +30,12 @@ import OpenEXR
 from trial import (
     COMMAND,
     DRAFT,
+    OFF,
+    ON,
     OURS,
     PACKAGES,
     SIZE,
+    STANDARD,
     Cases,
     Done,
     Edit,
@@ -114,7 +117,7 @@ EVENTS: dict[str, Edit] = {
     "a firefly": sparks(1),
     "five fireflies": sparks(5, 800),
 }
-FORCED = "--stages", "warp", "--stages", "gate", "--stages", "outliers"
+FORCED = ON, "warp", ON, "gate", ON, "outliers"
 
 
 def odd_window(edit: Edit, given: bool, folder: Path) -> str | None:
@@ -511,8 +514,8 @@ CHANGES: dict[str, Callable[[Project], object]] = {
 }
 OPTIONS: dict[str, Sequence[object]] = {
     "a layer left out": ("--layer", "normal=Denoising Albedo"),
-    "a stage forced on": ("--stages", "refine"),
-    "a stage forced off": ("--no-stages", "gate"),
+    "a stage forced on": (ON, "refine"),
+    "a stage forced off": (OFF, "gate"),
     "another preset": ("--preset", "final", "--estimate", "none"),
     "no estimates": ("--estimate", "none"),
     "our own estimates": ("--estimate", "nlm"),
@@ -792,12 +795,15 @@ def row_8() -> Cases:
 
 
 HOLD = """
-import pathlib, sys
+import os, pathlib, sys
 try:
     from hybrid.files.replace import replace_file, temporary_folder
 except ImportError:
     from hybrid.files import replace_file, temporary_folder
-kind, path = sys.argv[1], pathlib.Path(sys.argv[2])
+kind, path, number = sys.argv[1], pathlib.Path(sys.argv[2]), int(sys.argv[3])
+while os.getpid() < number:  # each child has the next number
+    if child := os.fork():
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 with (replace_file if kind == "file" else temporary_folder)(path) as temporary:
     inside = temporary if kind == "file" else temporary / "a.exr"
     inside.write_bytes(b"whole")
@@ -805,6 +811,11 @@ with (replace_file if kind == "file" else temporary_folder)(path) as temporary:
     sys.stdin.read(1)
     print(inside.read_bytes().decode(), flush=True)
 """
+
+
+def _free_number() -> int:
+    """The lowest number that no process has which is seen here: a process of another container may have it there."""
+    return next(number for number in range(2, 10**6) if not Path(f"/proc/{number}").exists())
 
 
 def other_container(kind: str, same_numbers: bool, folder: Path) -> str | None:
@@ -815,7 +826,7 @@ def other_container(kind: str, same_numbers: bool, folder: Path) -> str | None:
     out.mkdir()
     words = ["unshare", "--pid", "--fork", *(["--mount-proc"] if same_numbers else [])]
     child = subprocess.Popen(
-        [*words, sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr")],
+        [*words, sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr"), str(_free_number())],
         env={**os.environ, "PYTHONPATH": str(PACKAGES)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -836,7 +847,7 @@ def dead_container(kind: str, folder: Path) -> str | None:
     noisy, out = shot(folder / "in", 2), folder / "out"
     out.mkdir()
     child = subprocess.Popen(
-        [sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr")],
+        [sys.executable, "-P", "-c", HOLD, kind, str(out / "other.0001.exr"), "0"],
         env={**os.environ, "PYTHONPATH": str(PACKAGES)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -1192,7 +1203,7 @@ def ring(value: float, estimate: str, count: int, folder: Path) -> str | None:
         if index == 2:
             layers["late"] = lambda late: [late["ViewLayer.Combined"].__setitem__(at, value) for at in place]  # type: ignore[assignment]
 
-    words = ["--estimate", estimate, "--preset", "standard" if (PACKAGES / "hybrid/files").is_dir() else "balanced"]
+    words = ["--estimate", estimate, "--preset", STANDARD]
     for name, edit in (("plain", None), ("burnt", burnt)):
         noisy = shot(folder / f"{name} in", 5, edit, step=(1, 0))
         if failed := ravg("pseudoref", noisy, "-o", folder / name, *words).failed:

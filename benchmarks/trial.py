@@ -37,6 +37,12 @@ Cases = Iterator[tuple[str, Case]]
 Rows = Mapping[int, tuple[str, Callable[[], Cases]]]
 SIZE = 32, 48
 DRAFT = "--preset", "draft"
+# What the packages under test call this: they had other names before `hybrid.files` was a package.
+ON, OFF, STANDARD = (
+    ("--stages", "--no-stages", "standard")
+    if (PACKAGES / "hybrid" / "files").is_dir()
+    else ("--effects", "--no-effects", "balanced")
+)
 
 
 class UntriedError(Exception):
