@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
 
 from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
 from hybrid.files.frames import Shot
-from hybrid.pipeline import Denoised, DenoiseWindow, Failed, Finished, check_written, denoise_frames
+from hybrid.pipeline import Denoised, DenoiseWindow, Failed, Finished, check_written, denoise_frames, describe_run
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.plausibility import judge_layers
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
@@ -78,7 +79,9 @@ def denoise_shot(
     shot = judge_layers(shot).apply(shot)
     off = set(no_stages)
     denoise: DenoiseWindow
-    if weights is None and preset in CLASSICAL_PRESETS:
+    settings: dict[str, object] = {"aov": shot.aovs}
+    neural = weights is not None or preset not in CLASSICAL_PRESETS
+    if not neural:
         radius, own = 2, CLASSICAL_PRESETS[preset]
         off |= NEURAL_STAGES
         source = choose_estimate(estimate or "none", shot, own=own, device=device)
@@ -87,20 +90,25 @@ def denoise_shot(
     else:
         from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-        network = Denoiser(weights or shipped_weights(preset), device=device)
+        path = weights or shipped_weights(preset)
+        network = Denoiser(path, device=device)
+        content = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        settings |= {"weights": content, "precision": network.precision, "network": network.device}
         denoise, radius = network, network.radius
         if network.takes_estimate:
             mode = MODE_OF[preset] if weights is None else "oidn-clean"
             source = choose_estimate(estimate or "auto", shot, mode=mode, device=device)
         else:
             source = EstimateSource("none", None, "this network takes none")
+    settings["oidn"] = source.device
     check_written(shot, str(output), [source], {"weights": weights}, {})
-    attributes = {"ravg/command": "denoise_shot", "ravg/preset": preset, "ravg/estimate": source.name}
+    rules = Rules(on=frozenset(stages), off=frozenset(off))
+    attributes = describe_run("denoise_shot", preset, source, rules, settings, neural=neural)
     yield from denoise_frames(
         shot,
         output,
         denoise,
-        Rules(on=frozenset(stages), off=frozenset(off)),
+        rules,
         radius=radius,
         estimates=source.estimates,
         attributes=attributes,

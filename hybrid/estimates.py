@@ -6,6 +6,7 @@ sequence, from OIDN where it is installed, or from our own pseudo-reference.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,6 +38,8 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn-clean": {"quality": "high", "prefilter": "balanced"},
     "oidn-best": {"quality": "high", "prefilter": "high"},
 }
+# What is asked for by these names; by any other, a finished sequence.
+SPECS = ("auto", "none", "nlm", *OIDN_MODES)
 # What "auto" takes of them for a preset of the network: each is a point of accuracy against time.
 MODE_OF = {"fast": "oidn-fast", "balanced": "oidn", "quality": "oidn-clean"}
 
@@ -302,7 +305,7 @@ class Kept:
         # Of neighbours too that were not asked for.
         path = Path(spec)
         if shot.picture:
-            name = re.sub(r"[^\w.-]", "_", shot.picture)
+            name = _folder_name(shot.picture)
             path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
         self.places = {number: output_path(path, shot, number, beside=True) for number in shot.files}
         self._shot = shot
@@ -328,6 +331,13 @@ class Kept:
             shot.write(path, frame.number, {"color": run(frame, *known)}, attributes={MADE_FROM: made_from})
         # Read back also what was just written, half as it may be: every run then sees the same.
         return shot.remade({frame.number: path}).read(frame.number).color
+
+
+def _folder_name(picture: str) -> str:
+    """A folder's name for a picture: its own, or where no folder can be called so, one that no other picture has."""
+    plain = re.sub(r"[^\w.-]|^\.", "_", picture)
+    known = hashlib.sha256(picture.encode(errors="surrogateescape")).hexdigest()[:8]
+    return plain if plain == picture else f"{plain}-{known}"
 
 
 def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array]) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,10 +15,10 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.beside import ReadAhead
-from hybrid.estimates import EstimateSource
+from hybrid.estimates import OIDN_MODES, EstimateSource
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
-from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
+from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_lost_light, find_nonfinite
 from hybrid.timing import Timings
@@ -108,6 +109,46 @@ def check_written(
     read += [("estimate", path) for source in sources if source.files for path in source.files.files.values()]
     read += [(what, Path(path)) for what, path in inputs.items() if path is not None]
     check_outputs(written, read)
+
+
+def describe_run(
+    command: str,
+    preset: str,
+    source: EstimateSource,
+    rules: Rules,
+    settings: Mapping[str, object],
+    *,
+    neural: bool = False,
+) -> dict[str, str]:
+    """Describe how the frames of a run are made: where that differs, they may be others.
+
+    Parameters
+    ----------
+    command, preset : str
+        What makes them.
+    source : EstimateSource
+        Where their estimates come from.
+    rules : Rules
+        What the user has forced.
+    settings : mapping of str to object
+        All other options that pixels depend on, as JSON has them.
+    neural : bool
+        Whether there is a network.
+
+    Returns
+    -------
+    dict of str to str
+        Attributes of their headers.
+    """
+    packages = [*PACKAGES, *(["torch"] if neural else []), *(["pyoidn"] if source.name in OIDN_MODES else [])]
+    return {
+        "ravg/command": command,
+        "ravg/preset": preset,
+        "ravg/estimate": source.name,
+        "ravg/forced": rules.forced,
+        "ravg/settings": json.dumps(settings, sort_keys=True),
+        "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
+    }
 
 
 def denoise_frames(

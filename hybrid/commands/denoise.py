@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -117,8 +116,9 @@ def pseudoref(
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
     _expect_all(opened, keep_going)
     if scheduler is not None:
+        _spare_inputs(opened, output, (), {"profile": profile}, preview=preview, contact=contact)
         _hand_out(context, given, opened, scheduler, chunk)
-        _look(opened, output, preview, fps, contact)
+        _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
         (opened, *others), judgement = judge_input(opened, strict=strict)
@@ -269,8 +269,10 @@ def denoise(
     if scheduler is not None:
         if budget is not None or breakdown is not None:
             raise typer.BadParameter("--budget and --breakdown are of one machine, expected no --scheduler with them")
+        inputs = {"weights": weights, "profile": profile}
+        _spare_inputs(opened, output, (), inputs, preview=preview, contact=contact)
         _hand_out(context, given, opened, scheduler, chunk)
-        _look(opened, output, preview, fps, contact)
+        _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
         (opened, *others), judgement = judge_input(opened, strict=strict)
@@ -556,11 +558,9 @@ def _denoise(job: Job, record: Record) -> None:
     """Denoise; say how far it has come, and what was met on the way."""
     from rich.table import Table
 
-    from hybrid.estimates import OIDN_MODES
     from hybrid.files.layers import summarize_layers
-    from hybrid.files.sources import PACKAGES, versions
     from hybrid.memory import keep_freed_memory, parse_size, plan_rows
-    from hybrid.pipeline import Failed, denoise_frames
+    from hybrid.pipeline import Failed, denoise_frames, describe_run
     from hybrid.plan import NEURAL_STAGES, Plan, merge
 
     shot, source, timings = job.shot, job.source, job.timings
@@ -586,18 +586,10 @@ def _denoise(job: Job, record: Record) -> None:
     for words in (f"layers: {layers}", *taken.notes, *said):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
-    packages = [*PACKAGES, *(["torch"] if job.neural else []), *(["pyoidn"] if source.name in OIDN_MODES else [])]
     # Not where things lie: what was read from there is told by the files and layers that each picture was made from.
     elsewhere = ("profile", "estimate" if source.files else "")
     settings = {name: value for name, value in job.settings.items() if name not in elsewhere}
-    attributes = {
-        "ravg/command": job.command,
-        "ravg/preset": job.preset,
-        "ravg/estimate": source.name,
-        "ravg/forced": rules.forced,
-        "ravg/settings": json.dumps(settings, sort_keys=True),
-        "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
-    }
+    attributes = describe_run(job.command, job.preset, source, rules, settings, neural=job.neural)
     judged = list(job.judgement.findings)
     judgement = [vars(finding) for finding in judged]
     record.write(timings, layers=layers, warnings=shot.warnings, judged=judgement)

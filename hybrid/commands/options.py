@@ -37,6 +37,9 @@ DeviceOption = Annotated[
     ),
 ]
 
+# Of which every view has its own, where the shot has several.
+_OF_A_VIEW = ("output", "keep_estimates", "estimate", "preview", "contact", "breakdown")
+
 # What a folder is not called: somebody wants pictures of a kind that is not written.
 _OTHER_KINDS = re.compile(r"\.(avi|bmp|dpx|gif|hdr|jpe?g|mkv|mov|mp4|pfm|png|tga|tiff?|webp)", re.IGNORECASE)
 
@@ -274,12 +277,10 @@ def each_view(command: Callable[..., None], given: Mapping[str, object]) -> bool
     """Run a command for each stereo view that %V or %v stands for in the shot's name; False where it has neither."""
     from hybrid.files.sequences import find_views, name_view
 
-    spec, output = str(given["shot"]), given.get("output")
+    spec = str(given["shot"])
     views = find_views(spec)
-    if views and output is not None and name_view(str(output), views[0]) == str(output):
-        named = name_view(Path(spec).name, views[0]) != Path(spec).name
-        if not named or str(output).lower().endswith(".exr"):
-            raise typer.BadParameter(f"output is {str(output)!r}, expected %V or %v in it, as the shot has")
+    if views:
+        _expect_apart(given, views)
     for view in views:
         LOG.info(f"view {view}")
         here = {
@@ -289,6 +290,28 @@ def each_view(command: Callable[..., None], given: Mapping[str, object]) -> bool
         here["layer"] = [name_view(item, view) for item in given.get("layer") or ()]  # type: ignore[attr-defined]
         command(**here)
     return bool(views)
+
+
+def _expect_apart(given: Mapping[str, object], views: Sequence[str]) -> None:
+    """Refuse what both views would be written to, or be made from, as if they were one."""
+    from hybrid.estimates import SPECS
+    from hybrid.files.apart import names_sequence
+    from hybrid.files.sequences import name_view
+
+    def shared(value: str) -> bool:
+        return len({name_view(value, view) for view in views}) < len(views)
+
+    files_are_apart = not shared(Path(str(given["shot"])).name)
+    words = {name: str(given[name]) for name in _OF_A_VIEW if given.get(name) is not None}
+    words |= {f"layer {role}": value for role, value in parse_layers(given.get("layer")).items()}  # type: ignore[arg-type]
+    for name, value in words.items():
+        if name in ("output", "keep_estimates") and files_are_apart and not value.lower().endswith(".exr"):
+            continue  # a folder, where files are called as those of the shot
+        if (name == "estimate" and value in SPECS) or (name.startswith("layer") and not names_sequence(value)):
+            continue
+        if shared(value):
+            option = name.replace("_", "-")
+            raise typer.BadParameter(f"{option} is {value!r}, expected %V or %v in it, as the shot has")
 
 
 def judge_input(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:

@@ -350,7 +350,7 @@ def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
 
 def _load(path: Path, strings: Mapping[tuple[int, str], str], *, header_only: bool) -> tuple[Part, ...]:
     """The parts of a file, with some strings of their headers, by part and name, in place of those in the file."""
-    file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+    file = OpenEXR.File(_for_library(path), separate_channels=True, header_only=header_only)
     parts = []
     for index, part in enumerate(file.parts):
         own = {name: text for (where, name), text in strings.items() if where == index}
@@ -358,6 +358,12 @@ def _load(path: Path, strings: Mapping[tuple[int, str], str], *, header_only: bo
         channels = header["channels"] if header_only else part.channels.values()
         parts.append(Part(header.get("name", ""), header, {channel.name: channel for channel in channels}))
     return tuple(parts)
+
+
+def _for_library(path: Path) -> str | bytes:
+    """A path as the library takes it: as bytes where these are not UTF-8, of which it takes no string."""
+    name = str(path)
+    return name if without_surrogates(name) == name else os.fsencode(name)
 
 
 def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> None:
@@ -654,7 +660,7 @@ def _write(path: Path, parts: list[OpenEXR.Part]) -> None:
     with replace_file(path) as temporary:
         with _library_messages() as messages:
             try:
-                OpenEXR.File(parts).write(str(temporary))
+                OpenEXR.File(parts).write(_for_library(temporary))
                 if any(odd):
                     restore_strings(temporary, odd)
             except Exception as error:

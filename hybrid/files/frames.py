@@ -191,8 +191,8 @@ class Shot:
         max_pixels: int = MAX_PIXELS,
     ) -> None:
         wanted = sorted(files) if frames is None else parse_frames(frames)
-        # The numbers asked for count as well: --frames 1-5 where 1, 3 and 5 are there has two holes.
-        self.step = math.gcd(*(b - a for a, b in pairwise(sorted({*files, *wanted})))) or 1
+        # Of the files alone, or a frame would be another with other frames asked for: as it is in a chunk.
+        self.step = math.gcd(*(b - a for a, b in pairwise(sorted(files)))) or 1
         self.numbers = tuple(number for number in wanted if number in files)
         self.warnings: list[str] = []
         self.picture = ""

@@ -43,15 +43,16 @@ def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[st
     names: dict[object, str] = {}
     for what, path in inputs:
         names |= dict.fromkeys(identities(path), f"{what} {str(path)!r}")
-    written: dict[object, tuple[str, Path]] = {}
+    written: dict[object, str] = {}
     for what, path in outputs:
         refuse_other_kinds(path)
-        for name in identities(path):
+        own = set(identities(path))
+        for name in own:
             if name in names:
                 raise ValueError(f"{what} {str(path)!r} would overwrite an input: {names[name]}")
-            other = written.setdefault(name, (what, path))
-            if other != (what, path):
-                raise ValueError(f"{what} {str(path)!r} would overwrite {other[0]} {str(other[1])!r}")
+            if name in written:
+                raise ValueError(f"{what} {str(path)!r} would overwrite {written[name]}")
+        written |= dict.fromkeys(own, f"{what} {str(path)!r}")
 
 
 def identities(path: Path) -> Iterator[object]:

@@ -44,6 +44,36 @@ def test_with_a_network_it_is_denoise(shot_folder, tmp_path):
     same(tmp_path / "made", tmp_path / "out")
 
 
+def resumed(folder, out, **options):
+    shot = hybrid.open_shot(folder, aovs=options.pop("aovs", ()))
+    return [frame.resumed for frame in hybrid.denoise_shot(shot, out, resume=True, **options)]
+
+
+@pytest.mark.parametrize("changed", [{"no_stages": ["gate"]}, {"stages": ["warp"]}, {"estimate": "nlm"}])
+def test_it_resumes_what_would_be_the_same_alone(shot_folder, tmp_path, changed):
+    """Stages that were forced were no reason to make a frame again."""
+    assert resumed(shot_folder, tmp_path / "out", preset="draft") == [False] * 3
+    assert resumed(shot_folder, tmp_path / "out", preset="draft") == [True] * 3
+    assert resumed(shot_folder, tmp_path / "out", preset="draft", **changed) == [False] * 3
+
+
+@pytest.mark.neural
+def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
+    """Weights exchanged under one name were no reason."""
+    pytest.importorskip("torch")
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    weights, more = tmp_path / "w.safetensors", {"estimate": "nlm", "weights": tmp_path / "w.safetensors"}
+    weights.write_bytes((ROOT / "tests" / "data" / "small.safetensors").read_bytes())
+    assert resumed(shot_folder, tmp_path / "out", **more) == [False] * 3
+    assert resumed(shot_folder, tmp_path / "out", **more) == [True] * 3
+    with safe_open(weights, "np") as file:
+        save_file({name: file.get_tensor(name) * 0.9 for name in file.keys()}, weights, file.metadata())  # noqa: SIM118
+    assert resumed(shot_folder, tmp_path / "out", **more) == [False] * 3
+    assert resumed(shot_folder, tmp_path / "out", aovs=("ViewLayer.Denoising Albedo",), **more) == [False] * 3
+
+
 def test_the_example_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")

@@ -178,3 +178,41 @@ def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.Capture
     assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert main(["pseudoref", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
     assert "no view is there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--keep-estimates", "kept"),
+        ("--keep-estimates", "kept/e.####.exr"),
+        ("--preview", "x.png"),
+        ("--contact", "x.png"),
+        ("--estimate", "left/shot.####.exr"),
+        ("--layer", "albedo=left/shot.####.exr"),
+        ("--output", "out_%v"),
+    ],
+)
+def test_two_eyes_share_nothing(
+    option: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One eye's picture was written over the other's, or made from its estimates, with exit code 0."""
+    monkeypatch.chdir(tmp_path)
+    for eye in ("left", "local"):
+        save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
+    assert main(["pseudoref", "%V/shot.####.exr", "--output", "out_%V", "--preset", "draft", option, value]) == 2
+    assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["left", "local"]
+
+
+def test_kept_estimates_of_pictures_called_alike_lie_apart(tmp_path: Path) -> None:
+    """Both lay in A_B.Combined, the last one's over the first one's."""
+    pytest.importorskip("pyoidn")
+    for truth in FRAMES:
+        channels = {n.replace("ViewLayer.", "A B."): p for n, p in view(truth).items()}
+        channels |= {n.replace("ViewLayer.", "A_B."): p for n, p in view(truth, other=True).items()}
+        save(tmp_path / "in" / f"shot.{truth.number:04d}.exr", channels)
+    run(tmp_path / "in", tmp_path / "out", "--estimate", "oidn-fast", "--keep-estimates", str(tmp_path / "kept"))
+    folders = sorted(path.name for path in (tmp_path / "kept").iterdir())
+    assert len(folders) == 2
+    assert folders[0] == "A_B.Combined"
+    assert folders[1].startswith("A_B.Combined-")

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import pytest
 import typer
 
@@ -17,6 +18,7 @@ from hybrid.cli import main
 from hybrid.commands.cluster import arguments_of
 from tests.hybrid.simulate.test_run import STUB
 from tests.hybrid.test_docs import said, transcript
+from tests.renderers import save
 from tests.scenes import Scene
 
 pytestmark = pytest.mark.cluster
@@ -182,6 +184,30 @@ def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_
     assert run.returncode == 130, err
     assert "stopped: what is finished is kept" in err
     assert len(contents(out)) < FRAMES
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_handed_out(shot, tmp_path, capsys):
+    """A preview was looked at when all frames were there."""
+    words = ["pseudoref", str(shot), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main([*words, "--preview", str(tmp_path / "x.tif")]) == 2
+    assert "expected a name that ends in .png" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert main([*words, "--contact", str(tmp_path / "x.png"), "--preview", str(tmp_path / "x.png")]) == 1
+    assert "would overwrite preview" in capsys.readouterr().err
+    assert main(["pseudoref", str(shot), "-o", str(shot), "--scheduler", "tcp://127.0.0.1:9"]) == 1
+    assert "would overwrite an input" in capsys.readouterr().err
+
+
+def test_the_preview_of_several_pictures_is_that_of_the_first(cluster, tmp_path):
+    """It ended in an error when all frames were there."""
+    for frame in range(2):
+        channels = {}
+        for name in ("Front", "Back"):
+            picture = np.random.default_rng(frame).uniform(size=(12, 16)).astype(np.float32)
+            channels |= {f"{name}.Combined.{c}": picture for c in "RGB"}
+        save(tmp_path / "in" / f"shot.{frame:04d}.exr", channels)
+    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *OPTIONS, "--scheduler", cluster[0]]
+    assert main([*words, "--preview", str(tmp_path / "x.png")]) == 0
+    assert (tmp_path / "x.png").is_file()
 
 
 def test_no_scheduler_is_one_line(shot, tmp_path, capsys):

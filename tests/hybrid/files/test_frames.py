@@ -138,9 +138,10 @@ def test_every_second_frame_has_neighbours_two_away(tmp_path):
     assert shot.step == 2
     assert neighbours(shot, 5, 1) == [3, 5, None]
     assert "missing frames 7" in shot.warnings[0]
-    asked = open_shot(tmp_path, frames="1-5")  # asked for all: the even ones are holes
-    assert asked.step == 1
-    assert neighbours(asked, 3, 1) == [None, 3, None]
+    # Asked for all, the even ones are missing, and the odd ones as ever: a chunk of them has to be like the whole.
+    asked = open_shot(tmp_path, frames="1-5")
+    assert (asked.step, asked.numbers, asked.missing) == (2, (1, 3, 5), (2, 4))
+    assert neighbours(asked, 3, 1) == [1, 3, 5]
 
 
 # --- reading

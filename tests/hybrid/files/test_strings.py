@@ -68,3 +68,15 @@ def test_names_of_parts_in_any_encoding_are_kept_too(tmp_path):
 @settings(max_examples=200, deadline=None)
 def test_strings_are_looked_for_in_anything(data):
     assert all(where.stop <= len(data) + 8 for _, _, where in find_strings(b"v/1\x01\x02\x10\0\0" + data))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names are bytes on POSIX alone")
+def test_folders_of_any_encoding_are_read_and_written(tmp_path):
+    """OpenEXR 3.5 takes no string with bytes that are not UTF-8: all files in such a folder were "damaged"."""
+    save(tmp_path / "a.exr", planes(["R", "G", "B"]))
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    folder.mkdir()
+    (tmp_path / "a.exr").rename(folder / "a.exr")
+    source = read_exr(folder / "a.exr")
+    write_exr(folder / "b.exr", source, {"R": source.channel("R") + 1})
+    np.testing.assert_array_equal(read_exr(folder / "b.exr").channel("R"), source.channel("R") + 1)
