@@ -121,7 +121,7 @@ def pseudoref(
         _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
-        (opened, *others), judgement = judge_input(opened, strict=strict)
+        (opened, *others), judgement = _judge(opened, strict=strict)
     timings = Timings()
     choose = partial(choose_estimate, estimate, own=chosen, kept=keep_estimates, forced=rules.forced, device=device)
     source, beside = choose(opened), [(other, choose(other)) for other in others]
@@ -156,7 +156,6 @@ def pseudoref(
             keep_going=keep_going,
             max_memory=max_memory,
             judgement=judgement,
-            strict=strict,
             gathers=gathers,
             others=beside,
         )
@@ -275,7 +274,7 @@ def denoise(
         _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
-        (opened, *others), judgement = judge_input(opened, strict=strict)
+        (opened, *others), judgement = _judge(opened, strict=strict)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -341,7 +340,6 @@ def denoise(
         keep_going=keep_going,
         max_memory=max_memory,
         judgement=judgement,
-        strict=strict,
         others=beside,
         radius=denoiser.radius,
         neural=True,
@@ -397,6 +395,17 @@ def _hand_out(context: typer.Context, given: Mapping[str, object], shot: Shot, s
     if shot.missing:
         LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
         raise typer.Exit(1)
+
+
+def _judge(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:
+    """The pictures of the shot as `judge_input` has them; if `strict`, cuts are looked for too before any is made."""
+    from hybrid.plan import plan_shot
+
+    pictures, judgement = judge_input(shot, strict=strict)
+    if strict:
+        for picture in pictures:
+            say_cuts(plan_shot(picture), judgement.findings, strict=True)
+    return pictures, judgement
 
 
 @contextmanager
@@ -469,7 +478,6 @@ class Job:
     judgement: Judgement
     others: Sequence[tuple[Shot, EstimateSource]] = ()
     radius: int = 2
-    strict: bool = False
     neural: bool = False
     gathers: bool = False  # samples of the window, which OIDN then denoises
     before: SourcesOf | None = None  # what the shot was made from, if a pass has made it
@@ -624,7 +632,7 @@ def _denoise(job: Job, record: Record) -> None:
         outliers += finished.outliers
         if finished.plan is not None:
             plans[finished.number] = finished.plan
-            judged += say_cuts(finished.plan, judged, strict=job.strict)
+            judged += say_cuts(finished.plan, judged, strict=False)
         if finished.again:
             LOG.info(f"frame {finished.number} is made again: {printable(finished.again)}")
         if finished.fireflies:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,6 +29,7 @@ from hybrid.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from hybrid.files.layers import Layers
     from hybrid.plan import Decision
 
 
@@ -57,53 +59,70 @@ def inspect(
     from hybrid.plan import STAGES, plan_shot
 
     opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
-    (opened, *_), judgement = judge_input(opened, strict=strict)
-    first = opened.numbers[0]
+    pictures, judgement = judge_input(opened, strict=strict)
     height, width = opened.shape
-    layers = opened.layers(first)
-    rows = describe_layers(layers)
     rules = rules_of(stages, no_stages)
-    progress = Progress("look", len(opened))
-    plan = plan_shot(opened, rules, advance=progress.advance)
-    judged = [*judgement.findings, *say_cuts(plan, judgement.findings, strict=strict)]
+    progress = Progress("look", len(opened) * len(pictures))
+    layers = [picture.layers(picture.numbers[0]) for picture in pictures]
+    rows = [describe_layers(taken) for taken in layers]
+    plans, judged = [], list(judgement.findings)
+    for picture in pictures:
+        plans.append(plan_shot(picture, rules, advance=progress.advance))
+        judged += say_cuts(plans[-1], judged, strict=strict)
     if as_json:
+        of_each = [
+            {
+                "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in roles],
+                "plan": [asdict(decision) for decision in plan.decisions],
+            }
+            for roles, plan in zip(rows, plans, strict=True)
+        ]
         document = {
             "frames": opened.numbers,
             "width": width,
             "height": height,
             "warnings": opened.warnings,
-            "profile": layers.profile,
-            "reason": layers.reason,
-            "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in rows],
+            "profile": layers[0].profile,
+            "reason": layers[0].reason,
             "judged": [asdict(finding) for finding in judged],
             "motion": judgement.readings(),
-            "plan": [asdict(decision) for decision in plan.decisions],
+            **of_each[0],
+            **({"others": of_each[1:]} if len(pictures) > 1 else {}),
         }
         typer.echo(json.dumps(document, indent=1))
         return
     console = Console()
-    console.print(f"{len(opened)} frames, {first}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
-    console.print(f"profile: {printable(layers.profile)} ({printable(layers.reason)})\n", highlight=False, markup=False)
-    table = Table("role", "taken from", "note", title="Layers", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for row in rows:
-        table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
-    console.print(table)
+    console.print(f"{len(opened)} frames, {opened.numbers[0]}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
+    profile_line = f"profile: {printable(layers[0].profile)} ({printable(layers[0].reason)})\n"
+    console.print(profile_line, highlight=False, markup=False)
+
+    def show(title: str, heads: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+        table = Table(*heads, title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        for line in lines:
+            table.add_row(*(Text(printable(words)) for words in line))  # names from a file are no markup
+        console.print(table)
+
+    def named(title: str, taken: Layers) -> str:
+        return f"{title} of {printable(str(taken.color))}" if len(pictures) > 1 else title
+
+    for taken, roles in zip(layers, rows, strict=True):
+        show(named("Layers", taken), ("role", "taken from", "note"), roles)
     for finding in judgement.findings:
         if not finding.warning:
             console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
     if readings := judgement.readings():
-        title = "Motion: what the vectors leave unexplained"
-        table = Table(
-            "", "read as", "of the picture", title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False
-        )
-        for row in readings:
-            table.add_row(*row)
-        console.print(table)
-    table = Table("", "stage", "measured", "why", title="Plan", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for decision in plan.decisions:
-        why = f"{decision.reason} ({STAGES[decision.stage]})"
-        table.add_row("on" if decision.on else "off", decision.stage, _measured(decision), Text(printable(why)))
-    console.print(table)
+        show("Motion: what the vectors leave unexplained", ("", "read as", "of the picture"), readings)
+    for taken, plan in zip(layers, plans, strict=True):
+        lines = [
+            (
+                "on" if decision.on else "off",
+                decision.stage,
+                _measured(decision),
+                f"{decision.reason} ({STAGES[decision.stage]})",
+            )
+            for decision in plan.decisions
+        ]
+        show(named("Plan", taken), ("", "stage", "measured", "why"), lines)
 
 
 def _measured(decision: Decision) -> str:

@@ -63,6 +63,16 @@ def _check_size(size: str | None) -> str | None:
     return size
 
 
+def check_estimate(spec: str) -> str:
+    """Refuse a word that is neither a source nor the name of anything there is, before anything is made."""
+    from hybrid.estimates import OIDN_MODES
+
+    sources = "auto", "none", "nlm", *OIDN_MODES
+    if spec not in sources and re.fullmatch(r"[\w-]*", spec) and not Path(spec).exists():
+        raise typer.BadParameter(f"it is {spec!r}, expected one of {', '.join(sources)}, or OTHER.####.exr")
+    return spec
+
+
 ShotArgument = Annotated[str, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")]
 OutputOption = Annotated[
     str,
@@ -141,6 +151,7 @@ EstimateOption = Annotated[
     str,
     typer.Option(
         metavar="SOURCE",
+        callback=check_estimate,
         help="denoised single frames to make stable: auto (in the file, else OIDN if installed, else our own), oidn, "
         "oidn-fast, oidn-clean, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
         rich_help_panel=WHAT,
@@ -355,15 +366,16 @@ def _say(judgement: Judgement, shot: Shot, *, strict: bool, name: str = "") -> N
         LOG.warning(printable(f"{name}: {warning}" if name else warning))
 
 
-def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool) -> list[Finding]:
+def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
     """What there is to say of a plan's cuts beyond what is known; said in a line each, an error if `strict`."""
     from hybrid.plausibility import find_cut
 
     found = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
+    words = [f"{name}: {finding.message}" if name else finding.message for finding in found]
     if strict and found:
-        raise ValueError("; ".join(finding.message for finding in found))
-    for finding in found:
-        LOG.warning(finding.message)
+        raise ValueError("; ".join(words))
+    for line in words:
+        LOG.warning(printable(line))
     return found
 
 

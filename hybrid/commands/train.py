@@ -23,10 +23,13 @@ from hybrid.commands.options import (
     MotionOption,
     ProfileOption,
     StrictOption,
+    check_estimate,
+    choose,
     import_neural,
     judge_alike,
     parse_input,
     parse_layers,
+    say_cuts,
     usage,
 )
 from network.train_config import SamplerConfig, TrainConfig
@@ -134,7 +137,12 @@ def prepare(
     window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT)] = 5,
     estimate: Annotated[
         str,
-        typer.Option(metavar="SOURCE", help="first estimates, as for denoise; clips hold them", rich_help_panel=WHAT),
+        typer.Option(
+            metavar="SOURCE",
+            callback=check_estimate,
+            help="first estimates, as for denoise; clips hold them",
+            rich_help_panel=WHAT,
+        ),
     ] = "auto",
     reference: Annotated[
         bool,
@@ -159,6 +167,7 @@ def prepare(
     """
     from hybrid.files.frames import open_shot
     from hybrid.memory import keep_freed_memory
+    from hybrid.plan import plan_shot
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -188,8 +197,11 @@ def prepare(
         if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
             bar.advance(len(first), f"{name} has clips already")
             continue
+        levels_of, _ = judge_alike(shot, strict=strict)
+        plan = plan_shot(next(iter(levels_of.values())), radius=window // 2)
+        say_cuts(plan, (), strict=strict, name=name if len(found) > 1 else "")
         write_clips(
-            judge_alike(shot, strict=strict)[0],
+            levels_of,
             counts,
             output,
             name,
@@ -306,32 +318,36 @@ def train(
     import_neural()
     from hybrid.files.replace import check_outputs
     from hybrid.neural import train_network
+    from network.models import PRESETS
 
+    if init is None:
+        choose(PRESETS, preset, "preset")
+    with usage():
+        config = TrainConfig(
+            steps=steps,
+            minutes=minutes,
+            batch=batch,
+            rate=rate,
+            warmup=warmup,
+            clip_norm=clip_norm,
+            ema=ema,
+            loss=loss,
+            vgg=vgg,
+            terms=terms,
+            whole=whole,
+            slope=slope,
+            bfloat16=not float32,
+            compile=compile,
+            device=device,
+            workers=workers,
+            seed=seed,
+            checkpoint_minutes=validate_minutes,
+            validate_minutes=validate_minutes,
+            sampler=SamplerConfig(crop=crop, sets=sets),
+        )
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
     read += [(what, Path(path)) for what, path in (("init", init), ("vgg", vgg)) if path and Path(path).is_file()]
     check_outputs([("output", output), ("state", Path(f"{output}.state"))], read)
-    config = TrainConfig(
-        steps=steps,
-        minutes=minutes,
-        batch=batch,
-        rate=rate,
-        warmup=warmup,
-        clip_norm=clip_norm,
-        ema=ema,
-        loss=loss,
-        vgg=vgg,
-        terms=terms,
-        whole=whole,
-        slope=slope,
-        bfloat16=not float32,
-        compile=compile,
-        device=device,
-        workers=workers,
-        seed=seed,
-        checkpoint_minutes=validate_minutes,
-        validate_minutes=validate_minutes,
-        sampler=SamplerConfig(crop=crop, sets=sets),
-    )
     writer = None
     if tensorboard is not None:
         try:

@@ -8,18 +8,22 @@ from typing import Annotated
 
 import typer
 
-from hybrid.commands.options import RateOption
+from hybrid.commands.options import INPUT, RESOURCES, WHAT, RateOption
 
 
 def view(
     output: Annotated[str, typer.Argument(metavar="OUT", help="denoised frames: OUT.####.exr, or a folder")],
     beside: Annotated[
         list[str] | None,
-        typer.Option(metavar="SHOT", help="frames to compare with: the noisy ones, another denoiser's"),
+        typer.Option(
+            metavar="SHOT", help="frames to compare with: the noisy ones, another denoiser's", rich_help_panel=INPUT
+        ),
     ] = None,
     fps: RateOption = 24,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: one that is free")] = 0,
-    browser: Annotated[bool, typer.Option(help="open the page in a browser, where there is a screen")] = True,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: one that is free", rich_help_panel=RESOURCES)] = 0,
+    browser: Annotated[
+        bool, typer.Option(help="open the page in a browser, where there is a screen", rich_help_panel=WHAT)
+    ] = True,
 ) -> None:
     """Look at frames in a browser: play, wipe, exposure, layers, weights, what each stage did. Ctrl-C ends it.
 

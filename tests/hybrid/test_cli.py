@@ -299,6 +299,7 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["inspect", "SHOT", "--no-such-option"],
         ["inspect", "SHOT", "--quiet", "--verbose"],
         ["inspect", "SHOT", "--log-format", "prose"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--estimate", "best"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "much"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "0"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "9" * 400],
@@ -335,6 +336,10 @@ def test_bad_usage_is_two_and_makes_nothing(arguments, shot_folder, tmp_path, ca
         ["denoise", "SHOT", "-o", "OUT", "--preset", "auto", "--budget", "soon"],
         ["prepare", "SHOT", "-o", "OUT", "--window", "4"],
         ["prepare", "SHOT", "-o", "OUT", "--levels", "many"],
+        ["prepare", "SHOT", "-o", "OUT", "--estimate", "best"],
+        ["train", "SHOT", "-o", "OUT"],
+        ["train", "SHOT", "-o", "OUT", "--steps", "1", "--preset", "best"],
+        ["train", "SHOT", "-o", "OUT", "--steps", "1", "--batch", "0"],
     ],
 )
 def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys, monkeypatch):

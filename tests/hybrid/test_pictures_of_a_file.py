@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,6 +64,26 @@ def test_both_eyes_of_a_stereo_file_are_those_of_mono_files(mono: dict[str, byte
     out = run(tmp_path, tmp_path / "out")
     assert color(out, "ViewLayer.Combined.left") == mono["left"]
     assert color(out, "ViewLayer.Combined.right") == mono["right"]
+
+
+def test_inspect_has_the_layers_and_the_plan_of_both_eyes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number, truth in enumerate(FRAMES):
+        turned = view(truth, "right", other=True)
+        if number == 1:  # one frame of one eye alone
+            turned |= {name: 3 * plane for name, plane in turned.items() if "Combined" in name and name[-1] in "RGB"}
+        save(tmp_path / f"shot.{truth.number:04d}.exr", view(truth, "left") | turned)
+    assert main(["inspect", str(tmp_path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    left, (right,) = document, document["others"]
+    assert [eye["layers"][0]["layer"] for eye in (left, right)] == [
+        f"ViewLayer.Combined.{eye}.RGB" for eye in ("left", "right")
+    ]
+    gates = [next(d for d in eye["plan"] if d["stage"] == "gate") for eye in (left, right)]
+    assert gates[0]["figure"] < gates[1]["figure"]
+    assert main(["inspect", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    for words in ("Layers of ViewLayer.Combined.left", "Plan of ViewLayer.Combined.right"):
+        assert words in said
 
 
 def test_views_in_parts(mono: dict[str, bytes], tmp_path: Path) -> None:

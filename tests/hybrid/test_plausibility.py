@@ -318,6 +318,7 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
     assert "frames 10 and 11 show something else" in json.loads(out)["judged"][-1]["message"]
     assert main(["inspect", str(spec), "--motion", "none", "--strict"]) == 1
     assert main(["pseudoref", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"]) == 1
+    assert not list((tmp_path / "o").glob("*.exr"))  # not even what comes before the cut
 
 
 def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales() -> None:
