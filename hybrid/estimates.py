@@ -22,7 +22,7 @@ from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, denoise_oidn, find_device, why_no_oidn
-from hybrid.plausibility import LOST, find_lost_light
+from hybrid.plausibility import LOST, find_lost_light, find_other_frame
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
 
@@ -215,8 +215,8 @@ def choose_estimate(
     ImportError
         If OIDN is asked for by name and not installed.
     ValueError
-        If a sequence lacks frames of the shot, or `kept` is one file for several, neighbours among them; if OIDN is to
-        run on a device that is not there.
+        If a sequence lacks frames of the shot, or has each in the place of its neighbour; if `kept` is one file for
+        several, neighbours among them; if OIDN is to run on a device that is not there.
     FileNotFoundError
         If there is no such sequence.
     """
@@ -256,6 +256,9 @@ def _choose(
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
+    other = find_other_frame(shot, lambda number: _denoised(sequence, number) if sequence.has(number) else None)
+    if other is not None:
+        raise ValueError(f"estimate {spec}: each picture belongs to {other}, expected those of the shot's own frames")
     read = OfFrames(partial(_read_sequence, sequence), files=sequence)
     return EstimateSource("sequence", read, "asked for", sequence)
 

@@ -7,6 +7,7 @@ convention, guides of another frame. What does not make sense is left out, and a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -167,6 +168,31 @@ def find_cut(a: int, b: int) -> Finding:
     )
 
 
+def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str | None:
+    """Say whether denoised pictures of a shot are each of the frame before or after; None where they are not.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy frames, of which as many pairs are read as for `judge_layers`.
+    finished : callable
+        From a frame's number to its denoised picture (H, W, 3); None where it has none.
+
+    Returns
+    -------
+    str or None
+        Which frame, in words, with figures. What cannot be read is an error when its turn comes.
+    """
+    edges = []
+    for pair in _pair_numbers(shot):
+        with suppress(ValueError, OSError):
+            pictures = [picture for number in pair if (picture := finished(number)) is not None]
+            colors = [shot.read_color(number) for number in pair]
+            if [picture.shape for picture in pictures] == [color.shape for color in colors]:
+                edges.append(_match_edges(_edges_shown(pictures), _edges_shown(colors)))
+    return _other_frame(edges) if edges else None
+
+
 def _can_read(shot: Shot, number: int) -> bool:
     try:
         shot.read(number)
@@ -231,30 +257,20 @@ class _Evidence:
             if frame.variance is not None:
                 self.variances.append(_variance_ratios(frame))
         if len(frames) == 2:
-            small = [_shrink(frame.color) for frame in frames]
-            exposure = median_luminance(small[0])
-            # Of noise the correlation knows less where neighbours are averaged.
-            tones = [cv2.blur(tone_map(color, exposure), (3, 3)) for color in small]
-            shown = [_slope(np.asarray(tone, np.float32)) for tone in tones]
+            shown = _edges_shown([frame.color for frame in frames])
             for role in ("albedo", "normal"):
                 guides = [getattr(frame, role) for frame in frames]
                 if all(guide is not None for guide in guides):
                     slopes = [_slope(_shrink(guide)) for guide in guides]
-                    own = (_correlate(slopes[0], shown[0]) + _correlate(slopes[1], shown[1])) / 2
-                    late, early = _correlate(slopes[1], shown[0]), _correlate(slopes[0], shown[1])
-                    self.edges.setdefault(role, []).append((own, late, early))
+                    self.edges.setdefault(role, []).append(_match_edges(slopes, shown))
 
     def findings(self) -> Iterator[Finding]:
         """What is wrong in every frame that was looked at."""
         for role, words in self.wrong.items():
             if all(words):
                 yield self._leave(role, str(words[0]))
-            elif role in self.edges:
-                own, late, early = np.mean(self.edges[role], axis=0)
-                if max(late, early) > own + EDGES:
-                    other = "previous" if late > early else "next"
-                    figures = f"their edges correlate {max(late, early):.2f}, with its own frame's {own:.2f}"
-                    yield self._leave(role, f"belongs to the {other} frame ({figures})")
+            elif role in self.edges and (other := _other_frame(self.edges[role])):
+                yield self._leave(role, f"belongs to {other}")
 
     def judge_variance(self) -> tuple[float | None, list[Finding]]:
         """What the variance is multiplied by where nobody has said so, and what there is to say of it."""
@@ -297,6 +313,30 @@ def _shrink(layer: Array) -> Array:
     size = layer.shape[1] // factor, layer.shape[0] // factor
     cut = clean[: size[1] * factor, : size[0] * factor]
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _edges_shown(colors: Sequence[Array]) -> list[Array]:
+    """The edges of pictures, as the first one is exposed."""
+    small = [_shrink(color) for color in colors]
+    exposure = median_luminance(small[0])
+    # Of noise the correlation knows less where neighbours are averaged.
+    tones = [cv2.blur(tone_map(color, exposure), (3, 3)) for color in small]
+    return [_slope(np.asarray(tone, np.float32)) for tone in tones]
+
+
+def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> tuple[float, float, float]:
+    """Correlations of what two frames should show with what they show, of the second with the first, and back."""
+    own = (_correlate(found[0], shown[0]) + _correlate(found[1], shown[1])) / 2
+    return own, _correlate(found[1], shown[0]), _correlate(found[0], shown[1])
+
+
+def _other_frame(edges: Sequence[tuple[float, float, float]]) -> str | None:
+    """Which frame pairs show that is not their own, by `_match_edges`."""
+    own, late, early = np.mean(edges, axis=0)
+    if max(late, early) <= own + EDGES:
+        return None
+    figures = f"their edges correlate {max(late, early):.2f}, with its own frame's {own:.2f}"
+    return f"the {'previous' if late > early else 'next'} frame ({figures})"
 
 
 def _judge_guide(layer: Array) -> str | None:

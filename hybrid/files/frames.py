@@ -357,7 +357,8 @@ class Shot:
             if (state := self._states.get(path)) is None:
                 continue
             status = path.stat()
-            if (status.st_size, round(status.st_mtime_ns / 1e9, 3)) != (state.size, state.modified):
+            now = status.st_size, round(status.st_mtime_ns / 1e9, 3), status.st_ino
+            if now != (state.size, state.modified, state.inode):
                 raise OSError(f"{path} has changed since it was read; --resume makes again what was made from it")
 
     def source(self, number: int) -> ExrImage:

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -44,12 +44,15 @@ class Source:
         When it was last changed, seconds.
     hash : str
         Of its content, or of blocks all over it (`HASHED`).
+    inode : int
+        Which file of that name it was; means nothing later, and is not recorded.
     """
 
     name: str
     size: int
     modified: float
     hash: str
+    inode: int = field(default=0, compare=False)
 
     def same_as(self, other: Source) -> bool:
         """Whether nothing but the name is different; times to two seconds."""
@@ -77,7 +80,7 @@ def identify(path: Path) -> Source:
             for index in range(_BLOCKS):
                 file.seek((size - block) * index // (_BLOCKS - 1))
                 found.update(file.read(block))
-    return Source(path.name, size, round(status.st_mtime_ns / 1e9, 3), found.hexdigest())
+    return Source(path.name, size, round(status.st_mtime_ns / 1e9, 3), found.hexdigest(), status.st_ino)
 
 
 def describe_sources(files: Mapping[str, Source], **facts: object) -> str:

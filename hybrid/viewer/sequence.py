@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
@@ -67,7 +68,7 @@ class Sequence:
                 status = path.stat()
             except OSError:  # gone since the folder was listed
                 continue
-            found[number] = f"{status.st_mtime_ns:x}-{status.st_size:x}"
+            found[number] = _version(status)
         return found
 
     def layers(self, number: int) -> tuple[list[str], str]:
@@ -112,7 +113,7 @@ class Sequence:
             If the file cannot be read, for instance because it is not whole yet.
         """
         path = self._path(number)
-        key = path, path.stat().st_mtime_ns, name
+        key = path, _version(path.stat()), name
         with self._lock:
             pixels = self._kept.get(key)
         image = read_exr(path, pixels=pixels is None)
@@ -186,6 +187,11 @@ class Sequence:
                 inside = finite.size and finite.min() >= 0 and finite.max() <= 1
                 self._ranges[name] = (0.0, 1.0) if inside else (float(low), float(high))
             return self._ranges[name]
+
+
+def _version(status: os.stat_result) -> str:
+    """What changes when a file is replaced or written to, also by one of the same size and time."""
+    return f"{status.st_mtime_ns:x}-{status.st_size:x}-{status.st_ino:x}-{status.st_ctime_ns:x}"
 
 
 def _layers(image: ExrImage) -> Layers:

@@ -15,6 +15,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
 from hybrid.files import sources
+from hybrid.files.exr import write_layers
 from hybrid.files.frames import open_shot
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
@@ -383,3 +384,30 @@ def test_the_plan_sees_the_one_seed_of_blenders_defaults():
     decision = next(d for d in plan.decisions if d.stage == "fixed-noise")
     assert decision.on
     assert "Animate Seed" in decision.reason
+
+
+def late(folder, by, step=(3, 1)):
+    """Finished pictures, each in the place of a frame that comes so many after it."""
+    scene = Scene(frames=8, height=48, width=64, step=step)
+    folder.mkdir()
+    for index in range(1, 7):
+        layers = {"ViewLayer.Combined": scene.clean(index - by)["ViewLayer.Combined"]}
+        write_layers(folder / f"done.{scene.first + index}.exr", layers)
+    return scene
+
+
+@pytest.mark.parametrize(("by", "other"), [(1, "previous"), (-1, "next")])
+def test_pictures_of_the_neighbouring_frames_are_refused(tmp_path, capsys, by, other):
+    """Each frame came out as the one beside it, with exit code 0."""
+    late(tmp_path / "done", by).write(tmp_path / "in")
+    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "1002-1007"]
+    assert main([*words, "--estimate", str(tmp_path / "done")]) == 1
+    assert f"each picture belongs to the {other} frame" in capsys.readouterr().err
+    assert not list((tmp_path / "out").glob("*.exr"))
+
+
+@pytest.mark.parametrize(("by", "step"), [(0, (3, 1)), (1, (0, 0))])
+def test_pictures_that_are_alike_are_taken(tmp_path, by, step):
+    late(tmp_path / "done", by, step).write(tmp_path / "in")
+    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "1002-1007"]
+    assert main([*words, "--estimate", str(tmp_path / "done")]) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -356,3 +357,13 @@ def test_output_of_several_frames_needs_a_placeholder_and_may_not_be_the_input(t
             output_path(tmp_path / pattern, shot, 8)
     with pytest.raises(ValueError, match="overwrite"):  # a neighbour, not the frame itself
         output_path(tmp_path / "shot.0009.exr", open_shot(tmp_path, frames="8"), 8)
+
+
+def test_a_file_that_was_exchanged_is_seen_whatever_its_time_and_size(tmp_path):
+    """A run that went on over it ended with exit code 0."""
+    shot = open_shot(save(tmp_path, [1, 2]))
+    shot.read(1)
+    shot.check_unchanged([1, 2])
+    Path(shutil.copy2(shot.path(1), tmp_path / "spare")).replace(shot.path(1))
+    with pytest.raises(OSError, match=r"shot\.0001\.exr has changed since it was read"):
+        shot.check_unchanged([1, 2])

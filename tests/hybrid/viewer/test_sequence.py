@@ -123,6 +123,21 @@ def test_a_replaced_file_is_read_anew(tmp_path):
     assert (bright.min(), watched.picture(1, "color", 1, 0).max()) == (255, 0)
 
 
+def test_a_file_of_the_same_size_and_time_is_another_version(tmp_path):
+    """The old one was shown for as long as the page was open."""
+    path, spare = tmp_path / "a.1.exr", tmp_path / "spare.exr"
+    watched = Sequence(str(path), finished=True)
+    for place, value in ((path, 1), (spare, 0.5)):
+        write_layers(place, {"color": np.full((4, 4, 3), value, np.float32)})
+    first, bright = watched.versions(), watched.picture(1, "color", 1, 0)
+    status = path.stat()
+    assert spare.stat().st_size == status.st_size
+    os.utime(spare, ns=(status.st_atime_ns, status.st_mtime_ns))
+    spare.replace(path)
+    assert watched.versions() != first
+    assert watched.picture(1, "color", 1, 0).max() < bright.min()
+
+
 def test_another_exposure_does_not_read_again(scene, monkeypatch):
     scene.picture(1001, "ViewLayer.Combined", 1, 0)
 
