@@ -238,7 +238,8 @@ def denoise(
         ),
     ] = None,
     precision: Annotated[
-        Literal["auto", "float32", "bfloat16"], typer.Option(help="of the network", rich_help_panel=RESOURCES)
+        Literal["auto", "float32", "bfloat16"],
+        typer.Option(envvar="RAVG_PRECISION", help="of the network", rich_help_panel=RESOURCES),
     ] = "auto",
     device: DeviceOption = "auto",
     resume: ResumeOption = False,

@@ -102,6 +102,7 @@ ProfileOption = Annotated[
     str | None,
     typer.Option(
         metavar="NAME|FILE",
+        envvar="RAVG_PROFILE",
         help="whose names and conventions to take: a renderer, or a TOML file (docs/renderers.md); else found",
         rich_help_panel=INPUT,
     ),

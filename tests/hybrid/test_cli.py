@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -101,6 +102,22 @@ def test_the_environment_holds_the_defaults_of_a_site(shot_folder, capsys, monke
     monkeypatch.setenv("RAVG_MAX_PIXELS", "100")
     assert "100" in one_line_error(capsys, "inspect", shot_folder)
     assert run(capsys, "inspect", shot_folder, "--max-pixels", 10_000)[0] == 0
+
+
+def test_the_documentation_names_every_default_of_a_site():
+    """And each has the name of its option, but for Blender's interpreter, which is no one else's."""
+    text = (Path(__file__).parents[2] / "docs" / "farm.md").read_text(encoding="utf-8")
+    there = {
+        (str(parameter.envvar), option)
+        for command in typer.main.get_command(app).commands.values()
+        for parameter in command.params
+        for option in parameter.opts
+        if parameter.envvar and option.startswith("--")
+    }
+    assert {name for name, _ in there} == set(re.findall(r"`(RAVG_\w+)`", text))
+    assert {(n, o) for n, o in there if n != f"RAVG_{o[2:].upper().replace('-', '_')}"} == {
+        ("RAVG_BLENDER_PYTHON", "--python")
+    }
 
 
 def test_inspect_names_channels_and_decisions(shot_folder, capsys):
