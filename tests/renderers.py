@@ -231,6 +231,22 @@ RENDERERS = {
         roles="albedo normal depth variance",
         direction="both",
     ),
+    # The beauty, and the denoiser's variance file beside it.
+    "renderman, apart": Renderer(
+        "RenderMan",
+        lambda t: {
+            "shot.####.exr": layer("Ci", "rgb", t.color) | layer("", "a", t.alpha),
+            "shot_variance.####.exr": layer("albedo", "rgb", t.albedo)
+            | layer("normal", "rgb", t.normal)
+            | layer("zfiltered", "z", t.depth)
+            | layer("mse", "rgb", t.variance)
+            | layer("sampleCount", "y", np.full_like(t.alpha, SAMPLES))
+            | layer("forward", "rg", t.following * UP)
+            | layer("backward", "rg", t.previous * UP),
+        },
+        roles="albedo normal depth variance",
+        direction="both",
+    ),
     "vray": Renderer(
         "V-Ray",
         one(
@@ -364,5 +380,39 @@ RENDERERS = {
         ),
         direction="both",
         attributes={"nuke/version": "15.0"},
+    ),
+    "luxcore": Renderer(
+        "LuxCore",
+        lambda t: {
+            "RGB_IMAGEPIPELINE_####.exr": layer("", "RGB", t.color),
+            "ALBEDO_####.exr": layer("", "RGB", t.albedo),
+            "AVG_SHADING_NORMAL_####.exr": layer("", "RGB", t.normal),
+            "DEPTH_####.exr": {"Y": t.depth},
+        },
+        spec="",
+    ),
+    "unreal": Renderer(
+        "Unreal",
+        lambda t: {
+            "shot.FinalImage.####.exr": layer("", "RGBA", t.color, t.alpha),
+            "shot.FinalImageMovieRenderQueue_WorldNormal.####.exr": layer("", "RGB", t.normal),
+            "shot.FinalImageMovieRenderQueue_WorldDepth.####.exr": layer("", "R", t.depth),
+            "shot.FinalImageMovieRenderQueue_MotionVectors.####.exr": layer("", "RG", t.following / t.size * UP),
+        },
+        roles="normal depth",
+        direction="next",
+        attributes={"unreal/jobName": "shot"},
+        spec="",
+    ),
+    "3delight": Renderer(
+        "common names",
+        one(
+            lambda t: (
+                layer("RGBA", "RGBA", t.color, t.alpha)
+                | layer("albedo", "RGB", t.albedo)
+                | layer("N", "XYZ", t.normal)
+                | layer("", "Z", t.depth)
+            )
+        ),
     ),
 }
