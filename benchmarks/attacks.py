@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Sequence
@@ -826,6 +827,117 @@ def row_23() -> Cases:
     yield "two views in one file", partial(views_in_a_file, both_views)
 
 
+# --- 24: two things taken for one
+
+
+VIEWED = "%V/shot.####.exr"
+
+
+def two_views(more: Sequence[object], folder: Path) -> str | None:
+    """What is given once for both views is neither's: refused."""
+    for view in ("left", "right"):
+        shot(folder / view, 3)
+    given = dict(zip(more[::2], more[1::2], strict=True))
+    words = [word for option in {"-o": "out/%V", **given}.items() for word in option]
+    return first_of(
+        (done := ravg("pseudoref", VIEWED, *DRAFT, *words, folder=folder)).refused, "made" if done.code == 0 else None
+    )
+
+
+def pictures_called_alike(folder: Path) -> str | None:
+    """The estimates that are kept of two view layers lie apart, whatever these are called."""
+
+    def edit(index: int, layers: Layers) -> None:
+        for name in list(layers):
+            layer = layers.pop(name)
+            layers |= {name.replace("ViewLayer", other): layer.copy() for other in ("A B", "A_B")}
+
+    shot(folder / "in", 2, edit)
+    words = ["--estimate", "oidn-fast", "--keep-estimates", "kept"]
+    if failed := ravg("pseudoref", "in", "-o", "out", *DRAFT, *words, folder=folder).failed:
+        return failed
+    kept = len([*(folder / "kept").rglob("*.exr")])
+    return None if kept == 4 else f"{kept} of 4 pictures are kept"
+
+
+def neighbours_pictures(by: int, folder: Path) -> str | None:
+    """Estimates, each of the frame beside the one that it is called after, are refused."""
+    shot(folder / "in", 6, step=(3, 1))
+    for index in range(6):
+        picture = wall(index + by, SIZE, (3, 1))["ViewLayer.Combined"]
+        write(folder / "single" / f"shot.{1001 + index}.exr", {"ViewLayer.Combined": picture})
+    done = ravg("pseudoref", "in", "-o", "out", *DRAFT, "--estimate", "single", folder=folder)
+    return done.refused if done.code else ("each frame is another" if by else None)
+
+
+def asked_otherwise(frames: str, folder: Path) -> str | None:
+    """Of every second frame the pictures are the same, whatever range is asked for."""
+    noisy = shot(folder / "in", 7, step=(1, 0))
+    for number in (1002, 1004, 1006):
+        (noisy / f"shot.{number}.exr").unlink()
+    if failed := ravg("pseudoref", "in", "-o", "all", *DRAFT, folder=folder).failed:
+        return failed
+    ravg("pseudoref", "in", "-o", "part", *DRAFT, "--frames", frames, "--keep-going", folder=folder)
+    return differ(folder / "part", folder / "all", names(folder / "part"))
+
+
+PROGRAM = """
+import json, sys
+from hybrid import denoise_shot, open_shot
+out, options = sys.argv[1], json.loads(sys.argv[2])
+print(sum(not frame.resumed for frame in denoise_shot(open_shot("in"), out, resume=True, **options)))
+"""
+
+
+def other_program(first: dict[str, object], then: dict[str, object], folder: Path) -> str | None:
+    """What a program has made with `denoise_shot` is resumed by its options too."""
+    shot(folder / "in", 3, step=(2, 1))
+    shutil.copy(PACKAGES / "tests" / "data" / "small.safetensors", folder / "w.safetensors")
+    for out, options in (("out", first), ("out", then), ("fresh", then)):
+        if failed := alone(PROGRAM, out, json.dumps(options), folder=folder).failed:
+            return failed
+    return differ(folder / "fresh", folder / "out")
+
+
+def exchanged_while_it_runs(folder: Path) -> str | None:
+    """A frame that is exchanged for another of its size and time while it is used ends the run, or is used as a whole."""
+    for name, noise in (("in", 0.3), ("other", 0.5)):
+        shot(folder / name, 12, size=(160, 240), step=(2, 1), noise=noise, compression=OpenEXR.NO_COMPRESSION)
+    old, new = (folder / name / "shot.1008.exr" for name in ("in", "other"))
+    status = old.stat()
+    os.utime(new, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+    def exchange() -> None:
+        while not (folder / "out" / "shot.1006.exr").exists():
+            time.sleep(0.002)
+        new.replace(old)
+
+    threading.Thread(target=exchange, daemon=True).start()
+    done = _alone(["pseudoref", "in", "-o", "out", *DRAFT], folder)
+    return done.refused if done.code else "exit code 0"
+
+
+def row_24() -> Cases:
+    for more in (
+        ["--keep-estimates", "kept", "--estimate", "oidn-fast"],
+        ["--preview", "x.png"],
+        ["--contact", "x.png"],
+        ["--estimate", "left/shot.####.exr"],
+        ["--layer", "albedo=left/shot.####.exr"],
+        ["-o", "out"],
+    ):
+        yield f"{' '.join(more[:2])} for two views", partial(two_views, more)
+    yield "view layers called alike", pictures_called_alike
+    for by in (-1, 0, 1):
+        yield f"estimates of the frames {by:+d}", partial(neighbours_pictures, by)
+    for frames in ("1001-1007", "1003-1006", "1005"):
+        yield f"every second frame, asked for as {frames}", partial(asked_otherwise, frames)
+    draft: dict[str, object] = {"preset": "draft"}
+    for then in ({"no_stages": ["warp"]}, {"stages": ["refine"]}, {"estimate": "nlm"}, {"weights": "w.safetensors"}):
+        yield f"a program's {then}", partial(other_program, draft, draft | then)
+    yield "a frame exchanged while it is used", exchanged_while_it_runs
+
+
 ROWS = {
     15: ("resuming with another option, profile, layer or weights", row_15),
     16: ("estimates from a sequence that does not fit", row_16),
@@ -836,6 +948,7 @@ ROWS = {
     21: ("a frame that is not like the others", row_21),
     22: ("several runs at once, and chunks on a cluster", row_22),
     23: ("stereo", row_23),
+    24: ("two things taken for one: views, view layers, neighbouring frames, ranges, programs", row_24),
 }
 
 

@@ -90,7 +90,7 @@ def denoise_shot(
     else:
         from hybrid.neural.denoiser import Denoiser, shipped_weights
 
-        path = weights or shipped_weights(preset)
+        path = Path(weights or shipped_weights(preset))
         network = Denoiser(path, device=device)
         content = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
         settings |= {"weights": content, "precision": network.precision, "network": network.device}
