@@ -144,7 +144,7 @@ def row_15() -> Cases:
         ),
         ("albedo from elsewhere", [], albedo, nothing),
         ("albedo from elsewhere made again, at the same time", albedo, albedo, lambda f: apart(f / "albedo", ALBEDO, seed=3)),
-        ("albedo from elsewhere, another sequence", albedo, ["--layer", "albedo=in/shot.####.exr:ViewLayer.Denoising Normal"], nothing),
+        ("albedo from elsewhere, another sequence", albedo, ["--layer", "albedo=in/shot.####.exr:ViewLayer.Combined"], nothing),
         ("a part of the frames first", ["--frames", "1002-1003"], [], nothing),
         ("every second frame first", ["--frames", "1001-1005x2"], [], nothing),
         ("with and without --max-memory", ["--max-memory", "4G"], [], nothing),

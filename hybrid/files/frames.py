@@ -18,7 +18,7 @@ import numpy as np
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
-from hybrid.files.layers import Layers, find_colors, find_layers, summarize_layers
+from hybrid.files.layers import Layers, find_colors, find_layers, samples_of, summarize_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
@@ -405,7 +405,8 @@ class Shot:
 
     def _kind(self, image: ExrImage) -> object:
         """What a file has, by which its layers are known: found once, not with every header that is read."""
-        kind = tuple((part.name, part.view, tuple(part.channels)) for part in image.parts)
+        channels = tuple((part.name, part.view, tuple(part.channels)) for part in image.parts)
+        kind = channels, samples_of(image, self.profile)
         if kind not in self._known:
             self._known[kind] = find_layers(image, self._overrides, self.profile, self._aovs, self._elsewhere)
         self._kinds[image.path] = kind

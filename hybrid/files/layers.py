@@ -146,7 +146,7 @@ def find_layers(
     view = color.view or (image.views[0] if image.views else None)
     if len(image.views) > 1 and not isinstance(overrides.get("color"), Layer):
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
-    convention, samples = _convention(found, taken), _samples(image, taken)
+    convention, samples = _convention(found, taken), samples_of(image, taken)
     return Layers(
         **found,  # type: ignore[arg-type]
         profile=taken.name,
@@ -322,7 +322,7 @@ def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConve
     return replace(convention, direction="previous") if profile.layers.get("motion_next") else convention
 
 
-def _samples(image: ExrImage, profile: Profile) -> float | None:
+def samples_of(image: ExrImage, profile: Profile) -> float | None:
     """Samples of a pixel, where the header tells them."""
     for part in image.parts:
         for name in fnmatch.filter(part.header, profile.samples or ""):

@@ -14,6 +14,8 @@ from hybrid.alignment.align import Aligner
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import ExrError, read_exr, write_layers
 from hybrid.files.frames import Frame, Shot, open_shot, output_path
+from tests.renderers import layer
+from tests.renderers import save as save_file
 
 SIZE = 4, 6
 
@@ -367,3 +369,14 @@ def test_a_file_that_was_exchanged_is_seen_whatever_its_time_and_size(tmp_path):
     Path(shutil.copy2(shot.path(1), tmp_path / "spare")).replace(shot.path(1))
     with pytest.raises(OSError, match=r"shot\.0001\.exr has changed since it was read"):
         shot.check_unchanged([1, 2])
+
+
+def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):
+    """A frame that was rendered again with more of them had that of the first one's."""
+    ones = np.ones(SIZE, np.float32)
+    for number, samples in ((1, 64), (2, 256)):
+        channels = layer("", "RGB", ones, ones, ones) | layer("Variance", "RGB", ones, ones, ones)
+        save_file(tmp_path / f"a.{number}.exr", channels, {"samplesPerPixel": samples, "renderTimeSeconds": 1.0})
+    shot = open_shot(tmp_path)
+    assert [shot.read(number).variance.max() for number in (1, 2)] == [1 / 64, 1 / 256]
+    assert "variance 0.00390625" in shot.taken(2)
