@@ -323,7 +323,20 @@ def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConve
 
 
 def samples_of(image: ExrImage, profile: Profile) -> float | None:
-    """Samples of a pixel, where the header tells them."""
+    """Find how many samples a pixel has.
+
+    Parameters
+    ----------
+    image : ExrImage
+        A file, or its header alone.
+    profile : Profile
+        Which attribute tells it.
+
+    Returns
+    -------
+    float or None
+        At least 1; None where the header does not tell.
+    """
     for part in image.parts:
         for name in fnmatch.filter(part.header, profile.samples or ""):
             try:
