@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,7 @@ def same_in_chunks(edit: Edit, folder: Path) -> str | None:
 
 
 def told_where(edit: Edit, stage: str, frames: str, folder: Path) -> str | None:
-    said = ravg("inspect", shot(folder, 18, edit)).said
+    said = ravg("inspect", shot(folder, 18, edit)).words
     words = " ".join(said[said.find(stage) :].split()[:60])
     return None if frames in words else f"frames {frames} are not named with {stage}"
 
@@ -342,7 +343,7 @@ def row_3() -> Cases:
 # --- 4: one seed for all frames
 
 
-def seed_is_told(samples: int, moves: bool, fixed: bool, shots: int, folder: Path) -> str | None:
+def seed_is_told(samples: int, moves: bool, fixed: bool, vectors: bool, shots: int, folder: Path) -> str | None:
     """Detail of a pixel's size correlates between frames as a fixed noise does."""
     size, step = (96, 128), (3, 1) if moves else (0, 0)
     detail = np.random.default_rng(shots).uniform(0.5, 1.5, (200, 200, 1)).astype(np.float32)
@@ -351,18 +352,21 @@ def seed_is_told(samples: int, moves: bool, fixed: bool, shots: int, folder: Pat
         y, x = 40 - step[1] * index, 40 - step[0] * index
         clean = layers["ViewLayer.Combined"] * detail[y : y + 96, x : x + 128]
         layers["ViewLayer.Combined"] = grained(clean, (shots, 0 if fixed else index), 2 / samples**0.5)
+        if not vectors:
+            del layers["ViewLayer.Vector"]
         write(folder / f"shot.{1001 + index}.exr", layers)
-    found = "one seed for all frames" in " ".join(ravg("inspect", folder).said.split())
+    words = ravg("inspect", folder).words
+    # In a table of several columns the words of one may stand a line apart.
+    found = "one seed for all" in words
     return None if found == fixed else f"one seed is {'' if found else 'not '}said"
 
 
 def row_4() -> Cases:
-    for samples in (16, 256, 4096):
-        for moves in (False, True):
-            for fixed in (False, True):
-                for number in (1, 2):
-                    words = f"{samples} samples, {'moving' if moves else 'still'}, {'one seed' if fixed else 'many'}"
-                    yield words, partial(seed_is_told, samples, moves, fixed, number)
+    for samples, moves, fixed, vectors in product((16, 256, 4096), (False, True), (False, True), (True, False)):
+        for number in (1, 2):
+            words = f"{samples} samples, {'moving' if moves else 'still'}, {'one seed' if fixed else 'many'}"
+            words += ", no vectors" * (not vectors)
+            yield words, partial(seed_is_told, samples, moves, fixed, vectors, number)
 
 
 # --- 5: alpha

@@ -60,6 +60,11 @@ class Done:
     said: str
 
     @property
+    def words(self) -> str:
+        """What it said in one line, without what tables and boxes are drawn with."""
+        return " ".join("".join(" " if "\u2500" <= sign <= "\u257f" else sign for sign in self.said).split())
+
+    @property
     def refused(self) -> str | None:
         """None where it ended with an error in one line."""
         if self.code not in (1, 2):

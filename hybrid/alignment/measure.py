@@ -244,7 +244,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     here, there : PreparedFrame
         Neighbouring frames of one size.
     moves : bool
-        Whether the picture changes at equal pixels; asked only where no vectors tell.
+        Whether the picture changes at equal pixels; asked only where no vectors tell: then the motion is searched for.
 
     Returns
     -------
@@ -265,14 +265,16 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
     grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > 4 * SAME
-    forth, back = rendered_flow(here, there), rendered_flow(there, here)
+    forth, back, slowest = rendered_flow(here, there), rendered_flow(there, here), STILL_NOISE
+    if (forth is None or back is None) and moves:
+        # What is found is right to some tenths of a pixel: more than that is as good as still, which asks for equality.
+        forth, back = _search(here.radiance, there.radiance), _search(there.radiance, here.radiance)
+        slowest = MOVED_NOISE
     if forth is None or back is None:
-        if moves:  # detail moves as well, and only noise can correlate
-            return _correlation(*noise)
         still, moved = np.ones(a.shape, bool), np.zeros(a.shape, bool)
     else:
         length = np.hypot(forth[0][block][..., 0], forth[0][block][..., 1])
-        still = (length < STILL_NOISE) & forth[1][block]
+        still = (length < slowest) & forth[1][block]
         moved = (length > MOVED_NOISE) & forth[1][block] & back[1][block]
     shares, figures = [], []
     compared = still & grainy
