@@ -1,9 +1,16 @@
 """What a newcomer types, as the documentation has it, and what is said."""
 
+import os
 import re
 import shlex
+import signal
+import subprocess
+import sys
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 from hybrid.cli import main
 
@@ -38,3 +45,32 @@ def test_in_a_shell(tmp_path, monkeypatch, capsys):
         for line in answer:
             assert said(line) in lines
         assert code == (1 if any(word in " ".join(answer) for word in ("missing", "error")) else 0)
+
+
+@pytest.mark.neural
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+def test_looking_at_a_shot(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    ((_, *words), answer), ((_, *look), (url, end)) = transcript("view.md", "transcript")
+    assert main(words) == 0
+    lines = [said(line) for line in capsys.readouterr().err.splitlines()]
+    for line in answer:
+        assert said(line) in lines
+    command = [sys.executable, "-m", "hybrid.cli", *look, "--no-browser"]
+    path = os.pathsep.join([str(ROOT), *sys.path])
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path})
+    try:
+        assert process.stdout is not None
+        shown = r"http://127\.0\.0\.1:\d+/[\w-]+/"
+        here = process.stdout.readline().strip()
+        assert re.fullmatch(shown, url)
+        assert re.fullmatch(shown, here)
+        assert process.stdout.readline().strip() == end
+        with urllib.request.urlopen(here + "state", timeout=30) as state:
+            assert state.read().count(b'"14"') >= 2  # of the frames that are finished, and of those beside them
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+    finally:
+        process.kill()
