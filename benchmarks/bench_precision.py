@@ -30,9 +30,10 @@ from hybrid.alignment.transfer import measure_exposure
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import choose_estimate
 from hybrid.files.frames import open_shot
-from hybrid.neural.denoiser import Denoiser, shipped_weights
+from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import FINAL, filter_window
+from network.checkpoint import shipped_weights
 from nlm.guided import guided_filter
 
 Array = NDArray[np.float32]

@@ -1001,7 +1001,7 @@ def row_11() -> Cases:
     for entry in ("description", "version", "format"):
         long = partial(lambda entry, metadata: metadata.update({entry: "x\n" * 500_000}), entry)
         yield f"a megabyte of {entry}", partial(hostile_weights, long, "fast")
-    for text in ("[" * 10**5, '{"a":' * 10**5, "null", "1e999", '{"model": "Stabilizer", "config": null}'):
+    for text in ("[" * 10**5, '{"a":' * 10**5, "null", "1e999", '{"model": "RobustUNet", "config": null}'):
         other = partial(lambda text, metadata: metadata.update({"description": text}), text)
         yield f"a description {text[:12]}", partial(hostile_weights, other, "fast")
 

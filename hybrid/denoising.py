@@ -88,7 +88,7 @@ def denoise_shot(
         make = partial(filter_window, preset=own) if source.estimates is None else gated_average
         denoise = lambda aligned: Denoised(make(aligned))  # noqa: E731 - as the command has it
     else:
-        from hybrid.neural.denoiser import Denoiser, shipped_weights
+        from hybrid.neural import Denoiser, denoise_bundled, shipped_weights
 
         path = Path(weights or shipped_weights(preset))
         network = Denoiser(path, device=device)
@@ -97,7 +97,14 @@ def denoise_shot(
         denoise, radius = network, network.radius
         if network.takes_estimate:
             mode = MODE_OF[preset] if weights is None else "oidn-clean"
-            source = choose_estimate(estimate or "auto", shot, mode=mode, device=device)
+            source = choose_estimate(
+                estimate or "auto",
+                shot,
+                mode=mode,
+                quicker=network.quicker,
+                bundled=denoise_bundled,
+                device=device,
+            )
         else:
             source = EstimateSource("none", None, "this network takes none")
     settings["oidn"] = source.device

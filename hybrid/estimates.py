@@ -40,8 +40,9 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
 }
 # What is asked for by these names; by any other, a finished sequence.
 SPECS = ("auto", "none", "nlm", *OIDN_MODES)
-# What "auto" takes of them for a preset of the network: each is a point of accuracy against time.
-MODE_OF = {"fast": "oidn-fast", "balanced": "oidn", "quality": "oidn-clean"}
+# What "auto" takes of them for a preset of the network, which looks at the samples again: what the first look is
+# matters little (fast or clean: 0.1 dB).
+MODE_OF = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,7 @@ def choose_estimate(
     mode: str = "oidn-clean",
     forced: str = "",
     quicker: Callable[..., Array] | None = None,
+    bundled: Callable[..., Array] | None = None,
     device: str = "cpu",
 ) -> EstimateSource:
     """Find the estimates that are asked for.
@@ -203,6 +205,8 @@ def choose_estimate(
         for that.
     quicker : callable, optional
         What "auto" has in the place of `hybrid.oidn.denoise_oidn` on a processor, with the same parameters.
+    bundled : callable, optional
+        What "auto" has where OIDN is not installed, before our own, with the same parameters.
     device : str
         Of OIDN, as for `hybrid.oidn.find_device`.
 
@@ -221,7 +225,7 @@ def choose_estimate(
         If there is no such sequence.
     """
     keep = None if kept is None else partial(Kept, shot, kept, forced)
-    source = _choose(spec, shot, own, mode, keep, quicker, device)
+    source = _choose(spec, shot, own, mode, keep, quicker, bundled, device)
     if kept is not None and source.name not in OIDN_MODES:
         return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
     return source
@@ -234,6 +238,7 @@ def _choose(
     mode: str,
     keep: Callable[[str, bool, str], Kept] | None,
     quicker: Callable[..., Array] | None,
+    bundled: Callable[..., Array] | None,
     device: str,
 ) -> EstimateSource:
     if spec == "auto":
@@ -243,6 +248,9 @@ def _choose(
             if quicker is not None and find_device(device) == "cpu":
                 return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", "cpu", quicker)
             return _oidn(mode, keep, "OIDN is installed", device)
+        if bundled is not None:
+            run = partial(estimate_oidn, denoise=bundled)
+            return EstimateSource("bundled", OfFrames(run, HOLDS), f"{lacking}; a small network comes with ravg")
         return EstimateSource("nlm", OfWindows(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
         return EstimateSource("none", None, "asked for")

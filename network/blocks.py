@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from math import log
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from network.fused import blend_pixels, can_blend
 
 
 def ravg(frames: Sequence[Tensor]) -> Tensor:
@@ -141,6 +144,11 @@ class RobustAverage(nn.Module):
         Width of the features.
     kernel_size : int
         Odd size of the convolutions that predict the weights.
+    hidden : int, optional
+        Width between those convolutions; without, `channels`.
+    blend : float, optional
+        In (0, 1): the weight of the average in every pixel until training changes it. Without, what the initial values
+        of the convolutions give, around a half.
 
     Notes
     -----
@@ -151,19 +159,27 @@ class RobustAverage(nn.Module):
     The first convolution acts on the concatenation of x_i and a; it is held as two halves. As each frame is
     excluded before it has been changed, the half on x_i runs on all frames at once, and nothing is concatenated.
 
+    With convolutions of 1×1 the block does not look beyond a pixel. Where no gradient is asked for, on a processor, it
+    is then one pass over memory (`network.fused`), where torch needs one for each of forty operations.
+
     References
     ----------
     Kalojanov and Thurston 2023, section 3.
     """
 
-    def __init__(self, channels: int, kernel_size: int = 3) -> None:
+    def __init__(
+        self, channels: int, kernel_size: int = 3, hidden: int | None = None, blend: float | None = None
+    ) -> None:
         super().__init__()
-        padding = kernel_size // 2
-        self.on_frame = nn.Conv2d(channels, channels, kernel_size, padding=padding)
-        self.on_average = nn.Conv2d(channels, channels, kernel_size, padding=padding, bias=False)
-        self.weight = nn.Conv2d(channels, 1, kernel_size, padding=padding)
+        padding, hidden = kernel_size // 2, channels if hidden is None else hidden
+        self.on_frame = nn.Conv2d(channels, hidden, kernel_size, padding=padding)
+        self.on_average = nn.Conv2d(channels, hidden, kernel_size, padding=padding, bias=False)
+        self.weight = nn.Conv2d(hidden, 1, kernel_size, padding=padding)
+        if blend is not None:
+            nn.init.zeros_(self.weight.weight)
+            nn.init.constant_(cast(Tensor, self.weight.bias), log(blend / (1 - blend)))
 
-    def forward(self, x: Tensor, frames: int) -> Tensor:
+    def forward(self, x: Tensor, frames: int, centre: bool = False) -> Tensor:
         """Blend over time.
 
         Parameters
@@ -172,21 +188,26 @@ class RobustAverage(nn.Module):
             ``(T·N, C, H, W)``, time first.
         frames : int
             T. With one frame there is nothing to average: the block is the identity.
+        centre : bool
+            Whether the centre frame alone is asked for.
 
         Returns
         -------
         Tensor
-            As x.
+            As x, or ``(N, C, H, W)``.
         """
         if frames == 1:
             return x
+        if not torch.is_grad_enabled() and can_blend(x, self.on_frame, frames):
+            order, kept = outermost_first(frames), [frames // 2] if centre else range(frames)
+            return blend_pixels(x, frames, order, self.on_frame, self.on_average, self.weight, kept)
         of_frame = self.on_frame(x).chunk(frames)
         state = list(x.chunk(frames))
         for i in outermost_first(frames):
             average = ravg(state[:i] + state[i + 1 :])
             weight = torch.sigmoid(self.weight(torch.relu(of_frame[i] + self.on_average(average))))
             state[i] = torch.lerp(state[i], average, weight)
-        return torch.cat(state)
+        return state[frames // 2] if centre else torch.cat(state)
 
 
 class UNet(nn.Module):
@@ -200,18 +221,16 @@ class UNet(nn.Module):
         Channels of each scale, finest first.
     ra_scales : sequence of int
         Scales with an RA block.
-    cell : int
-        Pixels in each direction that the finest scale has one of.
 
     Notes
     -----
     One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
-    addition up. The first convolution sees 3×3 cells.
+    addition up.
     """
 
-    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int], cell: int = 1) -> None:
+    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int]) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(inputs, widths[0], 3 * cell, stride=cell, padding=cell)
+        self.stem = nn.Conv2d(inputs, widths[0], 3, padding=1)
         self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
         self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in ra_scales})
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))

@@ -27,7 +27,7 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
-from network.stabilizer import Stabilizer, StabilizerConfig
+from network.robust_unet import RobustUNet, RobustUNetConfig
 
 Config = TypeVar("Config")
 
@@ -53,7 +53,7 @@ CLASSES: dict[str, tuple[Any, Any]] = {
     "RAUNet": (RAUNet, RAUNetConfig),
     "RAResNet": (RAResNet, RAResNetConfig),
     "TKPCN": (TKPCN, TKPCNConfig),
-    "Stabilizer": (Stabilizer, StabilizerConfig),
+    "RobustUNet": (RobustUNet, RobustUNetConfig),
 }
 
 
@@ -289,3 +289,29 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
             yield file, metadata
     except SafetensorError as error:
         raise ValueError(f"{where}: no safetensors file, or cut short ({_short(error)})") from error
+
+
+def shipped_weights(preset: str) -> Path:
+    """Path of the weights that come with the package.
+
+    Parameters
+    ----------
+    preset : str
+        Name.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ValueError
+        If there is no such preset; names those there are.
+    """
+    folder = Path(__file__).parent / "weights"
+    path = folder / f"{preset}.safetensors"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
+        raise ValueError(f"preset is {preset!r}, expected one of: {known}")
+    return path

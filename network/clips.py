@@ -26,10 +26,12 @@ from network.losses import ImageLoss
 from network.train_config import SamplerConfig
 
 FORMAT = "ravg-clips"
-VERSION = "1"
+VERSION = "2"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
 #: (fireflies only) becomes this.
 HALF_MAX = 65504.0
+#: The fields of a clip that are one number for each level.
+FIGURES = ("exposure", "gain")
 #: Bytes after which a shard is full: small enough to copy about, large enough that files are few.
 SHARD_BYTES = 1 << 28
 
@@ -46,6 +48,8 @@ class Clip:
         ``(L, T, 3, H, W)`` aligned likewise; zeros where the renderer gave none.
     estimate : Tensor
         ``(L, T, 3, H, W)`` aligned estimates of the frames, irradiance, made from the same noisy frames alone.
+    residual : Tensor
+        ``(L, T, 3, H, W)`` what the noisy frames show beyond them, aligned to the nearest pixel (`nlm.gather`).
     confidence : Tensor
         ``(L, T, 1, H, W)`` in [0, 1].
     modulation : Tensor
@@ -54,6 +58,8 @@ class Clip:
         ``(L, 3, H, W)`` radiance of the centre, as rendered and as estimated from the level's own window.
     exposure : Tensor
         ``(L,)``, of the windows of whole frames: what the network is told when it runs.
+    gain : Tensor
+        ``(L,)``, OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
     reference : Tensor, optional
         ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
 
@@ -67,11 +73,13 @@ class Clip:
     albedo: Tensor
     normal: Tensor
     estimate: Tensor
+    residual: Tensor
     confidence: Tensor
     modulation: Tensor
     noisy: Tensor
     pseudo_reference: Tensor
     exposure: Tensor
+    gain: Tensor
     reference: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -80,10 +88,10 @@ class Clip:
             raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
         image = (shape[0], *shape[2:])
         expected = {
-            **dict.fromkeys(("color", "albedo", "normal", "estimate"), shape),
+            **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), shape),
             **dict.fromkeys(("modulation", "noisy", "pseudo_reference"), image),
             "confidence": (*shape[:2], 1, *shape[3:]),
-            "exposure": shape[:1],
+            **dict.fromkeys(FIGURES, shape[:1]),
             "reference": image,
         }
         for name, value in _values(self).items():
@@ -109,7 +117,7 @@ class Clip:
             With the exposures of the whole frame.
         """
         here = np.s_[..., y : y + size, x : x + size]
-        return Clip(**{n: v if n == "exposure" else v[here] for n, v in _values(self).items()})
+        return Clip(**{n: v if n in FIGURES else v[here] for n, v in _values(self).items()})
 
 
 def _values(clip: Clip) -> dict[str, Tensor]:
@@ -292,11 +300,11 @@ def write_shards(
 def _pack(clip: Clip) -> dict[str, Tensor]:
     """Values as they are stored: radiance and irradiance over the exposure of the last level, float16."""
     scale = clip.exposure[-1]
-    packed = {"exposure": (clip.exposure / scale).float()}
+    packed = {"exposure": (clip.exposure / scale).float(), "gain": (clip.gain * scale).float()}
     for name, value in _values(clip).items():
-        if name in ("color", "estimate", "noisy", "pseudo_reference", "reference"):
+        if name in ("color", "estimate", "residual", "noisy", "pseudo_reference", "reference"):
             value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
-        if name != "exposure":
+        if name not in FIGURES:
             packed[name] = value.to(torch.float16).contiguous()
     return packed
 
@@ -400,7 +408,7 @@ class Clips:
             If the file is cut short.
         """
         shard, number = self._find(index)
-        names = ("color", "albedo", "normal", "estimate", "confidence", "modulation", "exposure")
+        names = ("color", "albedo", "normal", "estimate", "residual", "confidence", "modulation", *FIGURES)
         try:
             with safe_open(shard.path, framework="pt") as file:
                 values = {name: file.get_slice(name)[number, level] for name in names}
@@ -554,16 +562,17 @@ class Samples(Dataset[dict[str, Tensor]]):
         Returns
         -------
         dict of Tensor
-            float32: ``color``, ``albedo``, ``normal``, ``estimate`` ``(T, 3, H, W)``, ``confidence`` ``(T, 1, H, W)``,
-            ``modulation``, ``target`` ``(3, H, W)``, ``exposure`` and ``error`` ``()`` (the loss of the clip's best
-            input). A `torch.utils.data.DataLoader` stacks them.
+            float32: ``color``, ``albedo``, ``normal``, ``estimate``, ``residual`` ``(T, 3, H, W)``, ``confidence``
+            ``(T, 1, H, W)``, ``modulation``, ``target`` ``(3, H, W)``, ``exposure``, ``gain`` and ``error`` ``()`` (the
+            loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
         level = int(rng.integers(len(pairs)))
         values = self.clips.read(index, level, pairs[level][rng.integers(len(pairs[level]))])
         error = input_error({name: value[None].float() for name, value in values.items()}, self.loss)[0]
-        exposure, frames = values.pop("exposure").float(), len(values["color"])
+        exposure, gain = (values.pop(name).float() for name in FIGURES)
+        frames = len(values["color"])
         centre = frames // 2
         y, x = self._place(values, rng)
         flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
@@ -582,16 +591,19 @@ class Samples(Dataset[dict[str, Tensor]]):
         if frames > 1 and rng.random() < config.drop_frames:
             dropped = torch.from_numpy(rng.random(frames) < 0.5)
             dropped[centre] = False
-            for name in ("color", "albedo", "normal", "estimate"):
+            for name in ("color", "albedo", "normal", "estimate", "residual"):
                 sample[name][dropped] = sample[name][centre].clone()
             sample["confidence"][dropped] = 0
         if rng.random() < config.fireflies:
             count = rng.integers(1, 9)
             rows, columns = rng.integers(config.crop, size=(2, count))
             # Not black where it was black: a firefly comes from a path, not from the pixel it lands in.
-            gain = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * exposure
-            sample["color"][rng.integers(frames), :, rows, columns] += gain
-        sample["exposure"] = exposure * 2 ** rng.uniform(-config.exposure_stops, config.exposure_stops)
+            burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * exposure
+            frame = rng.integers(frames)
+            for name in ("color", "residual"):
+                sample[name][frame, :, rows, columns] += burst
+        stops = rng.uniform(-config.exposure_stops, config.exposure_stops)
+        sample["exposure"], sample["gain"] = exposure * 2**stops, gain / 2**stops
         sample["error"] = error
         return sample
 
@@ -659,7 +671,7 @@ def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tens
     for level, targets in enumerate(clips.pairs(index)):
         values = clips.read(index, level, targets[0])
         height, width = (length // multiple * multiple for length in values["target"].shape[-2:])
-        batch = {n: v[None].float() for n, v in values.items() if n == "exposure"}
-        batch |= {n: v[None, ..., :height, :width].float() for n, v in values.items() if n != "exposure"}
+        batch = {n: v[None].float() for n, v in values.items() if n in FIGURES}
+        batch |= {n: v[None, ..., :height, :width].float() for n, v in values.items() if n not in FIGURES}
         batches.append(batch)
     return batches

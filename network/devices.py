@@ -35,6 +35,24 @@ def find_device(name: str) -> tuple[str, torch.device]:
     return name, there[name]
 
 
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a device computes in bfloat16 faster than in float32.
+
+    Parameters
+    ----------
+    device : torch.device
+        Of processors those with AVX-512 bf16 or AMX do.
+
+    Returns
+    -------
+    bool
+    """
+    if device.type != "cpu":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
 def _accelerators() -> dict[str, torch.device]:
     """Those that torch can use here."""
     found = {}

@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Channels of a frame without an estimate: color, albedo, normal, confidence (the paper's).
+#: Channels of a frame: color, albedo, normal, confidence (the paper's).
 CHANNELS = 10
-#: Channels an estimate adds: its three, and its difference from the centre's.
-ESTIMATE_CHANNELS = 6
 
 
 def network_inputs(
@@ -17,7 +15,6 @@ def network_inputs(
     normal: Tensor | None,
     confidence: Tensor,
     exposure: Tensor,
-    estimate: Tensor | None = None,
 ) -> Tensor:
     """Feature channels of each frame of an aligned window.
 
@@ -32,15 +29,11 @@ def network_inputs(
     exposure : Tensor
         ``(N,)``, positive: the brightness of each window as a whole, proportional to its radiance. Of whole frames and
         never of tiles: tiles of different exposure would show their seams.
-    estimate : Tensor, optional
-        ``(N, T, 3, H, W)`` aligned estimates, irradiance, for a model that takes them.
 
     Returns
     -------
     Tensor
-        ``(N, T, 10, H, W)``, or ``(N, T, 16, H, W)`` with an estimate: ``log1p(color / exposure)``,
-        ``log1p(albedo)``, normal, confidence, then ``log1p(estimate / exposure)`` and ten times what that differs by
-        from the centre frame's.
+        ``(N, T, 10, H, W)``: ``log1p(color / exposure)``, ``log1p(albedo)``, normal, confidence.
 
     Raises
     ------
@@ -67,10 +60,4 @@ def network_inputs(
         missing if normal is None else normal,
         confidence,
     ]
-    if estimate is not None:
-        if estimate.shape != (n, t, 3, h, w):
-            raise ValueError(f"estimate: expected shape {(n, t, 3, h, w)}, got {tuple(estimate.shape)}")
-        log = (estimate * scale).clamp_min_(0).log1p_()
-        # Ten times: what matters is a few hundredths, on the scale of the other channels some tenths.
-        channels += [log, (log - log[:, t // 2 : t // 2 + 1]).mul_(10)]
     return torch.cat(channels, 2)

@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from network.kernels import Filtered
-from network.stabilizer import Stabilized
 
 #: Frames of a window, and the weight of the loss of the image they give together.
 Term = tuple[tuple[int, ...], float]
@@ -267,7 +266,7 @@ def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -
 
 def temporal_loss(
     loss: ImageLoss,
-    filtered: Filtered | Stabilized,
+    filtered: Filtered,
     color: Tensor,
     target: Tensor,
     modulation: Tensor,
@@ -281,7 +280,7 @@ def temporal_loss(
     ----------
     loss : ImageLoss
         Image loss.
-    filtered : Filtered or Stabilized
+    filtered : Filtered
         The window after its kernels.
     color : Tensor
         ``(N, T, C, H, W)`` aligned irradiance: what a subset to which the kernels give no weight falls back to.
@@ -311,8 +310,7 @@ def temporal_loss(
     Kalojanov and Thurston 2023, section 5, equation 5.
     """
     centre = color.shape[1] // 2
-    # Scale of the radiance; a black modulation (no albedo anywhere) would make it 0.
-    radiance = scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
+    radiance = _scale_of_radiance(scale, modulation)
     total = torch.zeros_like(scale)
     for subset, weight in terms:
         fallback = color[:, centre] if centre in subset else color[:, list(subset)].mean(1)
@@ -320,6 +318,37 @@ def temporal_loss(
         sides = None if slope == 1 else asymmetry(image, target, color[:, centre] * modulation, slope)
         total = total + weight * loss(image, target, radiance, sides)
     return total / sum(weight for _, weight in terms)
+
+
+def picture_loss(
+    loss: ImageLoss,
+    image: Tensor,
+    noisy: Tensor,
+    target: Tensor,
+    modulation: Tensor,
+    scale: Tensor,
+    slope: float = 1.0,
+) -> Tensor:
+    """Loss of one picture of the whole window, for a network whose pictures are no sums of its frames.
+
+    Parts of the window are for such a network other windows: those whose frames `SamplerConfig.drop_frames` takes away.
+
+    Parameters
+    ----------
+    loss : ImageLoss
+        Image loss.
+    image, noisy : Tensor
+        ``(N, C, H, W)`` irradiance.
+    target, modulation, scale, slope : Tensor and float
+        As for `temporal_loss`.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
+    """
+    sides = None if slope == 1 else asymmetry(image * modulation, target, noisy * modulation, slope)
+    return loss(image * modulation, target, _scale_of_radiance(scale, modulation), sides)
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
@@ -343,3 +372,8 @@ def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
 def _mean(errors: Tensor, weight: Tensor | None) -> Tensor:
     """Mean per sample of errors, weighted where there are weights."""
     return (errors if weight is None else errors * weight).mean((1, 2, 3))
+
+
+def _scale_of_radiance(scale: Tensor, modulation: Tensor) -> Tensor:
+    """From that of the irradiance; a black modulation (no albedo anywhere) would make it 0."""
+    return scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)

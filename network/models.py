@@ -1,7 +1,8 @@
 """The networks by name, and those that predict kernels: in these only Robust Average blocks connect the frames.
 
 A model maps the features of an aligned window (`network.inputs`) to kernels (`network.kernels`). All of its
-convolutions are shared over the frames. `Stabilizer`, in a file of its own, works beside per-frame estimates.
+convolutions are shared over the frames. `RobustUNet`, in a file of its own, makes the
+picture itself.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch.nn import functional
 from network.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
 from network.inputs import CHANNELS, network_inputs
 from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
-from network.stabilizer import Stabilized, Stabilizer, StabilizerConfig
+from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, gather_and_denoise, round_robust
 
 
 @dataclass(frozen=True)
@@ -450,7 +451,7 @@ class MultiScale(nn.Module):
         return Pyramid(tuple(kernels), tuple(blends))
 
 
-Model = RAUNet | RAResNet | TKPCN | MultiScale | Stabilizer
+Model = RAUNet | RAResNet | TKPCN | MultiScale | RobustUNet
 
 
 def window_length(model: Model) -> int:
@@ -466,30 +467,11 @@ def window_length(model: Model) -> int:
     int
         T, odd.
     """
-    return model.config.frames if isinstance(model, Stabilizer) else model.config.kernel.frames
+    return model.config.frames if isinstance(model, RobustUNet) else model.config.kernel.frames
 
 
-def fast(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, for two CPU cores: 0.2 M parameters.
-
-    Parameters
-    ----------
-    frames : int
-        Length of the windows, odd.
-    seed : int
-        Of the initial weights.
-
-    Returns
-    -------
-    Stabilizer
-        In training layout.
-    """
-    with _seeded(seed):
-        return Stabilizer(StabilizerConfig(frames))
-
-
-def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, wider at coarse scales, which cost little: 0.5 M parameters.
+def fast(frames: int = 5, seed: int = 0) -> RobustUNet:
+    """The final stage on OIDN's small U-Net, the frames meeting at full resolution: 0.3 M parameters.
 
     Parameters
     ----------
@@ -500,15 +482,15 @@ def balanced(frames: int = 5, seed: int = 0) -> Stabilizer:
 
     Returns
     -------
-    Stabilizer
+    RobustUNet
         In training layout.
     """
     with _seeded(seed):
-        return Stabilizer(StabilizerConfig(frames, widths=(16, 48, 80)))
+        return RobustUNet(RobustUNetConfig(frames, "small"))
 
 
-def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
-    """Beside per-frame estimates, on cells of 2×2 pixels: 0.4 M parameters.
+def balanced(frames: int = 5, seed: int = 0) -> RobustUNet:
+    """The final stage on OIDN's U-Net: 0.9 M parameters.
 
     Parameters
     ----------
@@ -519,11 +501,30 @@ def quality(frames: int = 5, seed: int = 0) -> Stabilizer:
 
     Returns
     -------
-    Stabilizer
+    RobustUNet
         In training layout.
     """
     with _seeded(seed):
-        return Stabilizer(StabilizerConfig(frames, 2, (32, 48, 64)))
+        return RobustUNet(RobustUNetConfig(frames, "base"))
+
+
+def quality(frames: int = 5, seed: int = 0) -> RobustUNet:
+    """The final stage on OIDN's large U-Net, which relies on clean guides: 3.9 M parameters.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the windows, odd.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    RobustUNet
+        In training layout.
+    """
+    with _seeded(seed):
+        return RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True))
 
 
 def unet(frames: int = 5, seed: int = 0) -> RAUNet:
@@ -626,7 +627,10 @@ def for_inference(model: Model, bfloat16: bool) -> Model:
         The same.
     """
     dtype = torch.bfloat16 if bfloat16 else torch.float32
-    for parameter in model.eval().requires_grad_(False).parameters():
+    model.eval().requires_grad_(False)
+    if isinstance(model, RobustUNet):
+        return channels_last(round_robust(model) if bfloat16 else model)
+    for parameter in model.parameters():
         parameter.data = parameter.to(dtype)
     return channels_last(model)
 
@@ -655,7 +659,7 @@ def filter_window(
     window: Mapping[str, Tensor | None],
     threshold: float | None = None,
     run: Callable[..., Any] | None = None,
-) -> Filtered | Stabilized:
+) -> Filtered | Picture:
     """Run a model on an aligned window.
 
     Parameters
@@ -663,31 +667,34 @@ def filter_window(
     model : Model
         Any.
     window : mapping
-        ``color``, ``albedo``, ``normal``, ``estimate``, ``confidence`` and ``exposure``, as for `denoise_tile`.
+        As for `denoise_tile`.
     threshold : float, optional
-        Instead of the model's own.
+        Of the kernels, instead of the model's own; a `RobustUNet` has none.
     run : callable, optional
         Stands for the model where it is wrapped.
 
     Returns
     -------
-    Filtered or Stabilized
-        The sums of each frame.
+    Filtered or Picture
+        The sums of each frame, or the picture.
 
     Raises
     ------
     ValueError
         If shapes do not fit the model, or it takes estimates and there are none.
     """
-    color, confidence, exposure = (cast(Tensor, window[name]) for name in ("color", "confidence", "exposure"))
-    estimate, run = window.get("estimate"), model if run is None else run
-    if not isinstance(model, Stabilizer):
+    confidence, exposure = (cast(Tensor, window[name]) for name in ("confidence", "exposure"))
+    if not isinstance(model, RobustUNet):
+        run = model if run is None else run
+        color = cast(Tensor, window["color"])
         features = network_inputs(color, window.get("albedo"), window.get("normal"), confidence, exposure)
         return Filtered.of(run(features, confidence, threshold), color)
-    if estimate is None:
-        raise ValueError("estimate: expected one beside color, as this network takes, got none")
-    features = network_inputs(color, window.get("albedo"), window.get("normal"), confidence, exposure, estimate)
-    return cast(Stabilized, run(features, color, estimate, confidence, exposure, threshold))
+    if window.get("estimate") is None:
+        raise ValueError("estimate: expected those of the frames, as this network takes, got none")
+    names = ("estimate", "residual", "confidence", "modulation", "exposure", "gain")
+    layers = {name: cast(Tensor, window[name]) for name in names}
+    albedo, normal = (None if (guide := window.get(n)) is None else centre_of(guide) for n in ("albedo", "normal"))
+    return gather_and_denoise(model, layers, albedo, normal, run)
 
 
 @torch.inference_mode()
@@ -697,7 +704,7 @@ def denoise_tile(
     *,
     threshold: float | None = None,
     aovs: Tensor | None = None,
-) -> tuple[Tensor, Filtered | Stabilized, Tensor | None]:
+) -> tuple[Tensor, Filtered | Picture, Tensor | None]:
     """Denoise one tile of an aligned window.
 
     Parameters
@@ -705,21 +712,22 @@ def denoise_tile(
     model : Model
         In the precision of `for_inference`.
     window : mapping
-        ``color``, ``(N, T, 3, H, W)`` aligned irradiance, float32, finite; ``albedo``, ``normal`` and ``estimate``
-        likewise, or None; ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, as for
-        `network.inputs.network_inputs`.
+        ``color``, ``(N, T, 3, H, W)`` aligned irradiance, float32, finite; ``albedo``, ``normal`` likewise, or None;
+        ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, as for
+        `network.inputs.network_inputs`. For a `RobustUNet`, in the place of color: ``estimate``, ``residual``,
+        ``modulation`` and ``gain`` as for `network.robust_unet.realise`.
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.
     aovs : Tensor, optional
-        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; by a `Stabilizer`
-        averaged with the frames' weights.
+        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; by a `RobustUNet`
+        averaged by confidence.
 
     Returns
     -------
     denoised : Tensor
         ``(N, 3, H, W)`` irradiance.
-    filtered : Filtered or Stabilized
-        The color's sums of each frame; its ``parts()`` are what each frame contributes.
+    filtered : Filtered or Picture
+        Its ``parts()`` are what each frame contributes.
     aovs : Tensor or None
         ``(N, C, H, W)``, where there were any.
 
@@ -728,10 +736,16 @@ def denoise_tile(
     ValueError
         See `filter_window`.
     """
-    filtered, centre = filter_window(model, window, threshold), window_length(model) // 2
-    color = cast(Tensor, window["color"])
-    denoised = filtered.image(color[:, centre]).clamp_min(0)
+    filtered = filter_window(model, window, threshold)
+    if isinstance(filtered, Picture):
+        return filtered.irradiance, filtered, None if aovs is None else filtered.apply(aovs)
+    denoised = filtered.image(centre_of(cast(Tensor, window["color"]))).clamp_min(0)
     return denoised, filtered, None if aovs is None else filtered.apply(aovs)
+
+
+def centre_of(layers: Tensor) -> Tensor:
+    """The centre frame's of layers ``(N, T, C, H, W)``: ``(N, C, H, W)``."""
+    return layers[:, layers.shape[1] // 2]
 
 
 @contextmanager

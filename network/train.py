@@ -30,15 +30,15 @@ from network.checkpoint import describe, new_partial, save_model
 from network.clips import Clips, Samples, whole_frames
 from network.devices import find_device
 from network.kernels import Filtered, mean_of
-from network.models import Model, channels_last, filter_window
+from network.models import Model, centre_of, channels_last, filter_window
 from network.perceptual import Perceptual, load_vgg19
-from network.stabilizer import Stabilized
+from network.robust_unet import Picture, RobustUNet
 from network.train_config import TrainConfig
 
 
 def predict(
     model: Model, batch: dict[str, Tensor], bfloat16: bool = False, run: Callable[..., Any] | None = None
-) -> Filtered | Stabilized:
+) -> Filtered | Picture:
     """Filter a batch.
 
     Parameters
@@ -54,8 +54,8 @@ def predict(
 
     Returns
     -------
-    Filtered or Stabilized
-        The sums of each frame.
+    Filtered or Picture
+        The sums of each frame, or the picture.
     """
     with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
         return filter_window(model, batch, run=run)
@@ -124,10 +124,12 @@ def batch_loss(
     would undo what a hundred others have taught.
     """
     filtered = predict(model, batch, config.bfloat16, run)
-    terms = loss_terms(config, batch["color"].shape[1])
-    value = losses.temporal_loss(
-        loss, filtered, batch["color"], batch["target"], batch["modulation"], batch["exposure"], terms, config.slope
-    )
+    color, facts = batch["color"], (batch["target"], batch["modulation"], batch["exposure"])
+    if isinstance(filtered, Picture):
+        value = losses.picture_loss(loss, filtered.irradiance, centre_of(color), *facts, config.slope)
+    else:
+        terms = loss_terms(config, color.shape[1])
+        value = losses.temporal_loss(loss, filtered, color, *facts, terms, config.slope)
     return torch.log1p(value / batch["error"]).mean()
 
 
@@ -154,19 +156,19 @@ def validate(model: Model, clips: Clips) -> dict[str, float]:
     batches = [batch for index in range(len(clips)) for batch in whole_frames(clips, index, model.multiple)]
     for batch in batches:
         batch = {name: value.to(device) for name, value in batch.items()}
-        centre = batch["color"].shape[1] // 2
         modulation, target = batch["modulation"], batch["target"]
         estimate, confidence = batch["estimate"], batch["confidence"]
+        noisy = centre_of(batch["color"])
         images = {
-            "noisy": batch["color"][:, centre],
-            "estimate": estimate[:, centre],
-            "gated": mean_of(estimate * confidence, confidence, estimate[:, centre]),
+            "noisy": noisy,
+            "estimate": centre_of(estimate),
+            "gated": mean_of(estimate * confidence, confidence, centre_of(estimate)),
         }
         filtered = predict(model, batch)
-        images["denoised"] = filtered.image(batch["color"][:, centre])
+        images["denoised"] = filtered.irradiance if isinstance(filtered, Picture) else filtered.image(noisy)
         values = {name: float(losses.tone_mapped_psnr(image * modulation, target)) for name, image in images.items()}
         values["mean"] = float((images["denoised"] * modulation).sum() / target.sum().clamp_min(1e-6))
-        values["side"] = 1 - float(filtered.parts()[1][:, centre].mean())
+        values["side"] = 1 - float(centre_of(filtered.parts()[1]).mean())
         for name, value in values.items():
             sums[name] = sums.get(name, 0.0) + value / len(batches)
     return sums
@@ -231,7 +233,8 @@ def train(
     state_path = Path(f"{os.fspath(out)}.state")
     channels_last(model.to(device).train())
     average = copy.deepcopy(model).requires_grad_(False)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+    groups = _groups(model, config.trunk_rate)
+    optimizer = torch.optim.AdamW(groups, lr=config.rate, weight_decay=config.weight_decay)
     identity = json.dumps({"model": describe(model), "training": _identity(config)}, sort_keys=True)
     step, before = 0, 0.0
     history: list[dict[str, float]] = []
@@ -254,7 +257,9 @@ def train(
     checkpointed = validated = before
     values: list[float] = []
     while (done := _done(config, step, _agreed(time.monotonic() - start, device))) < 1:
-        optimizer.param_groups[0]["lr"] = rate = config.rate * _rate(config, step, done)
+        rate = config.rate * _rate(config, step, done)
+        for group, part in zip(optimizer.param_groups, groups, strict=True):
+            group["lr"] = rate * part["share"]
         batch = {name: value.to(device, non_blocking=True) for name, value in next(batches).items()}
         loss = batch_loss(model, batch, config, loss_of_image, run)
         optimizer.zero_grad(set_to_none=True)
@@ -286,6 +291,17 @@ def train(
         _write(out, average, config, history)
         state_path.unlink(missing_ok=True)
     return values
+
+
+def _groups(model: Model, trunk_rate: float) -> list[dict[str, Any]]:
+    """Parameters with their share of the rate: a trunk that knows how to denoise is to forget nothing of it."""
+    if not isinstance(model, RobustUNet):
+        return [{"params": list(model.parameters()), "share": 1.0}]
+    new = [value for name, value in model.named_parameters() if not name.startswith("trunk.")]
+    # What stands still is not followed by a gradient.
+    model.trunk.requires_grad_(trunk_rate > 0)
+    old = {"params": list(model.trunk.parameters()), "share": trunk_rate}
+    return [{"params": new, "share": 1.0}, *([old] if trunk_rate else [])]
 
 
 def _in_group() -> bool:

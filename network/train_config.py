@@ -36,6 +36,7 @@ class TrainConfig:
     minutes: float | None = None  # or after so long, whichever comes first
     batch: int = 2  # of all processes together
     rate: float = 1e-3  # peak learning rate
+    trunk_rate: float = 0.1  # share of it that the trunk of a RobustUNet is trained with; 0 leaves it as it is
     warmup: int = 200  # steps of linear rise; the kernels start at a sane mean, and must not be thrown off it
     weight_decay: float = 1e-4
     clip_norm: float = 1.0  # largest norm of the gradient; one firefly is one sample
@@ -61,6 +62,8 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
+        if not 0 <= self.trunk_rate <= 1:
+            raise ValueError(f"trunk_rate: expected 0 to 1, got {self.trunk_rate}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
         for name, choices in (("loss", LOSSES), ("terms", TERMS), ("device", DEVICES)):

@@ -94,10 +94,10 @@ class Trunk(nn.Module):
         self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
         for widths in ENCODERS[config.size]:
             skips.append(width)
-            self.encoder.append(_Convolutions(width, widths))
+            self.encoder.append(Convolutions(width, widths))
             width = widths[-1]
         for skip, widths in zip(reversed(skips[:-1]), DECODERS[config.size], strict=True):
-            self.decoder.append(_Convolutions(width + skip, widths))
+            self.decoder.append(Convolutions(width + skip, widths))
             width = widths[-1]
         self.last = nn.Conv2d(width, 3, 3, padding=1)
 
@@ -132,13 +132,19 @@ class Trunk(nn.Module):
         for name, length in zip(("height", "width"), x.shape[2:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"x: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        full = x.to(memory_format=torch.channels_last)
-        x = full.to(self.first.weight.dtype)
-        bottleneck, skips = self.encode(x)
-        if x.dtype == torch.bfloat16:
-            # See `round_trunk`.
-            skips[0] = torch.cat([x, (full[:, :3] - x[:, :3]).to(x.dtype)], 1)
-        return self.decode(bottleneck, skips)
+        bottleneck, skips = self.encode(x.to(self.first.weight.dtype, memory_format=torch.channels_last))
+        skips[0] = self.skip_of(x)
+        return self.finish(self.decode(bottleneck, skips))
+
+    def skip_of(self, x: Tensor) -> Tensor:
+        """What enters the last scale of the decoder of a picture, ``(N, C, H, W)``: itself.
+
+        In bfloat16 the color brings its low bits along, as three more channels (`round_trunk`).
+        """
+        rounded = x.to(self.first.weight.dtype, memory_format=torch.channels_last)
+        if rounded.dtype != torch.bfloat16:
+            return rounded
+        return torch.cat([rounded, (x[:, :3] - rounded[:, :3]).to(rounded.dtype)], 1)
 
     def encode(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Take a picture apart.
@@ -174,15 +180,20 @@ class Trunk(nn.Module):
         Returns
         -------
         Tensor
-            ``(N, 3, H, W)``.
+            ``(N, width, H, W)`` features of the finest scale.
         """
         for stage, skip in zip(self.decoder, reversed(skips), strict=True):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = stage(torch.cat([x, skip], 1))
-        return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
+        return x
+
+    def finish(self, x: Tensor) -> Tensor:
+        """The picture, ``(N, 3, H, W)``, of the features of the finest scale; not rounded by any autocast."""
+        with torch.autocast(x.device.type, enabled=False):
+            return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
 
 
-class _Convolutions(nn.Sequential):
+class Convolutions(nn.Sequential):
     """3×3 convolutions, a ReLU after each.
 
     On CPUs that have bfloat16 torch compiles the two into one operation; called without its compiler, it gives the same
@@ -196,11 +207,19 @@ class _Convolutions(nn.Sequential):
             width = following
         super().__init__(*layers)
 
+    def after_first(self, x: Tensor) -> Tensor:
+        """Run what follows the first convolution on what it gave."""
+        return self._run(torch.relu(x), list(self)[2:])
+
     def forward(self, x: Tensor) -> Tensor:
         """Run them."""
+        return self._run(x, list(self))
+
+    @staticmethod
+    def _run(x: Tensor, layers: list[nn.Module]) -> Tensor:
         fused = _FUSED and not torch.is_grad_enabled() and x.dtype == torch.bfloat16 and x.device.type == "cpu"
         one = [1, 1]  # stride, padding and dilation
-        for layer in self:
+        for layer in layers:
             if not fused:
                 x = layer(x)
             elif isinstance(layer, nn.Conv2d):
@@ -232,13 +251,24 @@ def round_trunk(trunk: Trunk) -> Trunk:
     finest.in_channels += 3
     *layers, _ = rounded.convolutions
     for layer in layers:
-        weight = _round_taps(layer.weight)
+        weight = round_taps(layer.weight)
         layer.bfloat16().weight.data = weight.contiguous(memory_format=torch.channels_last)
     return rounded.eval().requires_grad_(False)
 
 
-def _round_taps(weight: Tensor) -> Tensor:
-    """Weights ``(O, I, H, W)`` in bfloat16, each tap taking over the error of greater ones: sums over taps are kept."""
+def round_taps(weight: Tensor) -> Tensor:
+    """Weights in bfloat16, each tap taking over the error of greater ones, so that sums over taps are kept.
+
+    Parameters
+    ----------
+    weight : Tensor
+        ``(O, I, H, W)``.
+
+    Returns
+    -------
+    Tensor
+        As weight.
+    """
     taps = weight.flatten(2)
     order = taps.abs().argsort(2, descending=True)
     rounded, error = torch.empty_like(taps, dtype=torch.bfloat16), torch.zeros_like(taps[..., 0])

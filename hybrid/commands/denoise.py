@@ -233,7 +233,7 @@ def denoise(
         typer.Option(
             min=16,
             metavar="N",
-            help="pixels on a side that the network sees at once; without: 640, with --max-memory 384",
+            help="pixels on a side that the network sees at once; without: 640 or 1088, with --max-memory 384",
             rich_help_panel=RESOURCES,
         ),
     ] = None,
@@ -284,8 +284,8 @@ def denoise(
     if budget is not None:
         chosen = _fitting(opened, budget, estimate, rules, precision, device)
     path = weights or neural.shipped_weights(chosen)
-    if tile is None:
-        tile = neural.TILE if max_memory is None else neural.SMALL_TILE
+    if tile is None and max_memory is not None:
+        tile = neural.SMALL_TILE
     denoiser = neural.Denoiser(
         path, tile=tile, precision=precision, device=device, threshold=threshold, timings=timings
     )
@@ -294,12 +294,12 @@ def denoise(
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         ahead = reach_of(None, denoiser.radius) * (passes - 1)  # what the first pass makes
-        in_torch = denoiser.precision == "bfloat16" and denoiser.device == "cpu" and neural.has_unet()
         choose = partial(
             choose_estimate,
             wanted,
             mode=mode,
-            quicker=neural.denoise_unet if in_torch else None,
+            quicker=denoiser.quicker,
+            bundled=neural.denoise_bundled,
             kept=keep_estimates,
             forced=rules.forced,
             device=device,
@@ -319,7 +319,7 @@ def denoise(
         "motion": motion,
         "estimate": estimate,
         "aov": aov,
-        "tile": tile,
+        "tile": denoiser.tile,
         "threshold": threshold,
         "breakdown": breakdown is not None,
         "precision": denoiser.precision,

@@ -244,7 +244,11 @@ def train(
         str, typer.Option(help="fast, balanced, quality, unet, multiscale, paper or tkpcn", rich_help_panel=WHAT)
     ] = "fast",
     init: Annotated[
-        str | None, typer.Option(help="start from these weights: a file, or a preset that ships", rich_help_panel=INPUT)
+        str | None,
+        typer.Option(
+            help="start from these weights: a file, a preset that ships, or oidn: OIDN's own, with a new final stage",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     validation: Annotated[
         list[str] | None,
@@ -256,6 +260,10 @@ def train(
         int, typer.Option(help="samples of a step, of all processes together", rich_help_panel=TRAINING)
     ] = DEFAULTS.batch,
     rate: Annotated[float, typer.Option(help="peak learning rate", rich_help_panel=TRAINING)] = DEFAULTS.rate,
+    trunk_rate: Annotated[
+        float,
+        typer.Option(help="share of it for a trunk that knows how to denoise; 0: left alone", rich_help_panel=TRAINING),
+    ] = DEFAULTS.trunk_rate,
     warmup: Annotated[
         int, typer.Option(help="steps in which the rate rises", rich_help_panel=TRAINING)
     ] = DEFAULTS.warmup,
@@ -284,6 +292,9 @@ def train(
     slope: Annotated[
         float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail", rich_help_panel=TRAINING)
     ] = DEFAULTS.slope,
+    drop_frames: Annotated[
+        float, typer.Option(help="chance that frames of a sample are taken away", rich_help_panel=TRAINING)
+    ] = DEFAULTS.sampler.drop_frames,
     crop: Annotated[
         int, typer.Option(help="pixels on a side of a sample", rich_help_panel=TRAINING)
     ] = DEFAULTS.sampler.crop,
@@ -320,7 +331,7 @@ def train(
     from hybrid.neural import train_network
     from network.models import PRESETS
 
-    if init is None:
+    if init in (None, "oidn"):
         choose(PRESETS, preset, "preset")
     with usage():
         config = TrainConfig(
@@ -328,6 +339,7 @@ def train(
             minutes=minutes,
             batch=batch,
             rate=rate,
+            trunk_rate=trunk_rate,
             warmup=warmup,
             clip_norm=clip_norm,
             ema=ema,
@@ -343,7 +355,7 @@ def train(
             seed=seed,
             checkpoint_minutes=validate_minutes,
             validate_minutes=validate_minutes,
-            sampler=SamplerConfig(crop=crop, sets=sets),
+            sampler=SamplerConfig(crop=crop, sets=sets, drop_frames=drop_frames),
         )
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
     read += [(what, Path(path)) for what, path in (("init", init), ("vgg", vgg)) if path and Path(path).is_file()]

@@ -177,7 +177,7 @@ def aligned_robust_average(aligned: AlignedWindow) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _denoiser(preset: str, tile: int, precision: str, threshold: float | None) -> Denoiser:
+def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> Denoiser:
     """The network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
@@ -185,7 +185,13 @@ def _denoiser(preset: str, tile: int, precision: str, threshold: float | None) -
 
 
 def network(
-    shot: Shot, *, preset: str, tile: int = 640, precision: str = "auto", threshold: float | None = None, **window: Any
+    shot: Shot,
+    *,
+    preset: str,
+    tile: int | None = None,
+    precision: str = "auto",
+    threshold: float | None = None,
+    **window: Any,
 ) -> Iterator[tuple[int, Array]]:
     """Run a network with the weights of a preset.
 
@@ -195,7 +201,7 @@ def network(
         The noisy shot.
     preset : str
         Whose weights it takes.
-    tile : int
+    tile : int, optional
         Pixels on a side of what it works on at a time.
     precision : str
         Of its convolutions, as for `Denoiser`.

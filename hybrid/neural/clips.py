@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import AlignedWindow, Aligner
 from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.frames import Shot
-from hybrid.neural.denoiser import exposure_of, tensor_of
+from hybrid.neural.denoiser import exposure_of, gain_of
+from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average, gather_and_denoise
 from network.clips import Clip, importance, important_places, write_shards
@@ -123,7 +124,7 @@ def _level(
 ) -> dict[str, torch.Tensor]:
     """What a clip holds of one noise level, with N = 1 in front."""
     aligned = aligner.align(number)
-    if aligned.estimate is None:
+    if aligned.estimate is None or aligned.residual is None:
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
@@ -132,11 +133,13 @@ def _level(
         "albedo": tensor_of(np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo)),
         "normal": tensor_of(np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal)),
         "estimate": tensor_of(aligned.estimate),
+        "residual": tensor_of(aligned.residual),
         "confidence": tensor_of(aligned.confidence[..., None]),
         "modulation": tensor_of(aligned.modulation[None])[:, 0],
         "noisy": tensor_of(noisy[None])[:, 0],
         "pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0],
         "exposure": exposure_of(aligned),
+        "gain": gain_of(aligned),
     }
 
 

@@ -5,7 +5,7 @@ HWC becomes NCHW here, for running, and for training alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from copy import copy
 from pathlib import Path
 
@@ -14,51 +14,32 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-import network
 from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
+from hybrid.alignment.transfer import autoexposure
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
+from hybrid.neural.tiling import Block, Borders, PadMode, image_of, pad, tensor_of, tiles
+from hybrid.neural.unet import HALO as HALO_OF_TRUNK
+from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
 from hybrid.pipeline import Denoised
 from hybrid.timing import Timings
 from network.checkpoint import load_model
-from network.devices import find_device
+from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
-from network.stabilizer import Stabilizer
+from network.robust_unet import Picture, RobustUNet
+from nlm.gather import restore_mean
 
 Array = NDArray[np.float32]
 
-# Pixels of context around a tile: what a network sees beyond them changes a picture by less than 1e-5 of its mean. The
-# coarsest shares of a `Stabilizer`, of 32 pixels, see farthest.
-HALO, HALO_OF_SHARES = 48, 128
-# Sides of a tile: halos take half as much again at 1920×1080 with the first, and the second needs half of the memory.
-TILE, SMALL_TILE = 640, 384
+# Pixels of context around a tile: what a network sees beyond them changes a picture by less than 1e-5 of its mean.
+HALO = 48
+# Pixels that a picture is mirrored by beyond its borders for a trunk, to which there is else darkness: 0.7 dB within 8
+# pixels of a border, and a flat picture stays flat to 0.4 %, where its rim came out a third too dark.
+MIRRORED = 16
+# Sides of a tile: what predicts kernels, what makes pictures, which needs less memory for a pixel and more around it
+# (1080 rows are one tile); and where memory is short.
+TILE, TILE_OF_TRUNK, SMALL_TILE = 640, 1088, 384
 PRECISIONS = ("auto", "float32", "bfloat16")
-
-Block = tuple[slice, slice]
-
-
-def shipped_weights(preset: str) -> Path:
-    """Path of the weights that come with the package.
-
-    Raises
-    ------
-    ValueError
-        If there is no such preset; names those there are.
-    """
-    folder = Path(network.__file__).parent / "weights"
-    path = folder / f"{preset}.safetensors"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
-        raise ValueError(f"preset is {preset!r}, expected one of: {known}")
-    return path
-
-
-def has_bfloat16(device: torch.device) -> bool:
-    """Whether a device computes in bfloat16 faster than in float32; a processor with AVX-512 bf16 or AMX."""
-    if device.type != "cpu":
-        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
-    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
 class Denoiser:
@@ -68,8 +49,9 @@ class Denoiser:
     ----------
     weights : Path
         A file written by training.
-    tile : int
-        Side of the squares that the network sees at once, pixels; a halo is added around each.
+    tile : int, optional
+        Side of the squares that the network sees at once, pixels; a halo is added around each. Without: `TILE`, or
+        `TILE_OF_TRUNK` for the final stage.
     precision : str
         One of `PRECISIONS`; "auto" takes bfloat16 where the processor has it.
     device : str
@@ -84,14 +66,14 @@ class Denoiser:
     Raises
     ------
     ValueError
-        A bad option, or a file that holds no such model.
+        A bad option, a threshold for a network without one, or a file that holds no such model.
     """
 
     def __init__(
         self,
         weights: Path,
         *,
-        tile: int = TILE,
+        tile: int | None = None,
         precision: str = "auto",
         device: str = "cpu",
         threshold: float | None = None,
@@ -100,7 +82,7 @@ class Denoiser:
     ) -> None:
         if precision not in PRECISIONS:
             raise ValueError(f"precision is {precision!r}, expected one of {', '.join(PRECISIONS)}")
-        if tile < 16:
+        if tile is not None and tile < 16:
             raise ValueError(f"tile is {tile}, expected at least 16 pixels")
         if threshold is not None and not 0 <= threshold < 1:
             raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
@@ -108,7 +90,9 @@ class Denoiser:
         half = precision == "bfloat16" or (precision == "auto" and has_bfloat16(self._device))
         self.precision = "bfloat16" if half else "float32"
         self.model = for_inference(load_model(weights), half).to(self._device)
-        self.tile = tile
+        if threshold is not None and self.takes_estimate:
+            raise ValueError(f"threshold is {threshold}, expected none: the network of {weights.name} has no kernels")
+        self.tile = tile or (TILE_OF_TRUNK if self.takes_estimate else TILE)
         self.threshold = threshold
         self.breakdown = breakdown
         self.timings = timings or Timings()
@@ -116,12 +100,17 @@ class Denoiser:
     @property
     def takes_estimate(self) -> bool:
         """Whether the network works beside per-frame estimates."""
-        return isinstance(self.model, Stabilizer)
+        return isinstance(self.model, RobustUNet)
+
+    @property
+    def quicker(self) -> Callable[..., Array] | None:
+        """What may stand for OIDN where it makes the estimates (`hybrid.estimates.choose_estimate`)."""
+        return denoise_unet if self.precision == "bfloat16" and self.device == "cpu" and has_unet() else None
 
     @property
     def halo(self) -> int:
         """Pixels of context around a tile."""
-        return HALO_OF_SHARES if self.takes_estimate else HALO
+        return HALO_OF_TRUNK if self.takes_estimate else HALO
 
     @property
     def radius(self) -> int:
@@ -141,34 +130,63 @@ class Denoiser:
 
     def _run(self, aligned: AlignedWindow) -> Denoised:
         layers = self._layers(aligned)
-        irradiance, aovs, parts = self._run_tiles(aligned, layers)
+        irradiance, aovs, parts, gathered = self._run_tiles(aligned, layers)
+        color = irradiance * aligned.modulation
+        if gathered is not None:
+            color = restore_mean(color, gathered * aligned.modulation)
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
             extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
-        return Denoised(irradiance * aligned.modulation, _modulated(aovs, aligned), extra)
+        return Denoised(color, _modulated(aovs, aligned), extra)
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
-        """What the network is given of a window, and all AOVs side by side."""
-        layers = {"color": aligned.mixed(aligned.color), "confidence": aligned.confidence[..., None]}
-        if aligned.albedo is not None:
-            layers["albedo"] = aligned.mixed(aligned.albedo)
-        if aligned.normal is not None:
-            layers["normal"] = aligned.mixed(aligned.normal)
-        if aligned.estimate is not None:
-            layers["estimate"] = aligned.estimate
+        """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
+        layers = {"confidence": aligned.confidence[..., None]}
+        if self.takes_estimate:
+            if aligned.estimate is None or aligned.residual is None:
+                raise ValueError("estimate: expected those of the frames, as this network takes, got none")
+            guides = self._guides(aligned)
+            layers |= {"estimate": aligned.estimate, "residual": aligned.residual} | guides
+            layers["modulation"] = aligned.modulation[None]
+        else:
+            layers["color"] = aligned.mixed(aligned.color)
+            for name, guide in (("albedo", aligned.albedo), ("normal", aligned.normal)):
+                if guide is not None:
+                    layers[name] = aligned.mixed(guide)
         if aligned.aovs:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
         return layers
 
-    def _run_tiles(self, aligned: AlignedWindow, layers: dict[str, Array]) -> tuple[Array, Array, Array | None]:
-        """Irradiance (H, W, 3), AOVs side by side (H, W, C), and with a breakdown the frames' parts (T, H, W, 4)."""
-        color, centre = layers["color"], aligned.centre
+    def _guides(self, aligned: AlignedWindow) -> dict[str, Array]:
+        """The centre's guides, (1, H, W, 3), without noise where the network wants them so."""
+        found = {"albedo": aligned.albedo, "normal": aligned.normal}
+        guides = {name: layer[aligned.centre] for name, layer in found.items() if layer is not None}
+        clean = isinstance(self.model, RobustUNet) and self.model.config.clean_guides
+        if clean and "prefilter" in aligned.stages and guides:
+            if has_unet():
+                guides = prefilter_guides(guides)
+            elif aligned.guide is not None:  # ours: less good where guides are very noisy
+                guides = dict(zip(guides, np.split(aligned.guide, len(guides), axis=-1), strict=True))
+        return {name: np.asarray(layer, np.float32)[None] for name, layer in guides.items()}
+
+    def _run_tiles(
+        self, aligned: AlignedWindow, layers: dict[str, Array]
+    ) -> tuple[Array, Array, Array | None, Array | None]:
+        """Irradiance (H, W, 3); AOVs side by side (H, W, C); with a breakdown the frames' parts (T, H, W, 4).
+
+        Fourth, for a network that gathers, the samples of all frames together, irradiance (H, W, 3).
+        """
+        color, centre = aligned.color, aligned.centre
         frames, height, width = color.shape[:3]
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
         given = {name: layer for name, layer in layers.items() if name != "aovs"}
-        exposure = exposure_of(aligned).to(self._device)
-        irradiance, filtered = np.empty_like(color[centre]), np.empty_like(others[centre])
+        facts = {"exposure": exposure_of(aligned).to(self._device)}
+        if aligned.picture is not None:
+            facts["gain"] = gain_of(aligned).to(self._device)
+        # Rows that nobody asked for: what is around them is not there, and neither is the picture.
+        irradiance, filtered = color[centre].copy(), np.empty_like(others[centre])
+        gathered = irradiance.copy() if self.takes_estimate else None
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
@@ -177,19 +195,38 @@ class Denoiser:
                 if parts is not None:
                     parts[centre][inner] = np.dstack([irradiance[inner], np.ones_like(irradiance[inner][..., :1])])
                 continue
-            window = {name: self._cut(layer, outer) for name, layer in given.items()} | {"exposure": exposure}
-            aovs = self._cut(others, outer) if others.size else None
+            borders = self._borders(outer, height, width)
+            within = tuple(
+                slice(part.start + before, part.stop + before)
+                for part, (before, _) in zip(offset, borders, strict=True)
+            )
+            window = {name: self._cut(layer, outer, borders) for name, layer in given.items()} | facts
+            if "modulation" in window:
+                window["modulation"] = window["modulation"][:, 0]
+            aovs = self._cut(others, outer, borders) if others.size else None
             out, sums, through = denoise_tile(self.model, window, threshold=self.threshold, aovs=aovs)
-            irradiance[inner] = image_of(out)[offset]
+            irradiance[inner] = image_of(out)[within]
+            if gathered is not None and isinstance(sums, Picture):
+                gathered[inner] = image_of(sums.gathered)[within]
             if through is not None:
-                filtered[inner] = image_of(through)[offset]
+                filtered[inner] = image_of(through)[within]
             if parts is not None:
                 tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
-                parts[:, *inner] = tile[:, *offset]
-        return irradiance, filtered, parts
+                parts[:, *inner] = tile[:, *within]
+        return irradiance, filtered, parts, gathered
 
-    def _cut(self, layer: Array, outer: Block) -> torch.Tensor:
-        return tensor_of(_pad(layer[:, *outer], self.model.multiple)).to(self._device)
+    def _borders(self, outer: Block, height: int, width: int) -> Borders:
+        """By how many pixels a part is mirrored on each side: where the picture ends."""
+        border = MIRRORED if self.takes_estimate else 0
+        rows, columns = (
+            (border if part.start == 0 else 0, border if part.stop == size else 0)
+            for part, size in zip(outer, (height, width), strict=True)
+        )
+        return rows, columns
+
+    def _cut(self, layer: Array, outer: Block, borders: Borders) -> torch.Tensor:
+        mode: PadMode = "reflect" if self.takes_estimate else "edge"
+        return tensor_of(pad(layer[:, *outer], self.model.multiple, borders, mode)).to(self._device)
 
 
 def _modulated(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
@@ -219,55 +256,8 @@ def exposure_of(aligned: AlignedWindow) -> torch.Tensor:
     return torch.tensor([aligned.exposure], dtype=torch.float32)
 
 
-def tensor_of(window: Array) -> torch.Tensor:
-    """(T, H, W, C) to (1, T, C, H, W)."""
-    return torch.from_numpy(np.ascontiguousarray(window.transpose(0, 3, 1, 2)))[None]
-
-
-def image_of(tensor: torch.Tensor) -> Array:
-    """(1, C, H, W) to (H, W, C)."""
-    return tensor[0].permute(1, 2, 0).float().cpu().numpy()
-
-
-def _pad(window: Array, multiple: int) -> Array:
-    """Repeat the last row and column until height and width are what the network needs."""
-    bottom, right = (-window.shape[1] % multiple, -window.shape[2] % multiple)
-    return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
-
-
-def tiles(
-    rows: slice, height: int, width: int, tile: int, halo: int, multiple: int
-) -> Iterator[tuple[Block, Block, Block]]:
-    """Cover some rows of an image with tiles.
-
-    Parameters
-    ----------
-    rows : slice
-        To be covered.
-    height, width : int
-        Of the image.
-    tile : int
-        Pixels on a side of a tile, rounded up to `multiple`.
-    halo : int
-        Pixels around a tile that its result depends on, rounded up to `multiple`.
-    multiple : int
-        Where tiles may start, so that each samples its coarse scales where the whole image would.
-
-    Yields
-    ------
-    tuple of three pairs of slices
-        Where a tile's result goes, what it is computed from, and where in that the result is.
-    """
-    # The halo starts on a multiple, so that every tile samples its coarse scales where the whole image would.
-    halo = -(-halo // multiple) * multiple
-    tile = -(-tile // multiple) * multiple
-    for top in range(rows.start, rows.stop, tile):
-        for left in range(0, width, tile):
-            inner, outer, offset = [], [], []
-            for start, end, size in ((top, rows.stop, height), (left, width, width)):
-                stop = min(start + tile, end)
-                first, last = max(start - halo, 0), min(stop + halo, size)
-                inner.append(slice(start, stop))
-                outer.append(slice(first, last))
-                offset.append(slice(start - first, stop - first))
-            yield (inner[0], inner[1]), (outer[0], outer[1]), (offset[0], offset[1])
+def gain_of(aligned: AlignedWindow) -> torch.Tensor:
+    """What radiance is multiplied by before a trunk's transfer curve, (1,): in training and in running."""
+    if aligned.picture is None:
+        raise ValueError("aligned: expected a window with estimates, got none")
+    return torch.tensor([autoexposure(aligned.picture)], dtype=torch.float32)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from hybrid.neural.denoiser import shipped_weights
 from hybrid.threads import limit_threads
-from network.checkpoint import load_model
+from network.checkpoint import load_model, shipped_weights
 from network.clips import open_clips, split_by_shot
 from network.models import PRESETS, window_length
+from network.robust_unet import RobustUNet, start_from_oidn
 from network.train import train
 from network.train_config import TrainConfig
 
@@ -42,7 +42,7 @@ def train_network(
     preset : str
         Of `network.models.PRESETS`; not looked at with init.
     init : str, optional
-        Weights to start from: a file, or a preset that ships.
+        Weights to start from: a file, a preset that ships, or "oidn": the preset's, on OIDN's trunk.
     validation : sequence of str
         Shots kept out of training.
     threads : int, optional
@@ -69,10 +69,14 @@ def train_network(
     if threads is not None:
         limit_threads(threads)
     training, kept_out = split_by_shot(open_clips(clips), validation)
-    if init is None:
+    if init is None or init == "oidn":
         if preset not in PRESETS:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")
         model = PRESETS[preset](frames=training.frames, seed=config.seed)
+        if init is not None:
+            if not isinstance(model, RobustUNet):
+                raise ValueError(f"init is {init!r}, expected with it a preset on OIDN's trunk, not {preset!r}")
+            start_from_oidn(model)
     else:
         path = Path(init) if Path(init).suffix else shipped_weights(init)
         model = load_model(path)

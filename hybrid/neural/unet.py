@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybrid.neural.denoiser import image_of, tiles
+from hybrid.neural.tiling import image_of, tiles
 from hybrid.oidn import Quality
+from network.checkpoint import load_model, shipped_weights
+from network.devices import has_bfloat16
+from network.robust_unet import RobustUNet
 from network.trunk import Trunk, autoexposure, denoise_albedo, denoise_normal, denoise_picture, load_oidn, round_trunk
 
 Array = NDArray[np.float32]
@@ -46,13 +50,10 @@ def denoise_unet(
     (H, W, 3) array of float32
         Linear radiance.
     """
-    layers = [_tensor(layer) for layer in (color, albedo, normal) if layer is not None]
-    if prefilter is not None and albedo is not None:
-        size = "_large" if prefilter == "high" else ""
-        filters: list[Callable[..., Tensor]] = [denoise_albedo, denoise_normal]
-        for index, (name, run) in enumerate(zip(("rt_alb", "rt_nrm"), filters, strict=True), start=1):
-            if index < len(layers):
-                layers[index] = _tiled(run, _network(name + size), layers[index : index + 1])
+    guides = {name: layer for name, layer in (("albedo", albedo), ("normal", normal)) if layer is not None}
+    if prefilter is not None:
+        guides = prefilter_guides(guides, prefilter)
+    layers = [_tensor(layer) for layer in (color, *guides.values())]
     reliable = (clean or prefilter is not None) and len(layers) == 3
     name = "rt_hdr" + ("", "_alb", "_calb_cnrm" if reliable else "_alb_nrm")[len(layers) - 1]
     if quality == "fast":
@@ -65,6 +66,70 @@ def denoise_unet(
         return denoise_picture(trunk, *parts, exposure=exposure)
 
     return image_of(_tiled(run_color, _network(name), layers))
+
+
+def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced") -> dict[str, Array]:
+    """Take the noise out of guides, each by itself, with OIDN's networks in bfloat16.
+
+    Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
+
+    Parameters
+    ----------
+    guides : mapping of str to (H, W, 3) array
+        "albedo" and "normal", or one of them.
+    quality : str
+        "high" takes the large networks.
+
+    Returns
+    -------
+    dict of str to (H, W, 3) array of float32
+        The same, without noise.
+    """
+    size = "_large" if quality == "high" else ""
+    filters: dict[str, tuple[str, Callable[..., Tensor]]] = {
+        "albedo": ("rt_alb", denoise_albedo),
+        "normal": ("rt_nrm", denoise_normal),
+    }
+    found = {}
+    for name, layer in guides.items():
+        weights, run = filters[name]
+        found[name] = image_of(_tiled(run, _network(weights + size), [_tensor(layer)]))
+    return found
+
+
+def denoise_bundled(
+    color: Array, albedo: Array | None = None, normal: Array | None = None, **settings: object
+) -> Array:
+    """Denoise one frame with the trunk of the preset `fast`, which needs nothing installed beside torch.
+
+    Parameters
+    ----------
+    color, albedo, normal : array
+        As for `hybrid.oidn.denoise_oidn`.
+    **settings : object
+        Of OIDN: they have no meaning here.
+
+    Returns
+    -------
+    (H, W, 3) array of float32
+        Linear radiance.
+    """
+    half = np.full_like(color, 0.5)
+    # As where a shot has no such guide (`network.robust_unet.gather_and_denoise`): a normal of 0 is a half to a trunk.
+    layers = [color, half if albedo is None else albedo, np.zeros_like(color) if normal is None else normal]
+    tensors = [_tensor(layer) for layer in layers]
+    exposure = autoexposure(tensors[0])
+
+    def run(trunk: Trunk, *parts: Tensor) -> Tensor:
+        return denoise_picture(trunk, *parts, exposure=exposure)
+
+    return image_of(_tiled(run, _bundled(), tensors))
+
+
+@lru_cache
+def _bundled() -> Trunk:
+    trunk = cast(RobustUNet, load_model(shipped_weights("fast"))).trunk.eval().requires_grad_(False)
+    return round_trunk(trunk) if has_bfloat16(torch.device("cpu")) else trunk
 
 
 def has_unet() -> bool:

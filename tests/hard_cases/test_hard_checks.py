@@ -121,8 +121,7 @@ def test_a_picture_that_cannot_be_right_is_not_written(tmp_path, capsys, monkeyp
 @pytest.mark.parametrize("scale", [30.0, 300.0, -30.0])
 def test_absurd_weights_make_no_pictures_that_are_not_finite(tmp_path, capsys, scale):
     torch = pytest.importorskip("torch")
-    from hybrid.neural.denoiser import shipped_weights
-    from network.checkpoint import load_model, save_model
+    from network.checkpoint import load_model, save_model, shipped_weights
 
     model = load_model(shipped_weights("fast"))
     with torch.no_grad():

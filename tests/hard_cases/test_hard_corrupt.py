@@ -69,7 +69,8 @@ def test_the_picture_is_finite_and_in_range(layer, value, record_property):
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
 def test_the_network_is_finite(value, precision, record_property):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser
+    from network.checkpoint import shipped_weights
 
     denoiser = Denoiser(shipped_weights("fast"), precision=precision)
     frames = with_variance()

@@ -387,7 +387,8 @@ def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
 @pytest.mark.parametrize("rows", [64, 192])
 def test_the_network_in_parts_is_the_network(tall, rows):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser
+    from network.checkpoint import shipped_weights
 
     shot, number = open_shot(tall), TALL.first + 2
     denoiser = Denoiser(shipped_weights("fast"), precision="float32")

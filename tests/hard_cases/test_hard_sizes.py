@@ -40,7 +40,8 @@ def test_any_size_works(size, record_property):
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_the_network_takes_any_size(size):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser
+    from network.checkpoint import shipped_weights
 
     image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimates=OfFrames(itself))).color
     assert image.shape == (*size, 3)
@@ -66,7 +67,8 @@ def test_more_than_32767_pixels_on_a_side(size):
 @pytest.mark.neural
 def test_more_than_32767_pixels_through_the_network():
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser
+    from network.checkpoint import shipped_weights
 
     image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, estimates=OfFrames(itself))).color
     assert image.shape == (3, 33_000, 3)
@@ -87,7 +89,8 @@ def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
     The picture is wider than a tile with its halo, so that tiles lack what is beyond.
     """
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser, shipped_weights
+    from hybrid.neural.denoiser import Denoiser
+    from network.checkpoint import shipped_weights
 
     height, width = 40, 448
     window = align(noisy((height, width)), estimates=OfFrames(itself))

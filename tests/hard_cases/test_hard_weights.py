@@ -16,8 +16,14 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file  # noqa: E402
 
 from hybrid.cli import main  # noqa: E402
-from hybrid.neural.denoiser import shipped_weights  # noqa: E402
-from network.checkpoint import VERSION, describe, load_model, load_notes, save_model  # noqa: E402
+from network.checkpoint import (  # noqa: E402
+    VERSION,
+    describe,
+    load_model,
+    load_notes,
+    save_model,
+    shipped_weights,
+)
 from network.models import fast, paper, unet  # noqa: E402
 
 pytestmark = pytest.mark.neural

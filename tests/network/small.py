@@ -19,7 +19,7 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
-from network.stabilizer import Stabilizer, StabilizerConfig
+from network.robust_unet import RobustUNet, RobustUNetConfig
 
 
 def make_model(seed: int = 0) -> RAUNet:
@@ -28,9 +28,9 @@ def make_model(seed: int = 0) -> RAUNet:
     return RAUNet(RAUNetConfig(kernel, widths=(8, 8), ra_scales=(1,)))
 
 
-def make_stabilizer() -> Stabilizer:
+def make_robust() -> RobustUNet:
     torch.manual_seed(0)
-    return Stabilizer(StabilizerConfig(3, 2, (4, 8), (0, 1)))
+    return RobustUNet(RobustUNetConfig(3, "small", (0, 1)))
 
 
 SMALL = KernelConfig(frames=3, size=3)
@@ -39,5 +39,5 @@ MODELS: dict[str, Callable[[], Model]] = {
     "tkpcn": lambda: TKPCN(TKPCNConfig(SMALL, width=4, blocks=1)),
     "multi-scale": lambda: MultiScale(MultiScaleConfig(make_model().config, scales=3)),
     "softmax": lambda: RAUNet(RAUNetConfig(replace(SMALL, activation="softmax"), (4, 4), (1,))),
-    "stabilizer": make_stabilizer,
+    "robust": make_robust,
 }

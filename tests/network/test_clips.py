@@ -47,11 +47,13 @@ def make_clip(seed: int = 0, size: tuple[int, int] = (16, 16), frames: int = 3) 
         albedo=uniform(3, frames, 3),
         normal=uniform(3, frames, 3) * 2 - 1,
         estimate=uniform(3, frames, 3) + 0.1,
+        residual=uniform(3, frames, 3) - 0.5,
         confidence=uniform(3, frames, 1),
         modulation=uniform(3, 3) + 0.1,
         noisy=uniform(3, 3) + 0.1,
         pseudo_reference=uniform(3, 3) + 0.1,
         exposure=torch.tensor([0.5, 1.0, 2.0]),
+        gain=torch.tensor([0.4, 0.2, 0.1]),
     )
 
 
@@ -289,14 +291,14 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
     image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) + 0.1
     window = image.expand(1, 3, 3, 16, 16).clone()
     clip = Clip(
-        window, window, window, window, window[:, :, :1], window[:, 1], window[:, 1], window[:, 1], torch.ones(1)
+        *[window] * 5, window[:, :, :1], window[:, 1], window[:, 1], window[:, 1], torch.ones(1), torch.ones(1)
     )  # fmt: skip
     write_shards(tmp_path, "s", [4], [clip])
     samples = Samples(open_clips(tmp_path), PLAIN, 0)
     seen = set()
     for number in range(40):
         sample = samples[number]
-        for name in ("albedo", "estimate"):
+        for name in ("albedo", "estimate", "residual"):
             torch.testing.assert_close(sample[name], sample["color"])
         for name in ("modulation", "target"):
             torch.testing.assert_close(sample[name], sample["color"][1])

@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.inputs import CHANNELS, ESTIMATE_CHANNELS, network_inputs
+from network.inputs import CHANNELS, network_inputs
 
 pytestmark = pytest.mark.neural
 
@@ -29,23 +29,9 @@ def window() -> dict[str, torch.Tensor]:
 
 def test_channels_and_their_order() -> None:
     data = window()
-    estimate = uniform(1, 3, 3, 8, 12, seed=9)
-    features = network_inputs(**data, exposure=torch.tensor([0.5]), estimate=estimate)
-    log = torch.log1p(estimate / 0.5)
-    expected = torch.cat(
-        [
-            torch.log1p(data["color"] / 0.5),
-            torch.log1p(data["albedo"]),
-            data["normal"],
-            data["confidence"],
-            log,
-            10 * (log - log[:, 1:2]),
-        ],
-        2,
-    )
-    torch.testing.assert_close(features, expected)
-    without = network_inputs(**data, exposure=torch.tensor([0.5]))
-    torch.testing.assert_close(without, expected[:, :, :10])
+    features = network_inputs(**data, exposure=torch.tensor([0.5]))
+    layers = [torch.log1p(data["color"] / 0.5), torch.log1p(data["albedo"]), data["normal"], data["confidence"]]
+    torch.testing.assert_close(features, torch.cat(layers, 2))
 
 
 def test_what_is_missing_is_zero() -> None:
@@ -77,24 +63,18 @@ def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
         network_inputs(**data, exposure=torch.ones(1))
 
 
-def test_an_exposure_or_an_estimate_of_another_shape_is_an_error() -> None:
+def test_an_exposure_of_another_shape_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
         network_inputs(**window(), exposure=torch.ones(2))
-    with pytest.raises(ValueError, match="estimate: expected shape"):
-        network_inputs(**window(), exposure=torch.ones(1), estimate=torch.zeros(1, 3, 8, 12))
 
 
 def test_numbers_of_channels_are_what_the_models_count_on() -> None:
     data = window()
     assert network_inputs(**data, exposure=torch.ones(1)).shape[2] == CHANNELS
-    features = network_inputs(**data, exposure=torch.ones(1), estimate=data["color"])
-    assert features.shape[2] == CHANNELS + ESTIMATE_CHANNELS
 
 
 def test_what_is_given_is_not_written_to() -> None:
     data = window()
-    estimate = uniform(1, 3, 3, 8, 12, seed=9)
     copies = {name: value.clone() for name, value in data.items()}
-    network_inputs(**data, exposure=torch.tensor([0.5]), estimate=estimate)
+    network_inputs(**data, exposure=torch.tensor([0.5]))
     assert all(torch.equal(value, copies[name]) for name, value in data.items())
-    assert torch.equal(estimate, uniform(1, 3, 3, 8, 12, seed=9))

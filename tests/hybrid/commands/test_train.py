@@ -23,7 +23,7 @@ from hybrid.files.sources import MADE_FROM  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.clips import open_clips  # noqa: E402
 from network.models import unet  # noqa: E402
-from network.stabilizer import Stabilizer, StabilizerConfig  # noqa: E402
+from network.robust_unet import RobustUNet, RobustUNetConfig  # noqa: E402
 from network.train_config import SamplerConfig, TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -49,7 +49,9 @@ def weights(tmp_path_factory):
     """A small network of three frames, not trained."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    save_model(path, Stabilizer(StabilizerConfig(frames=3, cell=2, widths=(4, 4), ra_scales=(1,))))
+    model = RobustUNet(RobustUNetConfig(frames=3, size="small"))
+    torch.nn.init.constant_(model.keep.bias, 4)  # what an untrained trunk makes is no picture: little of it
+    save_model(path, model)
     return path
 
 
@@ -166,7 +168,15 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     capsys.readouterr()
     for more, message in (
         (["--steps", "1", "--resume"], "resume: no file"),
+<<<<<<< HEAD
         (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 32, as this model needs, got 40"),
+=======
+        (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 16, as this model needs, got 40"),
+        (
+            ["--steps", "1", "--preset", "slow"],
+            "preset is 'slow', expected one of fast, balanced, quality, unet, multiscale, paper, tkpcn",
+        ),
+>>>>>>> 5302e63 (The final stage is a U-Net on OIDN's trunk, whose frames meet in Robust Average blocks before it denoises)
         (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
         (["--steps", "1", "--validation", "nowhere"], "expected shots among"),
     ):
@@ -182,6 +192,7 @@ OPTIONS = {
     "minutes": (["--minutes", 1.5], 1.5),
     "batch": (["--batch", 3], 3),
     "rate": (["--rate", 2e-3], 2e-3),
+    "trunk_rate": (["--trunk-rate", 0.5], 0.5),
     "warmup": (["--warmup", 11], 11),
     "clip_norm": (["--clip", 0.5], 0.5),
     "ema": (["--ema", 0.9], 0.9),
@@ -197,7 +208,7 @@ OPTIONS = {
     "seed": (["--seed", 5], 5),
     "checkpoint_minutes": ([], 3.0),  # as often as it is validated
     "validate_minutes": (["--validate-minutes", 3], 3.0),
-    "sampler": (["--crop", 64, "--sets", 4], SamplerConfig(crop=64, sets=4)),
+    "sampler": (["--crop", 64, "--sets", 4, "--drop-frames", 0.3], SamplerConfig(crop=64, sets=4, drop_frames=0.3)),
 }
 NOT_OFFERED = {"weight_decay"}
 
@@ -261,7 +272,8 @@ def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
     layers = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in ("before1", "centre", "after1")]
     frame = open_shot(tmp_path / "out", aovs=layers).read(SCENE.first + 1)
     total = sum(frame.aovs[layer] for layer in layers[:3])
-    np.testing.assert_allclose(total, frame.color, rtol=2e-3, atol=1e-3)  # layers may be halves
+    # Together they are what was gathered, whose local mean the picture has.
+    assert total.mean() == pytest.approx(frame.color.mean(), rel=0.03)
     np.testing.assert_allclose(sum(frame.aovs[layer] for layer in layers[3:]), 1, rtol=2e-3)
 
 

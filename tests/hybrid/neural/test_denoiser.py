@@ -13,10 +13,11 @@ from hybrid.alignment.align import Aligner  # noqa: E402
 from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.estimates import OfWindows  # noqa: E402
 from hybrid.files.frames import open_shot  # noqa: E402
-from hybrid.neural.denoiser import Denoiser, shipped_weights  # noqa: E402
+from hybrid.neural.denoiser import Denoiser  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
-from network.checkpoint import save_model  # noqa: E402
-from network.models import fast, unet  # noqa: E402
+from network.checkpoint import save_model, shipped_weights  # noqa: E402
+from network.models import unet  # noqa: E402
+from nlm.gather import gather  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -24,16 +25,15 @@ STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(height=70, width=90, frames=5)
 
 
-@pytest.fixture(scope="module", params=[fast, unet])
+@pytest.fixture(scope="module", params=["fast", "unet"])
 def weights(request, tmp_path_factory):
-    """A network that was never trained: whatever it makes of its input, it must make it everywhere alike."""
+    """The final stage that ships; and kernels never trained: what they make of their input, they make everywhere."""
+    if request.param == "fast":
+        return shipped_weights("fast")
     path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
-    model = request.param(seed=3)
+    model = unet(seed=3)
     with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
-        (model.weight if request.param is fast else model.head.window).weight.mul_(20)
-        for head in model.shares if request.param is fast else ():
-            head[-1].weight.mul_(40)
-            head[-1].bias.zero_()
+        model.head.window.weight.mul_(20)
     save_model(path, model)
     return path
 
@@ -92,7 +92,8 @@ def test_a_flat_picture_stays_as_it_is(tmp_path, weights):
         layers["ViewLayer.Denoising Albedo"][:] = 0.5
 
     image = Denoiser(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
-    np.testing.assert_allclose(image, 0.7, rtol=1e-5)
+    # Kernels sum to 1. A trunk was 0.4 % off at most; 28 % at the borders, before they were mirrored.
+    np.testing.assert_allclose(image, 0.7, rtol=1e-5 if weights.stem == "untrained" else 0.01)
 
 
 def test_without_guides_it_runs(tmp_path, weights):
@@ -156,19 +157,23 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
     denoiser = Denoiser(weights, tile=16, precision="float32")
     aligners = [Aligner(shot, STAGES | extra, estimates=OfWindows(DRAFT)) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
-    np.testing.assert_allclose(images[1], images[0], atol=1e-6)
+    # A trunk leaves next to nothing where there is nothing: 0.002 beside an edge was measured.
+    np.testing.assert_allclose(images[1], images[0], atol=1e-6 if weights.stem == "untrained" else 5e-3)
     assert images[1][:, 60:].max() < 1e-3
     assert (images[1][:, 240:] == 0).all()  # exactly what was there
 
 
-def test_contributions_sum_to_the_result_and_weights_to_one(folder, weights):
+def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, weights):
     window, counted = align(folder), Breakdown()
     denoised = Denoiser(weights, precision="float32", tile=32, breakdown=counted)(window)
     names = ["before2", "before1", "centre", "after1", "after2"]
     added = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
     assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
-    parts = sum(denoised.extra[f"contribution.{name}"] for name in names)
-    np.testing.assert_allclose(parts, denoised.color, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
+    parts, whole = sum(denoised.extra[f"contribution.{name}"] for name in names), denoised.color
+    if weights.stem == "fast":  # whose pictures are made of what the frames give together
+        gathered = gather(window.estimate, window.residual, window.confidence, window.exposure)
+        whole = gathered.image * window.modulation
+    np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
     shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])
     np.testing.assert_allclose(shares.sum(0), 1, rtol=1e-5)
     rows = list(counted.rows())
@@ -184,6 +189,7 @@ def test_bad_options_are_refused(weights):
         ({"precision": "int8"}, "precision"),
         ({"tile": 3}, "tile"),
         ({"threshold": 1.0}, "threshold"),
+        *([({"threshold": 0.5}, "no kernels")] if weights.stem == "fast" else []),
     ):
         with pytest.raises(ValueError, match=word):
             Denoiser(weights, **options)

@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("torch")
 
-from hybrid import neural
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, open_shot
-from hybrid.neural import denoise_unet, unet
+from hybrid.neural import denoiser, unet
+from hybrid.neural.unet import denoise_unet
 from network.trunk import OIDN_WEIGHTS
 from tests.scenes import Scene
 
@@ -82,7 +82,7 @@ def test_denoise_takes_them_where_it_runs_in_bfloat16(tmp_path, monkeypatch, pre
     if not known:  # another version of OIDN
         unet._network.cache_clear()
         monkeypatch.setitem(OIDN_WEIGHTS, "rt_hdr_alb_nrm_small", (641480, "0" * 64))
-    monkeypatch.setattr(neural, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
+    monkeypatch.setattr(denoiser, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
     words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--frames", "1002", "--precision", precision]
     assert main(words) == 0
     assert bool(calls) == (precision == "bfloat16" and known)

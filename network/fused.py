@@ -1,0 +1,176 @@
+"""The Robust Average block whose convolutions are 1×1, as one pass over memory. For running, on processors.
+
+Torch makes some forty passes over the features of all frames, which at full resolution are far larger than any cache;
+here each pixel is read once and written once, and bfloat16 is widened on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from loops.cores import on_all_cores
+
+#: Width between the convolutions: a constant, so that what is done for all of them becomes one instruction.
+HIDDEN = 16
+_PIXELS = 64  # at a time: all their features fit the fastest cache
+_MOST = 15  # frames of a window, as a network may have (`network.checkpoint.BOUNDS`)
+
+
+def can_blend(x: Tensor, on_frame: nn.Conv2d, frames: int) -> bool:
+    """Whether `blend_pixels` does this block on these features.
+
+    Parameters
+    ----------
+    x : Tensor
+        Features.
+    on_frame : Conv2d
+        The block's first convolution.
+    frames : int
+        T.
+
+    Returns
+    -------
+    bool
+    """
+    small = on_frame.kernel_size == (1, 1) and on_frame.out_channels == HIDDEN and 3 <= frames <= _MOST
+    same = x.dtype == on_frame.weight.dtype and x.dtype in (torch.float32, torch.bfloat16)
+    return small and same and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
+
+
+def blend_pixels(
+    x: Tensor,
+    frames: int,
+    order: Sequence[int],
+    on_frame: nn.Conv2d,
+    on_average: nn.Conv2d,
+    weight: nn.Conv2d,
+    kept: Sequence[int],
+) -> Tensor:
+    """Do what `network.blocks.RobustAverage` does, in one pass.
+
+    Parameters
+    ----------
+    x : Tensor
+        ``(T·N, C, H, W)``, float32 or bfloat16, time first.
+    frames : int
+        T, 3 or more.
+    order : sequence of int
+        In which the frames are visited.
+    on_frame, on_average, weight : Conv2d
+        1×1, `HIDDEN` channels between them.
+    kept : sequence of int
+        The frames that are asked for.
+
+    Returns
+    -------
+    Tensor
+        As x, of these frames.
+    """
+    given = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
+    parameters = [layer.weight.float().flatten(1).t().contiguous().numpy() for layer in (on_frame, on_average)]
+    bias = cast(Tensor, on_frame.bias).float().numpy()
+    last = np.append(weight.weight.float().flatten().numpy(), cast(Tensor, weight.bias).float().numpy())
+    batch, (height, width, channels) = len(x) // frames, given.shape[1:]
+    result = given.new_empty(len(kept) * batch, height, width, channels)
+    arguments = np.asarray(order), np.asarray(kept), *parameters, bias, last
+    loop, bits = (_blend_rounded, torch.uint16) if x.dtype == torch.bfloat16 else (_blend, torch.float32)
+    images = [values.view(bits).numpy().reshape(-1, batch * height, width, channels) for values in (given, result)]
+    on_all_cores(loop, batch * height, *images, *arguments)
+    return result.permute(0, 3, 1, 2)
+
+
+@njit(nogil=True)
+def _blend_pixels(
+    state: Any, order: Any, on_frame: Any, on_average: Any, bias: Any, last: Any, average: Any, hidden: Any, share: Any
+) -> None:
+    # Pixels lie innermost, so that each step is the same instruction on many of them.
+    T, C, P = state.shape
+    for i in order:
+        first, second = (1, 2) if i == 0 else ((0, 2) if i == 1 else (0, 1))
+        for k in range(HIDDEN):
+            hidden[k] = bias[k]
+        for c in range(C):
+            mean, low, high = average[c], share[0], share[1]
+            for p in range(P):
+                low[p] = min(state[first, c, p], state[second, c, p])
+                high[p] = max(state[first, c, p], state[second, c, p])
+                mean[p] = 0
+            for t in range(second + 1, T):
+                if t != i:
+                    # The middle of (low, next, high) can no longer be extreme: it joins the sum (see `ravg`).
+                    for p in range(P):
+                        value = state[t, c, p]
+                        mean[p] += max(low[p], min(value, high[p]))
+                        low[p] = min(low[p], value)
+                        high[p] = max(high[p], value)
+            for p in range(P):
+                mean[p] = mean[p] / np.float32(T - 3) if T > 3 else np.float32(0.5) * (low[p] + high[p])
+            for k in range(HIDDEN):
+                of_frame, of_average = on_frame[c, k], on_average[c, k]
+                for p in range(P):
+                    hidden[k, p] += state[i, c, p] * of_frame + mean[p] * of_average
+        share[0] = last[HIDDEN]
+        for k in range(HIDDEN):
+            for p in range(P):
+                share[0, p] += max(hidden[k, p], np.float32(0)) * last[k]
+        for p in range(P):
+            share[0, p] = np.float32(1) / (np.float32(1) + np.exp(-share[0, p]))
+        for c in range(C):
+            for p in range(P):
+                state[i, c, p] += share[0, p] * (average[c, p] - state[i, c, p])
+
+
+@njit(cache=True, nogil=True)
+def _blend(
+    first: int, stop: int, given: NDArray[np.float32], result: NDArray[np.float32], order: NDArray[Any],
+    kept: NDArray[Any], on_frame: NDArray[Any], on_average: NDArray[Any], bias: NDArray[Any], last: NDArray[Any],
+) -> None:  # fmt: skip
+    T, _, W, C = given.shape
+    state, average = np.empty((T, C, _PIXELS), np.float32), np.empty((C, _PIXELS), np.float32)
+    hidden, share = np.empty((HIDDEN, _PIXELS), np.float32), np.empty((2, _PIXELS), np.float32)
+    for y in range(first, stop):
+        for start in range(0, W, _PIXELS):
+            count = min(_PIXELS, W - start)
+            for t in range(T):
+                for p in range(_PIXELS):
+                    x = start + min(p, count - 1)
+                    for c in range(C):
+                        state[t, c, p] = given[t, y, x, c]
+            _blend_pixels(state, order, on_frame, on_average, bias, last, average, hidden, share)
+            for n in range(len(kept)):
+                for p in range(count):
+                    for c in range(C):
+                        result[n, y, start + p, c] = state[kept[n], c, p]
+
+
+@njit(cache=True, nogil=True)
+def _blend_rounded(
+    first: int, stop: int, given: NDArray[np.uint16], result: NDArray[np.uint16], order: NDArray[Any],
+    kept: NDArray[Any], on_frame: NDArray[Any], on_average: NDArray[Any], bias: NDArray[Any], last: NDArray[Any],
+) -> None:  # fmt: skip
+    T, _, W, C = given.shape
+    bits, average = np.empty((T, C, _PIXELS), np.uint32), np.empty((C, _PIXELS), np.float32)
+    state = bits.view(np.float32)  # a bfloat16 is the upper half of a float32
+    hidden, share = np.empty((HIDDEN, _PIXELS), np.float32), np.empty((2, _PIXELS), np.float32)
+    for y in range(first, stop):
+        for start in range(0, W, _PIXELS):
+            count = min(_PIXELS, W - start)
+            for t in range(T):
+                for p in range(_PIXELS):
+                    x = start + min(p, count - 1)
+                    for c in range(C):
+                        bits[t, c, p] = np.uint32(given[t, y, x, c]) << np.uint32(16)
+            _blend_pixels(state, order, on_frame, on_average, bias, last, average, hidden, share)
+            for n in range(len(kept)):
+                for p in range(count):
+                    for c in range(C):
+                        value = bits[kept[n], c, p]
+                        half = np.uint32(0x7FFF) + ((value >> np.uint32(16)) & np.uint32(1))  # ties to even
+                        result[n, y, start + p, c] = np.uint16((value + half) >> np.uint32(16))

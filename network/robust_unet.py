@@ -1,0 +1,402 @@
+"""The final stage: a U-Net that knows how to denoise, whose frames meet in Robust Average blocks before it does.
+
+The trunk is OIDN's (`network.trunk`). Each frame of an aligned window enters as a noisy realisation of the centre; RA
+blocks, the first behind the first convolution at full resolution, let the samples of the frames meet; one decoder makes
+the picture of the centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import log
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from network.blocks import RobustAverage
+from network.fused import HIDDEN
+from network.kernels import mean_of
+from network.trunk import (
+    DECODERS,
+    ENCODERS,
+    Convolutions,
+    Trunk,
+    TrunkConfig,
+    load_oidn,
+    pu_forward,
+    pu_inverse,
+    round_taps,
+    round_trunk,
+)
+
+#: Channels that a frame has beside those of OIDN's networks: the gathered average, confidence, samples gathered.
+KNOWN = 5
+#: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
+RESIDUAL_LIMIT = 6.0
+#: Rows of all frames that are worked on at a time.
+ROWS = 64
+#: Weights before any training: of the average in an RA block; of the average of estimates in the picture.
+BLEND, KEEP = 0.8, 0.2
+
+
+@dataclass(frozen=True)
+class RobustUNetConfig:
+    """Sizes of a `RobustUNet`."""
+
+    frames: int = 5  # T, odd; the window
+    size: str = "base"  # of network.trunk.ENCODERS
+    ra_scales: tuple[int, ...] = (0,)  # 0: behind the first convolution; s: behind the convolutions of scale s
+    clean_guides: bool = False  # whether the trunk relies on its guides: where they have noise they are filtered first
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.frames % 2 == 0:
+            raise ValueError(f"frames: expected an odd number >= 1, got {self.frames}")
+        if self.size not in ENCODERS:
+            raise ValueError(f"size: expected one of {', '.join(ENCODERS)}, got {self.size!r}")
+        scales = range(len(ENCODERS[self.size]))
+        if not set(self.ra_scales) <= set(scales):
+            raise ValueError(f"ra_scales: expected scales 0 to {len(scales) - 1}, got {self.ra_scales}")
+
+
+@dataclass(frozen=True)
+class Realisations:
+    """A window whose frames are noisy pictures of its centre, and what they give by hand.
+
+    Attributes
+    ----------
+    frames : Tensor
+        ``(N, T, 3, H, W)`` on OIDN's transfer curve, with noise of their own; their mean is `picture`.
+    picture : Tensor
+        ``(N, 3, H, W)``, the samples of all frames gathered (`nlm.gather`), on the same curve.
+    average : Tensor
+        ``(N, 3, H, W)``, the gated average of the estimates, on the same curve.
+    confidence : Tensor
+        ``(N, T, 1, H, W)``; 1 for the centre where no frame has any.
+    samples : Tensor
+        ``(N, 1, H, W)`` in (0, 1]: frames' worth of samples gathered, over T.
+    parts : Tensor
+        ``(N, T, 3, H, W)``: what each frame gives of the gathered irradiance, which is their sum.
+    estimate : Tensor
+        ``(N, 3, H, W)``: average of the estimates, irradiance.
+    scale : Tensor
+        ``(N, 3, H, W)``: what irradiance is multiplied by before the transfer curve.
+    """
+
+    frames: Tensor
+    picture: Tensor
+    average: Tensor
+    confidence: Tensor
+    samples: Tensor
+    parts: Tensor
+    estimate: Tensor
+    scale: Tensor
+
+
+def realise(
+    estimate: Tensor, residual: Tensor, confidence: Tensor, modulation: Tensor, exposure: Tensor, gain: Tensor
+) -> Realisations:
+    """Make of each frame of a window a noisy realisation of its centre.
+
+    Parameters
+    ----------
+    estimate, residual : Tensor
+        ``(N, T, 3, H, W)`` irradiance, as for `nlm.gather.gather`.
+    confidence : Tensor
+        ``(N, T, 1, H, W)``, at least 0.
+    modulation : Tensor
+        ``(N, 3, H, W)``; radiance is irradiance times modulation.
+    exposure : Tensor
+        ``(N,)``, positive, of the irradiance.
+    gain : Tensor
+        ``(N,)``, positive: OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
+
+    Returns
+    -------
+    Realisations
+        Float32.
+
+    Notes
+    -----
+    With e the estimates, r' the residuals held to six times the light, c the confidence,
+
+        G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,    x_s = P(G + c_s r'_s + (1 − c_s) r'_t),
+
+    P the transfer curve, t the centre: a frame that is not trusted shows the centre's noise. All x_s are then shifted
+    by P(b) − mean x_s. Noise on a concave curve has a mean that is too dark: without the shift, pictures of a few
+    samples lost up to 5 dB.
+    """
+    centre = confidence.shape[1] // 2
+    total = confidence.sum(1, keepdim=True)
+    alone = torch.zeros_like(confidence)
+    alone[:, centre] = 1
+    confidence = torch.where(total > 0, confidence, alone)
+    share = confidence / confidence.sum(1, keepdim=True)
+    limit = RESIDUAL_LIMIT * (estimate.mean(2, keepdim=True).clamp_min(0) + exposure.view(-1, 1, 1, 1, 1))
+    held = residual * (limit / torch.maximum(residual.mean(2, keepdim=True).abs(), limit))
+    parts = share * (estimate + held)
+    average, gathered = (share * estimate).sum(1), parts.sum(1)
+    scale = modulation * gain.view(-1, 1, 1, 1)
+    own = held[:, centre, None]
+    frames = pu_forward(((average[:, None] + own + confidence * (held - own)) * scale[:, None]).clamp_min_(0))
+    picture = pu_forward((gathered * scale).clamp_min(0))
+    frames += (picture - frames.mean(1))[:, None]
+    samples = share.square().sum(1).reciprocal() / share.shape[1]
+    average_seen = pu_forward((average * scale).clamp_min(0))
+    return Realisations(frames, picture, average_seen, confidence, samples, parts, average, scale)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a `RobustUNet` made of a window.
+
+    Attributes
+    ----------
+    irradiance : Tensor
+        ``(N, 3, H, W)``, at least 0.
+    gathered : Tensor
+        The samples of all frames, irradiance: right in the mean, and noisy, ``(N, 3, H, W)``.
+    window : mapping of str to Tensor
+        What it was made from, as `realise` takes it.
+    """
+
+    irradiance: Tensor
+    gathered: Tensor
+    window: Mapping[str, Tensor]
+
+    def apply(self, layers: Tensor) -> Tensor:
+        """Average other layers of the window, ``(N, T, C, H, W)``, by confidence: ``(N, C, H, W)``."""
+        confidence = self.window["confidence"]
+        return mean_of(layers * confidence, confidence, layers[:, layers.shape[1] // 2])
+
+    def parts(self) -> tuple[Tensor, Tensor]:
+        """What each frame gives of the gathered picture, ``(N, T, 3, H, W)``, and its share, ``(N, T, 1, H, W)``."""
+        found = realise(**self.window)
+        return found.parts, found.confidence / found.confidence.sum(1, keepdim=True)
+
+
+class RobustUNet(nn.Module):
+    """OIDN's U-Net over a window of frames, connected by RA blocks.
+
+    Parameters
+    ----------
+    config : RobustUNetConfig
+        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large"), and some thousands for what is new.
+
+    Notes
+    -----
+    The frames share the encoder up to the last RA block; what follows it sees the centre alone. The first block stands
+    *before* the first ReLU: averages of what a convolution makes are what it makes of averages, so that before any
+    training the network does what it would with frames gathered by hand. The skip connection from the input to the
+    last scale of the decoder has the gathered picture.
+
+    Further input channels (`KNOWN`) enter the first convolution with weights of 0. Blocks start as a constant blend
+    (`BLEND`), and the picture as four parts of the network's and one of the average of estimates, whose errors are
+    different ones (`KEEP`); both are predicted, pixel by pixel, once they are trained.
+    """
+
+    def __init__(self, config: RobustUNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths = [convolutions[-1] for convolutions in ENCODERS[config.size]]
+        self.trunk = Trunk(TrunkConfig(9, config.size))
+        self.known = nn.Conv2d(KNOWN, ENCODERS[config.size][0][0], 3, padding=1, bias=False)
+        self.average = nn.ModuleDict(
+            {str(scale): RobustAverage(widths[scale], 1, HIDDEN, BLEND) for scale in sorted(config.ra_scales)}
+        )
+        self.keep = nn.Conv2d(DECODERS[config.size][-1][-1], 1, 1)
+        nn.init.zeros_(self.known.weight)
+        nn.init.zeros_(self.keep.weight)
+        nn.init.constant_(cast(Tensor, self.keep.bias), log(KEEP / (1 - KEEP)))
+
+    @property
+    def multiple(self) -> int:
+        """Height and width must be multiples of this."""
+        return self.trunk.multiple
+
+    def forward(self, frames: Tensor, still: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Make the picture of the centre.
+
+        Parameters
+        ----------
+        frames : Tensor
+            ``(N, T, 3, H, W)`` from `realise`.
+        still : Tensor
+            ``(N, 9, H, W)``: the gathered picture, and albedo and normal of the centre in [0, 1].
+        known : Tensor
+            ``(N, T, 5, H, W)``: gathered average, confidence, samples.
+
+        Returns
+        -------
+        picture : Tensor
+            ``(N, 3, H, W)`` on the transfer curve.
+        keep : Tensor
+            ``(N, 1, H, W)`` in (0, 1): share of the average of estimates.
+
+        Raises
+        ------
+        ValueError
+            If frames are not the model's, or height or width is no multiple of 16.
+        """
+        if frames.shape[1] != self.config.frames:
+            raise ValueError(f"frames: expected {self.config.frames}, got {frames.shape[1]}")
+        for name, length in zip(("height", "width"), still.shape[2:], strict=True):
+            if length == 0 or length % self.multiple:
+                raise ValueError(f"frames: expected a {name} that is a multiple of {self.multiple}, got {length}")
+        return self.finish(self.meet(frames, still, known), still)
+
+    def meet(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
+        """Run what is before the first ReLU. A row depends on those beside it alone.
+
+        Parameters
+        ----------
+        frames, still, known : Tensor
+            As for `forward`, of any height.
+
+        Returns
+        -------
+        Tensor
+            Features ``(T·N, width, H, W)``, or ``(N, width, H, W)`` where all frames have met.
+        """
+        count, last = self.config.frames, max(self.config.ra_scales, default=-1)
+        first = self.trunk.first
+        guides = still[:, None, 3:].expand(-1, count, -1, -1, -1)
+        # Time first, and rounded before anything is copied.
+        parts = [part.to(first.weight.dtype).transpose(0, 1).flatten(0, 1) for part in (frames, guides, known)]
+        if last < 0:
+            parts = [part.chunk(count)[count // 2] for part in parts]
+        x = torch.cat(parts, 1).contiguous(memory_format=torch.channels_last)
+        weight = torch.cat([first.weight, self.known.weight], 1).contiguous(memory_format=torch.channels_last)
+        x = functional.conv2d(x, weight, first.bias, padding=1)
+        return self.average["0"](x, count, last == 0) if "0" in self.average else x
+
+    def finish(self, x: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
+        """Run all that follows `meet`, as for `forward`.
+
+        Parameters
+        ----------
+        x : Tensor
+            From `meet`.
+        still : Tensor
+            As for `forward`.
+
+        Returns
+        -------
+        picture, keep : Tensor
+            As of `forward`.
+        """
+        trunk, count, last = self.trunk, self.config.frames, max(self.config.ra_scales, default=-1)
+        x = cast(Convolutions, trunk.encoder[0]).after_first(x)
+        skips = [trunk.skip_of(still)]
+        for scale, stage in enumerate(trunk.encoder):
+            if scale:
+                x = functional.max_pool2d(x, 2)
+                # What enters a scale is handed on to the decoder: the centre's, which has the others' in it.
+                skips.append(x.chunk(count)[count // 2] if scale <= last else x)
+                x = stage(x)
+            if scale and str(scale) in self.average:
+                x = self.average[str(scale)](x, count, last == scale)
+        x = trunk.decode(x, skips[: len(trunk.decoder)])
+        keep = torch.sigmoid(self.keep(x.to(self.keep.weight.dtype)).float())
+        return trunk.finish(x), keep
+
+
+def gather_and_denoise(
+    model: RobustUNet,
+    window: Mapping[str, Tensor],
+    albedo: Tensor | None,
+    normal: Tensor | None,
+    run: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
+) -> Picture:
+    """Run a model on an aligned window.
+
+    Parameters
+    ----------
+    model : RobustUNet
+        The model.
+    window : mapping of str to Tensor
+        As `realise` takes it.
+    albedo, normal : Tensor, optional
+        ``(N, 3, H, W)``: the centre's guides, albedo in [0, 1], normals in [−1, 1]; without, the same everywhere.
+    run : callable, optional
+        Stands for the model where it is wrapped.
+
+    Returns
+    -------
+    Picture
+        Float32.
+
+    Notes
+    -----
+    Without gradients the frames are realised, and meet, some rows at a time: no more of five frames' features is ever
+    there, and what is there fits the caches of a processor.
+    """
+    missing = torch.full_like(window["modulation"], 0.5)
+    guides = torch.cat(
+        [
+            missing if albedo is None else albedo.clamp(0, 1),
+            missing if normal is None else normal.clamp(-1, 1) * 0.5 + 0.5,
+        ],
+        1,
+    )
+    if torch.is_grad_enabled():
+        found = realise(**window)
+        still = torch.cat([found.picture, guides], 1)
+        seen, keep = (model if run is None else run)(found.frames, still, _known(found))
+        gathered, average, scale = found.parts.sum(1), found.estimate, found.scale
+    else:
+        height, strips = guides.shape[2], []
+        for top in range(0, height, ROWS):
+            stop = min(top + ROWS, height)
+            first, last = max(top - 1, 0), min(stop + 1, height)  # the first convolution sees a row around
+            here = {name: layer if layer.ndim < 4 else layer[..., first:last, :] for name, layer in window.items()}
+            found = realise(**here)
+            still = torch.cat([found.picture, guides[:, :, first:last]], 1)
+            features = model.meet(found.frames, still, _known(found))
+            own = slice(top - first, stop - first)
+            of_rows = features, still, found.parts.sum(1), found.estimate, found.scale
+            strips.append([layer[:, :, own] for layer in of_rows])
+        features, still, gathered, average, scale = (torch.cat(layers, 2) for layers in zip(*strips, strict=True))
+        seen, keep = model.finish(features.contiguous(memory_format=torch.channels_last), still)
+    # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
+    light = pu_inverse(seen.float().clamp_min(0)) / scale
+    return Picture(light + keep * (average.clamp_min(0) - light), gathered, window)
+
+
+def _known(found: Realisations) -> Tensor:
+    """What the network is told of each frame beside its picture and guides, ``(N, T, 5, H, W)``."""
+    frames = found.frames.shape[1]
+    average, samples = (layer[:, None].expand(-1, frames, -1, -1, -1) for layer in (found.average, found.samples))
+    return torch.cat([average, found.confidence, samples], 2)
+
+
+#: OIDN's networks that a model of each size starts from. The first two bear guides with noise; the third, whose guides
+#: must have none, is the only large one that there is.
+OIDN_TRUNKS = {"small": "rt_hdr_alb_nrm_small", "base": "rt_hdr_alb_nrm", "large": "rt_hdr_calb_cnrm_large"}
+
+
+def start_from_oidn(model: RobustUNet) -> RobustUNet:
+    """Give a model the weights of OIDN's network of its size (`network.trunk.load_oidn`, which says what it raises).
+
+    Parameters
+    ----------
+    model : RobustUNet
+        Is changed.
+
+    Returns
+    -------
+    RobustUNet
+        The same.
+    """
+    model.trunk.load_state_dict(load_oidn(OIDN_TRUNKS[model.config.size]).state_dict())
+    return model
+
+
+def round_robust(model: RobustUNet) -> RobustUNet:
+    """Lay a model out for processors that have bfloat16 (`network.trunk.round_trunk`); the model is changed."""
+    model.trunk = round_trunk(model.trunk)
+    model.known.weight.data = round_taps(model.known.weight)
+    model.average.bfloat16()
+    return model

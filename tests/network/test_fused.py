@@ -1,0 +1,86 @@
+"""The Robust Average block in one pass gives what torch gives."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network import blocks, fused
+from network.blocks import RobustAverage, outermost_first
+
+pytestmark = pytest.mark.neural
+
+
+def block_and_features(
+    frames: int, dtype: torch.dtype = torch.float32, channels: int = 8
+) -> tuple[RobustAverage, torch.Tensor]:
+    torch.manual_seed(0)
+    block = RobustAverage(channels, 1, fused.HIDDEN).to(dtype)
+    with torch.no_grad():
+        block.weight.weight.mul_(20)  # so that blends differ from pixel to pixel
+    # Two windows, a width that is no multiple of what is done at a time, and more than one of those.
+    x = torch.randn(2 * frames, channels, 5, 2 * fused._PIXELS + 7).to(dtype)
+    return block, x.to(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("frames", [3, 4, 5, 6, 7])
+def test_it_gives_what_torch_gives(frames: int, centre: bool) -> None:
+    block, x = block_and_features(frames)
+    wanted = block(x, frames, centre)  # with gradients: torch
+    with torch.no_grad():
+        found = block(x, frames, centre)
+    assert found.shape == wanted.shape
+    assert found.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(found, wanted.detach(), rtol=0, atol=1e-5)
+    given = x[frames // 2 * 2 : frames // 2 * 2 + 2] if centre else x
+    assert float((found - given).abs().mean()) > 0.1  # it does something
+
+
+def test_in_bfloat16_it_is_nearer_to_exact_than_torch_is() -> None:
+    block, x = block_and_features(5, torch.bfloat16)
+    exact = block.float()(x.float(), 5).detach()
+    rounded = block.bfloat16()
+    slow = rounded(x, 5).detach().float()
+    with torch.no_grad():
+        quick = rounded(x, 5)
+    assert quick.dtype == torch.bfloat16
+    # One rounding, at the end: half a step of 2^-8.
+    assert float(((quick.float() - exact).abs() / exact.abs().clamp_min(0.05)).max()) < 2**-8
+    assert float((quick.float() - exact).square().mean()) < float((slow - exact).square().mean())
+
+
+def test_it_is_taken_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[int] = []
+
+    def spy(x: torch.Tensor, frames: int, *_: object) -> torch.Tensor:
+        taken.append(frames)
+        return x
+
+    monkeypatch.setattr(blocks, "blend_pixels", spy)
+    block, x = block_and_features(5)
+    block(x, 5)
+    assert not taken  # a gradient may be asked for
+    with torch.no_grad():
+        block(x, 5)
+        assert taken == [5]
+        RobustAverage(8, 3, fused.HIDDEN)(x, 5)
+        RobustAverage(8, 1, 4)(x, 5)
+        with torch.autocast("cpu", torch.bfloat16):
+            block(x.bfloat16(), 5)
+        block(x[:4], 2)  # the mean of one other frame
+    assert taken == [5]
+
+
+def test_the_order_is_that_of_the_block() -> None:
+    """Another order gives another picture: each frame is blended with what those before it have become."""
+    block, x = block_and_features(5)
+    layers = block.on_frame, block.on_average, block.weight
+    with torch.no_grad():
+        right = fused.blend_pixels(x, 5, outermost_first(5), *layers, range(5))
+        wrong = fused.blend_pixels(x, 5, range(5), *layers, range(5))
+        torch.testing.assert_close(block(x, 5), right)
+    assert float((right - wrong).abs().max()) > 0.01
