@@ -39,7 +39,7 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn-best": {"quality": "high", "prefilter": "high"},
 }
 # What is asked for by these names; by any other, a finished sequence.
-SPECS = ("auto", "none", "nlm", *OIDN_MODES)
+SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
 # What "auto" takes of them for a preset of the network, which looks at the samples again: what the first look is
 # matters little (fast or clean: 0.1 dB).
 MODE_OF = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
@@ -189,8 +189,8 @@ def choose_estimate(
     spec : str
         "auto": what is in the file, else `mode` where OIDN is installed, else our own. "oidn" (quality high,
         guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with OIDN's balanced networks, in frames where
-        they hold noise), "oidn-best" (with its largest, in all), "nlm" (our own, from each frame's window), "none", or
-        the pattern of a finished sequence of the same frames.
+        they hold noise), "oidn-best" (with its largest, in all), "nlm" (our own, from each frame's window), "bundled"
+        (`bundled`, by itself), "none", or the pattern of a finished sequence of the same frames.
     shot : Shot
         The noisy shot.
     own : ClassicalPreset
@@ -249,13 +249,16 @@ def _choose(
                 return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", "cpu", quicker)
             return _oidn(mode, keep, "OIDN is installed", device)
         if bundled is not None:
-            run = partial(estimate_oidn, denoise=bundled)
-            return EstimateSource("bundled", OfFrames(run, HOLDS), f"{lacking}; a small network comes with ravg")
+            return _bundled(bundled, f"{lacking}; a small network comes with ravg")
         return EstimateSource("nlm", OfWindows(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
     if spec == "nlm":
         return EstimateSource("nlm", OfWindows(own), "asked for")
+    if spec == "bundled":
+        if bundled is None:
+            raise ImportError("estimate bundled: torch is needed, which this command does without; expected another")
+        return _bundled(bundled, "asked for")
     if spec in OIDN_MODES:
         if (lacking := why_no_oidn()) is not None:
             raise ImportError(f"estimate {spec}: {lacking}; expected: pip install 'ravg[compare]'")
@@ -269,6 +272,10 @@ def _choose(
         raise ValueError(f"estimate {spec}: each picture belongs to {other}, expected those of the shot's own frames")
     read = OfFrames(partial(_read_sequence, sequence), files=sequence)
     return EstimateSource("sequence", read, "asked for", sequence)
+
+
+def _bundled(run: Callable[..., Array], reason: str) -> EstimateSource:
+    return EstimateSource("bundled", OfFrames(partial(estimate_oidn, denoise=run), HOLDS), reason)
 
 
 def _oidn(

@@ -20,6 +20,8 @@ Floats = NDArray[np.float32]
 _LIMIT = np.float32(6)
 # Of `restore_mean`: σ = 24 and 48 pixels bring the mean equally near.
 _SIGMA, _MOST = 24.0, 0.1
+#: How far around a pixel `restore_mean` looks: three deviations.
+REACH = 72
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,6 @@ def _gray(image: Floats) -> Floats:
 
 
 def _blur(image: Floats, sigma: float) -> Floats:
-    # Cut at three deviations: a part of a frame has no more around it.
     side = 2 * int(3 * sigma) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
 

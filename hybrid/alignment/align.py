@@ -45,8 +45,9 @@ SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 # Forward and back again a pixel that is seen in both frames misses its start by less than this, pixels.
 HIDDEN = 3.0
 # Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, then
-# the network's context. Whole strips of the guided filter (64 rows): it then sums in the order it would in the frame.
-MARGIN = 128
+# what a trunk sees (112) around what the mean is restored in (72). Whole strips of the guided filter (64 rows): it then
+# sums in the order it would in the frame.
+MARGIN = 192
 # Float32 planes that come and go while TV-L1 solves for a flow.
 PLANES_REFINING = 45
 

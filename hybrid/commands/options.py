@@ -153,8 +153,9 @@ EstimateOption = Annotated[
     typer.Option(
         metavar="SOURCE",
         callback=check_estimate,
-        help="denoised single frames to make stable: auto (in the file, else OIDN if installed, else our own), oidn, "
-        "oidn-fast, oidn-clean, oidn-best, nlm (our own), none, or a finished sequence, OTHER.####.exr",
+        help="denoised single frames to start from: auto (in the file, else OIDN if installed, else bundled), oidn, "
+        "oidn-fast, oidn-clean, oidn-best, bundled (a small network that comes with ravg), nlm (without one), none, "
+        "or a finished sequence, OTHER.####.exr",
         rich_help_panel=WHAT,
     ),
 ]

@@ -140,9 +140,16 @@ def _windows(
         runs = flip in _plan(seen).stages
         rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
     refine = partial(refine_flow, **(solver or {}))
-    aligner = Aligner(seen, rules, radius=radius, estimates=choose_estimate(source, shot).estimates, refine=refine)
+    chosen = choose_estimate(source, shot, bundled=_small_network() if source == "bundled" else None)
+    aligner = Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
     for number in shot.numbers:
         yield aligner.align(number)
+
+
+def _small_network() -> Callable[..., Array]:
+    from hybrid.neural import denoise_bundled  # torch may be absent
+
+    return denoise_bundled
 
 
 def classical(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[tuple[int, Array]]:
@@ -428,7 +435,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN clean": _aligned("Gated averages", gated_average, source="oidn-clean"),
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
     "gathered": _aligned("Gated averages", gather_and_denoise, source="oidn-fast"),
-    "network without OIDN": _network("quality", "nlm"),
+    "network without OIDN": _network("fast", "bundled"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast"),

@@ -14,7 +14,7 @@ from hybrid.plan import Plan
 from hybrid.pseudo_reference import STANDARD, filter_window
 
 # What is varied around: the middle of the classical presets, and the network.
-CLASSICAL, NETWORK = "standard", "network without OIDN"
+CLASSICAL, NETWORK, KERNELS = "standard", "network without OIDN", "tKPCN"
 
 RADII = (0, 1, 2, 3)  # windows of 1, 3, 5 and 7 frames
 SCALES, WARPS, ITERATIONS = (1, 3), (1, 3), (10, 30)  # of TV-L1
@@ -79,13 +79,13 @@ def _nlm() -> Iterator[tuple[str, Method]]:
 
 
 def _network() -> Iterator[tuple[str, Method]]:
-    for sweep, option, values in (
-        ("Kernel threshold", "threshold", THRESHOLDS),
-        ("Precision", "precision", PRECISIONS),
-        ("Tile", "tile", TILES),
+    for sweep, base, option, values in (
+        ("Kernel threshold", KERNELS, "threshold", THRESHOLDS),
+        ("Precision", NETWORK, "precision", PRECISIONS),
+        ("Tile", NETWORK, "tile", TILES),
     ):
         for value in values:
-            yield _variant(sweep, NETWORK, {option: value}, **{option: value})
+            yield _variant(sweep, base, {option: value}, **{option: value})
 
 
 def _threads() -> Iterator[tuple[str, Method]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
-from hybrid.alignment.transfer import autoexposure
+from hybrid.alignment.transfer import autoexposure, measure_exposure
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.neural.tiling import Block, Borders, PadMode, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
@@ -27,7 +27,7 @@ from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import Picture, RobustUNet
-from nlm.gather import restore_mean
+from nlm.gather import REACH, restore_mean
 
 Array = NDArray[np.float32]
 
@@ -184,13 +184,19 @@ class Denoiser:
         facts = {"exposure": exposure_of(aligned).to(self._device)}
         if aligned.picture is not None:
             facts["gain"] = gain_of(aligned).to(self._device)
-        # Rows that nobody asked for: what is around them is not there, and neither is the picture.
+        # Where no tile lies, nobody looks.
         irradiance, filtered = color[centre].copy(), np.empty_like(others[centre])
         gathered = irradiance.copy() if self.takes_estimate else None
+        rows = aligned.inner
+        if gathered is not None:  # the mean is restored from what is around
+            around = -(-REACH // self.model.multiple) * self.model.multiple
+            rows = slice(max(rows.start - around, 0), min(rows.stop + around, height))
+        # A picture that is black, as far as numbers go, is left as it is.
+        dark = aligned.picture is not None and measure_exposure(aligned.picture) == 1 > aligned.picture.max()
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
-        for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
+        for inner, outer, offset in tiles(rows, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
-            if "skip" in aligned.stages and not aligned.variance[outer].any():
+            if dark or ("skip" in aligned.stages and not aligned.variance[outer].any()):
                 irradiance[inner], filtered[inner] = color[centre][inner], others[centre][inner]
                 if parts is not None:
                     parts[centre][inner] = np.dstack([irradiance[inner], np.ones_like(irradiance[inner][..., :1])])
@@ -260,4 +266,6 @@ def gain_of(aligned: AlignedWindow) -> torch.Tensor:
     """What radiance is multiplied by before a trunk's transfer curve, (1,): in training and in running."""
     if aligned.picture is None:
         raise ValueError("aligned: expected a window with estimates, got none")
-    return torch.tensor([autoexposure(aligned.picture)], dtype=torch.float32)
+    # OIDN's has a floor of 1e-8 of what it takes for light; a shot may be in any unit.
+    exposure = measure_exposure(aligned.picture)
+    return torch.tensor([autoexposure(aligned.picture / np.float32(exposure)) / exposure], dtype=torch.float32)

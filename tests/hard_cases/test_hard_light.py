@@ -88,8 +88,8 @@ def test_a_constant_picture_is_kept(preset, value):
 def test_the_network_keeps_a_constant_picture(network):
     for precision, model in network.items():
         image = model(align(constant(0.7), estimates=OfWindows(STANDARD))).color
-        # Kernels are float32 and sum to one in either precision; 125 taps of rounding.
-        np.testing.assert_allclose(image, 0.7, rtol=1e-6 if precision == "float32" else 1e-5)
+        # A trunk makes it anew. Before pictures were mirrored beyond their borders it was 28 % off there.
+        np.testing.assert_allclose(image, 0.7, rtol=0.02, err_msg=precision)
 
 
 def test_identical_frames_are_one_frame():

@@ -213,7 +213,7 @@ def test_weights_that_are_not_finite_or_absurd_are_refused(tmp_path, value):
     """They made every picture NaN."""
     model = fast()
     with torch.no_grad():
-        model.stem.weight[0, 0, 0, 0] = value
+        model.known.weight[0, 0, 0, 0] = value
     with pytest.raises(ValueError, match="finite"):
         load_model(write(tmp_path / "x.safetensors", model))
 

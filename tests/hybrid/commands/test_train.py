@@ -168,15 +168,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     capsys.readouterr()
     for more, message in (
         (["--steps", "1", "--resume"], "resume: no file"),
-<<<<<<< HEAD
-        (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 32, as this model needs, got 40"),
-=======
         (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 16, as this model needs, got 40"),
-        (
-            ["--steps", "1", "--preset", "slow"],
-            "preset is 'slow', expected one of fast, balanced, quality, unet, multiscale, paper, tkpcn",
-        ),
->>>>>>> 5302e63 (The final stage is a U-Net on OIDN's trunk, whose frames meet in Robust Average blocks before it denoises)
         (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
         (["--steps", "1", "--validation", "nowhere"], "expected shots among"),
     ):

@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS
-from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
+from hybrid.comparison.sweep import CLASSICAL, KERNELS, NETWORK, sweep_methods
 from hybrid.files.frames import Shot, open_shot
 from hybrid.plan import STAGES, plan_shot
 from tests.scenes import Scene
@@ -33,7 +33,7 @@ def test_every_decision_is_turned_once(shot: Shot) -> None:
     assert {m.sweep for m in swept.values()} == {
         "Stages", "Window", "TV-L1", "NLM", "Kernel threshold", "Precision", "Tile", "Threads",
     }  # fmt: skip
-    assert {m.base for m in swept.values()} == {CLASSICAL, NETWORK}
+    assert {m.base for m in swept.values()} == {CLASSICAL, NETWORK, KERNELS}
 
 
 def test_variants_run_and_differ_from_their_base_where_they_should(shot: Shot) -> None:
@@ -72,5 +72,5 @@ def test_settings_of_the_solver_reach_it(shot: Shot, monkeypatch: pytest.MonkeyP
 
 def test_a_threshold_changes_the_network(shot: Shot) -> None:
     pytest.importorskip("torch")
-    low, high = (next(partial(METHODS[NETWORK].run, threshold=t)(shot))[1] for t in (0.0, 0.75))
+    low, high = (next(partial(METHODS[KERNELS].run, threshold=t)(shot))[1] for t in (0.0, 0.75))
     assert not np.array_equal(low, high)
