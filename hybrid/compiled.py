@@ -43,7 +43,9 @@ class _FirstRun(event.Listener):
             return
         self.begun = True
         LOG.info("compiling for this processor, once: some ten seconds, and kept for later runs")
-        kept = getattr(event.data["dispatcher"]._cache, "cache_path", os.devnull)
+        kept = (
+            getattr(event.data["dispatcher"]._cache, "cache_path", None) or os.devnull
+        )  # a loop that is not kept has none
         if not kept.startswith(os.devnull):
             nothing: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
             with suppress(OSError):

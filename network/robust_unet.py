@@ -38,8 +38,11 @@ KNOWN = 5
 RESIDUAL_LIMIT = 6.0
 #: Rows of all frames that are worked on at a time.
 ROWS = 64
-#: Weights before any training: of the average in an RA block; of the average of estimates in the picture.
-BLEND, KEEP = 0.8, 0.2
+#: Weight of the average in an RA block before any training.
+BLEND = 0.8
+#: Share of the average of estimates in the picture before any training, by the trunk's size: the better a trunk's
+#: picture, the less. Found on four shots at two noise levels (docs/experiments.md).
+KEEP = {"small": 0.5, "base": 0.4, "large": 0.25}
 
 
 @dataclass(frozen=True)
@@ -193,8 +196,8 @@ class RobustUNet(nn.Module):
     last scale of the decoder has the gathered picture.
 
     Further input channels (`KNOWN`) enter the first convolution with weights of 0. Blocks start as a constant blend
-    (`BLEND`), and the picture as four parts of the network's and one of the average of estimates, whose errors are
-    different ones (`KEEP`); both are predicted, pixel by pixel, once they are trained.
+    (`BLEND`), and the picture as a mixture of the network's and the average of estimates, whose errors are different
+    ones (`KEEP`); both are predicted, pixel by pixel, once they are trained.
     """
 
     def __init__(self, config: RobustUNetConfig) -> None:
@@ -209,7 +212,8 @@ class RobustUNet(nn.Module):
         self.keep = nn.Conv2d(DECODERS[config.size][-1][-1], 1, 1)
         nn.init.zeros_(self.known.weight)
         nn.init.zeros_(self.keep.weight)
-        nn.init.constant_(cast(Tensor, self.keep.bias), log(KEEP / (1 - KEEP)))
+        keep = KEEP[config.size]
+        nn.init.constant_(cast(Tensor, self.keep.bias), log(keep / (1 - keep)))
 
     @property
     def multiple(self) -> int:

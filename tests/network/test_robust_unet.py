@@ -151,15 +151,15 @@ def test_its_trunk_is_oidns() -> None:
     assert all(torch.equal(value, wanted[name]) for name, value in model.trunk.state_dict().items())
 
 
-def test_the_picture_is_four_parts_the_networks_before_training() -> None:
+def test_the_picture_is_half_the_networks_before_training() -> None:
     model, window = small(), make_window()
     found = realised(window)
     guides = window["albedo"][:, 2], window["normal"][:, 2]
     still = torch.cat([found.picture, guides[0], guides[1] * 0.5 + 0.5], 1)
     seen, keep = model(found.frames, still, torch.zeros(1, 5, 5, 32, 48))
-    torch.testing.assert_close(keep, torch.full_like(keep, KEEP))
+    torch.testing.assert_close(keep, torch.full_like(keep, KEEP["small"]))
     light = pu_inverse(seen.clamp_min(0)) / found.scale
-    wanted = (1 - KEEP) * light + KEEP * found.estimate
+    wanted = 0.5 * (light + found.estimate)
     torch.testing.assert_close(denoise_tile(model, window)[0], wanted, rtol=1e-5, atol=1e-6)
 
 

@@ -111,10 +111,10 @@ def test_estimates_are_aligned_as_the_frames_are(tmp_path):
 
 
 def test_a_part_of_a_frame_is_that_part_of_the_whole(tmp_path):
-    folder = Scene(height=320, width=40, frames=3).write(tmp_path)
+    folder = Scene(height=448, width=40, frames=3).write(tmp_path)
     number = SCENE.first + 1
     whole, part = (Aligner(open_shot(folder), STAGES, radius=1).align(number, rows) for rows in (None, slice(64, 128)))
-    assert part.color.shape[1] < 320
+    assert part.color.shape[1] < 448
     for name in ("color", "albedo", "normal", "confidence"):
         np.testing.assert_array_equal(getattr(part, name)[:, part.inner], getattr(whole, name)[:, 64:128])
     np.testing.assert_array_equal(part.modulation[part.inner], whole.modulation[64:128])
