@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
@@ -58,21 +59,26 @@ def identity(self, x, frames, centre=False):
     return x.chunk(frames)[frames // 2] if centre else x
 
 
-def decibels(denoiser, window, reference):
-    return psnr(denoiser(window).color, reference)
+def decibels(image, number=FRAME):
+    """PSNR against two independent references, whose noise cancels in the product of both differences."""
+    shots = [open_shot(SHOT / f"{name}.####.exr").read(number).color for name in ("reference", "reference_b")]
+    seen, *clean = (np.maximum(x, 0) / (1 + np.maximum(x, 0)) for x in (image, *shots))
+    return float(-10 * np.log10(np.mean((seen - clean[0]) * (seen - clean[1]))))
 
 
-@pytest.mark.parametrize("preset", MODE_OF)
-def test_the_network_is_worth_more_than_the_average_it_starts_from(window, reference, preset):
+# Measured: 0.59, 0.75 and 1.07 dB.
+@pytest.mark.parametrize(("preset", "gain"), [("fast", 0.4), ("balanced", 0.5), ("quality", 0.8)])
+def test_the_network_is_worth_more_than_the_average_it_starts_from(window, preset, gain):
     """Put `gated_average` in its place, and something must be missing."""
-    network = decibels(Denoiser(shipped_weights(preset)), window, reference)
-    assert network > psnr(gated_average(window), reference) + 0.1
+    network = decibels(Denoiser(shipped_weights(preset))(window).color)
+    assert network > decibels(gated_average(window)) + gain
 
 
-@pytest.mark.parametrize("preset", MODE_OF)
-def test_the_networks_ra_blocks_are_worth_something(window, reference, preset, monkeypatch):
+# Measured: 0.31, 0.22 and 0.57 dB; the gathered picture is in the skip connection too.
+@pytest.mark.parametrize(("preset", "loss"), [("fast", 0.2), ("balanced", 0.15), ("quality", 0.4)])
+def test_the_networks_ra_blocks_are_worth_something(window, preset, loss, monkeypatch):
     """Put the identity in the place of all of them, and something must be missing."""
     denoiser = Denoiser(shipped_weights(preset))
-    whole = decibels(denoiser, window, reference)
+    whole = decibels(denoiser(window).color)
     monkeypatch.setattr(RobustAverage, "forward", identity)
-    assert whole > decibels(denoiser, window, reference) + 0.1
+    assert whole > decibels(denoiser(window).color) + loss
