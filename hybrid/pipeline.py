@@ -68,7 +68,8 @@ class Finished:
     pixels: int = 0
     repaired: int = 0
     fireflies: int = 0
-    removed: float = 0.0  # share of the frame's light that went with the fireflies
+    mean: float = 0.0  # radiance of the noisy frame without its fireflies
+    burnt: float = 0.0  # mean radiance that went with them
     outliers: int = 0
     clamped: int = 0
     plan: Plan | None = None  # which stages ran, and why
@@ -265,14 +266,15 @@ def denoise_frames(
                 (picture, images, denoised.extra)
                 for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
             ]
-            extra = made[0][0].extra
+            extra, centre = made[0][0].extra, aligners[0].frame(number)
             finished = Finished(
                 number=number,
                 path=path,
                 pixels=layers[0]["color"][..., 0].size * len(counted),
                 repaired=sum(counts.repaired for counts in counted),
                 fireflies=sum(counts.fireflies for counts in counted),
-                removed=max(counts.removed for counts in counted),
+                mean=0.0 if centre is None else centre.mean,
+                burnt=0.0 if centre is None else centre.burnt,
                 outliers=sum(counts.outliers for counts in counted),
                 plan=plan,
                 again=again,
@@ -330,7 +332,6 @@ class _Counts:
 
     repaired: int
     fireflies: int
-    removed: float
     outliers: int
     stages: frozenset[str]
     shares: dict[str, float]
@@ -346,8 +347,7 @@ def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: 
         aligned = aligner.align(number, band)
         part = denoise(aligned)
         outliers += aligned.outliers
-        taken = aligned.repaired, aligned.fireflies, aligned.removed
-        counts = _Counts(*taken, outliers, aligned.stages, aligned.shares)
+        counts = _Counts(aligned.repaired, aligned.fireflies, outliers, aligned.stages, aligned.shares)
         named = {("color", ""): part.color}
         named |= {("aovs", name): layer for name, layer in part.aovs.items()}
         named |= {("extra", name): layer for name, layer in part.extra.items()}
@@ -386,7 +386,7 @@ def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -
 
     def around() -> float:
         near = (aligner.frame(n) for n in aligner.around(number, aligner.radius))
-        return max(float(other.radiance.mean(dtype=np.float64)) for other in near if other is not None)
+        return max(other.mean for other in near if other is not None)
 
     if fault := find_lost_light(images["color"], frame.radiance, frame.valid, around):
         raise ValueError(f"frame {number}: {fault}; it was not written")

@@ -374,8 +374,10 @@ class Aligner:
                 known |= recurring(places, prepared.irradiance, there.irradiance, flow, valid)
         lamps = replace_fireflies(prepared.irradiance, places[known])[1] if known.any() else None
         places = places[~known]
-        clean, _, removed = replace_fireflies(prepared.irradiance, places)
-        prepared = replace(prepared, irradiance=clean, fireflies=len(places), removed=removed, lamps=lamps)
+        clean, _, _ = replace_fireflies(prepared.irradiance, places)
+        rendered = prepared.mean
+        prepared = replace(prepared, irradiance=clean, fireflies=len(places), lamps=lamps)
+        prepared = replace(prepared, burnt=max(rendered - prepared.mean, 0.0))
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
 
     def frame(self, number: int) -> PreparedFrame | None:

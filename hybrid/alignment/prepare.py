@@ -68,8 +68,8 @@ class PreparedFrame:
         Whether the albedo has been divided out.
     fireflies : int
         Single bright samples that were taken out.
-    removed : float
-        Share of the light that went with them, in [0, 1].
+    burnt : float
+        Mean radiance that went with them: what fireflies carry belongs to the picture in expectation.
     lamps : (H, W) bool array or None
         Single bright pixels that a neighbour shows as well; None where there are none.
     """
@@ -87,7 +87,7 @@ class PreparedFrame:
     aovs: dict[str, Array]
     demodulated: bool
     fireflies: int = 0
-    removed: float = 0.0
+    burnt: float = 0.0
     lamps: Mask | None = None
 
     @cached_property
@@ -123,6 +123,16 @@ class PreparedFrame:
         if self.albedo is None or not self.demodulated:
             return self.irradiance
         return remodulate(self.irradiance, self.albedo)
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean radiance of all pixels and channels."""
+        return float(self.radiance.mean(dtype=np.float64))
+
+    @property
+    def removed(self) -> float:
+        """Share of the light that went with the fireflies, in [0, 1]."""
+        return self.burnt / (self.mean + self.burnt) if self.burnt else 0.0
 
 
 def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:

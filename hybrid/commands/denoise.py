@@ -565,6 +565,7 @@ def _run(job: Job) -> None:
 
 def _denoise(job: Job, record: Record) -> None:
     """Denoise; say how far it has come, and what was met on the way."""
+    import numpy as np
     from rich.table import Table
 
     from hybrid.files.layers import summarize_layers
@@ -603,6 +604,7 @@ def _denoise(job: Job, record: Record) -> None:
     judgement = [vars(finding) for finding in judged]
     record.write(timings, layers=layers, warnings=shot.warnings, judged=judgement)
     pixels, outliers = 0, 0
+    means: list[tuple[float, float]] = []  # radiance of each noisy frame, as rendered and without its fireflies
     plans: dict[int, Plan] = {}
     progress = Progress(job.command, len(shot))
     frames = denoise_frames(
@@ -636,23 +638,29 @@ def _denoise(job: Job, record: Record) -> None:
             judged += say_cuts(finished.plan, judged, strict=False)
         if finished.again:
             LOG.info(f"frame {finished.number} is made again: {printable(finished.again)}")
+        light = finished.mean + finished.burnt
+        share = finished.burnt / light if light > 0 else 0.0
         if finished.fireflies:
-            light = f"{finished.removed:.2%} of its light"
-            LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {light}")
+            LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {share:.2%} of its light")
         if finished.repaired:
             LOG.warning(f"frame {finished.number}: {finished.repaired} pixels were not finite, filled in")
         if finished.clamped:
             LOG.warning(f"frame {finished.number}: {finished.clamped} values too large for half, written as 65504")
         seconds = round(finished.seconds, 3)
         state, words = ("there", "was there") if finished.resumed else ("made", f"{seconds:.1f} s")
-        facts = {"file": finished.path.name, "seconds": seconds, "light_removed": finished.removed}
+        facts: dict[str, object] = {"file": finished.path.name, "seconds": seconds}
+        if not finished.resumed:
+            means.append((light, finished.mean))
+            facts |= {"mean": light, "light_removed": share}
         stages = sorted(finished.plan.stages) if finished.plan else None
         record.add(finished.number, state, **facts, stages=stages)
         record.write(timings, pixels=pixels, outliers=outliers, judged=[vars(finding) for finding in judged])
         message = f"frame {finished.number} {words}"
         progress.advance(message=message, frame=finished.number, seconds=seconds, path=str(finished.path))
     plan = merge(plans).decisions if plans else ()
-    record.write(timings, plan=[vars(decision) for decision in plan])
+    with_fireflies, without = np.mean(means, axis=0).tolist() if means else (None, None)
+    means_of_shot = {"with_fireflies": with_fireflies, "without": without}
+    record.write(timings, plan=[vars(decision) for decision in plan], mean=means_of_shot)
     for decision in plan:
         if job.neural or decision.stage not in NEURAL_STAGES:
             LOG.info(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")

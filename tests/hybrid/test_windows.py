@@ -8,6 +8,7 @@ import pytest
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
+from hybrid.cli import main
 from hybrid.estimates import OfFrames
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import read_exr
@@ -15,6 +16,7 @@ from hybrid.files.frames import open_shot
 from hybrid.pipeline import Denoised, denoise_frames
 from hybrid.plan import STAGES, Rules, plan_shot
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
+from hybrid.records import read_records
 from tests.scenes import Scene
 
 # Locked off: what is odd is odd by itself. Frame numbers 1001 to 1012; the odd one is 1009.
@@ -173,6 +175,20 @@ def test_what_fireflies_take_with_them_is_counted(tmp_path):
     np.testing.assert_array_less(estimated[14:27, 24:37], 3 * clean[14:27, 24:37].max())
     spread = picture(shot, 1009, Rules(off=frozenset({"fireflies", "outliers", "gate"})), OfFrames(lambda f: f.color))
     assert spread.max() > 100  # that is what is guarded against
+
+
+def test_the_mean_of_a_shot_with_and_without_fireflies_is_on_record(tmp_path):
+    folder = CALM.write(tmp_path / "in", edit=burnt)
+    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--frames", "1008-1010"]
+    assert main(words) == 0
+    ((_, record),) = read_records(tmp_path / "out")
+    shot = open_shot(folder, frames="1008-1010")
+    means = [float(shot.read(number).color.mean()) for number in shot.numbers]
+    assert record["mean"]["with_fireflies"] == pytest.approx(np.mean(means), rel=1e-4)  # pixels of float32 are summed
+    lost = 5000 / shot.read(1009).color[..., 0].size  # what else was there is a thousandth of it
+    assert means[1] * record["frames"]["1009"]["light_removed"] == pytest.approx(lost, rel=0.01)
+    kept = np.mean(means) - lost / 3
+    assert record["mean"]["without"] == pytest.approx(kept, rel=0.01)
 
 
 @pytest.mark.parametrize("samples", [16, 256, 4096])
