@@ -88,6 +88,16 @@ def test_an_option_of_one_name_says_the_same_in_every_command():
     assert differ <= SAID_BY_EACH | {"--estimate"}  # prepare has it "as for denoise"
 
 
+def test_an_option_of_one_name_stands_in_one_group_of_every_help():
+    groups: dict[str, set[str | None]] = {}
+    for command in typer.main.get_command(app).commands.values():
+        for parameter in command.params:
+            for option in parameter.opts if parameter.param_type_name == "option" else ():
+                groups.setdefault(option, set()).add(parameter.rich_help_panel)
+    assert None not in set.union(*groups.values())
+    assert {option for option, named in groups.items() if len(named) > 1} <= SAID_BY_EACH
+
+
 def test_inspect_as_json(shot_folder, capsys):
     code, out, _ = run(capsys, "inspect", shot_folder, "--json", "--no-stages", "warp")
     document = json.loads(out)
