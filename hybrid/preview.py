@@ -43,8 +43,15 @@ def check_preview(path: Path) -> None:
         check_movie(path)
 
 
-def check_sheet(path: Path) -> None:
-    """Refuse what `write_contact_sheet` could not write, before any work is done.
+def check_png(path: Path, what: str) -> None:
+    """Refuse, before any work is done, a picture that would not be what its name says.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG that is to be written.
+    what : str
+        What an error calls it.
 
     Raises
     ------
@@ -52,7 +59,7 @@ def check_sheet(path: Path) -> None:
         If the name does not end in .png.
     """
     if path.suffix.lower() != ".png":
-        raise ValueError(f"contact {path}: expected a name that ends in .png")
+        raise ValueError(f"{what} {path}: expected a name that ends in .png")
 
 
 def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = RATE) -> None:
@@ -102,11 +109,11 @@ def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
     Raises
     ------
     ValueError
-        As `check_sheet`.
+        As `check_png`.
     FileNotFoundError
         If a denoised frame is not there.
     """
-    check_sheet(path)
+    check_png(path, "contact")
     pairs = _Pairs(shot, output)
     count = min(len(shot.numbers), SHEET_FRAMES)
     chosen = [shot.numbers[round(i * (len(shot.numbers) - 1) / max(count - 1, 1))] for i in range(count)]

@@ -77,6 +77,7 @@ def compare(
         float | None,
         typer.Option(
             metavar="SPP",
+            min=1,
             help="per pixel of SHOT, where its files do not tell, as those of Cycles do",
             rich_help_panel=INPUT,
         ),

@@ -371,14 +371,15 @@ def _spare_inputs(
 ) -> None:
     """Refuse, before anything is made, to write over anything that is read, and what is no preview."""
     from hybrid.pipeline import check_written
-    from hybrid.preview import check_preview, check_sheet
+    from hybrid.preview import check_png, check_preview
 
     check_written(shot, output, sources, inputs, {**pictures, "log-file": log_file()})
     with usage():
         if (preview := pictures.get("preview")) is not None:
             check_preview(preview)
-        if (contact := pictures.get("contact")) is not None:
-            check_sheet(contact)
+        for what in ("contact", "breakdown"):
+            if (picture := pictures.get(what)) is not None:
+                check_png(picture, what)
 
 
 def _hand_out(context: typer.Context, given: Mapping[str, object], shot: Shot, scheduler: str, size: int) -> None:

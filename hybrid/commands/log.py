@@ -117,12 +117,12 @@ def start_log(
     OSError
         If it cannot be written to.
     """
-    end_log()
-    LOG.setLevel(logging.DEBUG if verbose else logging.INFO)
     handlers = [_on_stderr(form)]
     handlers[0].setLevel(logging.WARNING if quiet else logging.NOTSET)
     if file is not None:
         handlers.append(_into(file, form))
+    end_log()  # not before: what is wrong with the file is told as ever
+    LOG.setLevel(logging.DEBUG if verbose else logging.INFO)
     for handler in handlers:
         LOG.addHandler(handler)
 

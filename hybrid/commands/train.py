@@ -303,9 +303,9 @@ def train(
     ] = DEFAULTS.sampler.sets,
     seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = DEFAULTS.seed,
     device: DeviceOption = "auto",
-    threads: Annotated[int | None, typer.Option(help="of torch and numba", rich_help_panel=RESOURCES)] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="of torch and numba", rich_help_panel=RESOURCES)] = None,
     workers: Annotated[
-        int, typer.Option(help="processes that read clips", rich_help_panel=RESOURCES)
+        int, typer.Option(min=0, help="processes that read clips", rich_help_panel=RESOURCES)
     ] = DEFAULTS.workers,
     float32: Annotated[bool, typer.Option("--float32", help="no bfloat16", rich_help_panel=RESOURCES)] = False,
     compile: Annotated[

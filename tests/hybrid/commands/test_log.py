@@ -107,6 +107,11 @@ def test_errors_are_records_too(tmp_path, capsys):
     assert "no.####.exr" in document["message"]
 
 
+def test_a_log_file_that_cannot_be_written_is_an_error_as_any(tmp_path, capsys):
+    assert main(["status", str(tmp_path), "--log-file", str(tmp_path / "no" / "log")]) == 1
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'no' / 'log'}")
+
+
 def ravg(*arguments, **options):
     return [sys.executable, "-m", "hybrid.cli", *map(str, arguments)], {"cwd": ROOT, **options}
 
