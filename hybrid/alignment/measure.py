@@ -23,8 +23,8 @@ from nlm.gate import color_gate
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Frames are looked at this small: a mean of k×k pixels has a k-th of their noise, and costs a k²-th of their time. No
-# smaller than the whole frame below twice this.
+# Frames are looked at about this small: a mean of k×k pixels has a k-th of their noise, and a k²-th of their cost.
+# No smaller than the whole frame below twice this.
 SHORT_SIDE = 270
 # Where the noise is compared that stands still: enough pixels to tell a correlation of 0.02.
 CROP = 512
@@ -142,8 +142,8 @@ class SmallFrame:
 def shrink(frame: PreparedFrame) -> SmallFrame:
     """Reduce a frame for looking at it; its size decides by how much."""
     height, width = frame.irradiance.shape[:2]
-    factor = max(1, min(height, width) // SHORT_SIDE)
-    if factor == 1:
+    factor = round(min(height, width) / SHORT_SIDE)
+    if min(height, width) < 2 * SHORT_SIDE:
         return SmallFrame(1, frame.irradiance, frame.light, frame.albedo if frame.demodulated else None)
     irradiance = _means(frame.irradiance, factor)
     albedo, normal = (None if layer is None else _means(layer, factor) for layer in (frame.albedo, frame.normal))
@@ -397,7 +397,7 @@ def _middle(shape: tuple[int, int]) -> tuple[slice, slice]:
 
 def _high_pass(image: Array) -> Array:
     noise = image - cv2.blur(image, (5, 5))
-    limit = 3 * float(np.median(np.abs(noise)))
+    limit = 3 * float(np.median(np.abs(noise[::2, ::2])))  # of a quarter of the pixels, in a quarter of the time
     return np.asarray(np.clip(noise, -limit, limit), np.float32)
 
 
