@@ -719,8 +719,8 @@ def denoise_tile(
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.
     aovs : Tensor, optional
-        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; by a `RobustUNet`
-        averaged by confidence.
+        ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; a `RobustUNet`
+        has none.
 
     Returns
     -------
@@ -738,7 +738,7 @@ def denoise_tile(
     """
     filtered = filter_window(model, window, threshold)
     if isinstance(filtered, Picture):
-        return filtered.irradiance, filtered, None if aovs is None else filtered.apply(aovs)
+        return filtered.irradiance, filtered, None
     denoised = filtered.image(centre_of(cast(Tensor, window["color"]))).clamp_min(0)
     return denoised, filtered, None if aovs is None else filtered.apply(aovs)
 

@@ -18,7 +18,6 @@ from torch.nn import functional
 
 from network.blocks import RobustAverage
 from network.fused import HIDDEN
-from network.kernels import mean_of
 from network.trunk import (
     DECODERS,
     ENCODERS,
@@ -168,11 +167,6 @@ class Picture:
     irradiance: Tensor
     gathered: Tensor
     window: Mapping[str, Tensor]
-
-    def apply(self, layers: Tensor) -> Tensor:
-        """Average other layers of the window, ``(N, T, C, H, W)``, by confidence: ``(N, C, H, W)``."""
-        confidence = self.window["confidence"]
-        return mean_of(layers * confidence, confidence, layers[:, layers.shape[1] // 2])
 
     def parts(self) -> tuple[Tensor, Tensor]:
         """What each frame gives of the gathered picture, ``(N, T, 3, H, W)``, and its share, ``(N, T, 1, H, W)``."""

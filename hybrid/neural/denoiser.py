@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
-from hybrid.alignment.transfer import autoexposure, measure_exposure
+from hybrid.alignment.transfer import autoexposure, compress, measure_exposure
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.neural.tiling import Block, Borders, PadMode, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
@@ -27,7 +27,9 @@ from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import Picture, RobustUNet
+from nlm.average import average
 from nlm.gather import REACH, restore_mean
+from nlm.parts import is_part, split_light
 
 Array = NDArray[np.float32]
 
@@ -130,10 +132,13 @@ class Denoiser:
 
     def _run(self, aligned: AlignedWindow) -> Denoised:
         layers = self._layers(aligned)
-        irradiance, aovs, parts, gathered = self._run_tiles(aligned, layers)
+        irradiance, filtered, parts, gathered = self._run_tiles(aligned, layers)
         color = irradiance * aligned.modulation
-        if gathered is not None:
+        if gathered is None:
+            aovs = _apart(filtered, aligned)
+        else:
             color = restore_mean(color, gathered * aligned.modulation)
+            aovs = _averaged(aligned, color / aligned.modulation)
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
@@ -154,7 +159,7 @@ class Denoiser:
             for name, guide in (("albedo", aligned.albedo), ("normal", aligned.normal)):
                 if guide is not None:
                     layers[name] = aligned.mixed(guide)
-        if aligned.aovs:
+        if aligned.aovs and not self.takes_estimate:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
         return layers
 
@@ -235,14 +240,40 @@ class Denoiser:
         return tensor_of(pad(layer[:, *outer], self.model.multiple, borders, mode)).to(self._device)
 
 
-def _modulated(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
-    """The AOVs of a window apart again, light times the albedo it was divided by."""
-    aovs, start = {}, 0
-    for name, layer in aligned.aovs.items():
-        stop = start + layer.shape[-1]
-        light, start = filtered[..., start:stop], stop
+def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
+    """AOVs that lie side by side, (H, W, C), by name."""
+    edges = np.cumsum([layer.shape[-1] for layer in aligned.aovs.values()])[:-1]
+    return dict(zip(aligned.aovs, np.split(filtered, edges, axis=-1), strict=True)) if aligned.aovs else {}
+
+
+def _averaged(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
+    """The AOVs of a window averaged over time; those that are parts of the light add up to it if they did."""
+    centre, color = aligned.centre, aligned.color
+    means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
+    parts = [
+        name
+        for name, layer in aligned.aovs.items()
+        if name != ALPHA and is_part(layer[centre], means[name], color[centre], aligned.exposure)
+    ]
+    if parts:
+        whole = average(color, aligned.confidence)
+        light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
+        guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
+        moments = aligned.moments[:, : guide.shape[-1]]
+        split = split_light(
+            [means[name] for name in parts], whole, irradiance, guide, exposure=aligned.exposure, moments=moments
+        )
+        means |= dict(zip(parts, split, strict=True))
+    return means
+
+
+def _modulated(found: dict[str, Array], aligned: AlignedWindow) -> dict[str, Array]:
+    """AOVs as they were before they were divided by the albedo."""
+    aovs = {}
+    for name, light in found.items():
         if name == ALPHA:
-            aovs[name] = np.where(_solid(layer[aligned.centre]), layer[aligned.centre], light)
+            own = aligned.aovs[name][aligned.centre]
+            aovs[name] = np.where(_solid(own), own, light)
         elif light.shape[-1] == 3:
             aovs[name] = light * aligned.modulation
         else:

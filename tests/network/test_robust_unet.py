@@ -218,12 +218,10 @@ def test_bfloat16_is_close() -> None:
     assert float(rounded.mean() / exact.mean()) == pytest.approx(1, abs=3e-3)
 
 
-def test_without_guides_and_with_other_layers_it_runs() -> None:
+def test_without_guides_it_runs() -> None:
     window = make_window()
-    layers = torch.rand(1, 5, 2, 32, 48)
-    _, picture, aovs = denoise_tile(small(), window | {"albedo": None, "normal": None}, aovs=layers)
-    share = window["confidence"] / window["confidence"].sum(1, keepdim=True)
-    torch.testing.assert_close(aovs, (share * layers).sum(1), rtol=1e-4, atol=1e-5)
+    _, picture, aovs = denoise_tile(small(), window | {"albedo": None, "normal": None})
+    assert aovs is None
     parts, weights = picture.parts()
     torch.testing.assert_close(parts.sum(1), picture.gathered)
     torch.testing.assert_close(weights.sum(1), torch.ones_like(weights[:, 0]))
