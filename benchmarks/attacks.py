@@ -163,9 +163,10 @@ def row_15() -> Cases:
         "two view layers, then one alone",
         partial(as_fresh, [], ["--layer", "color=Fog.Combined"], nothing, edit=two_layers),
     )
+    kernels = ["denoise", "--preset", "tkpcn"]
+    yield "another threshold", partial(as_fresh, [], ["--threshold", "0.3"], nothing, command=kernels)
     network = ["denoise", "--estimate", "nlm", "--weights", "w.safetensors"]
     for name, before, after, change in (
-        ("another threshold", [], ["--threshold", "0.3"], nothing),
         ("another precision", ["--precision", "bfloat16"], ["--precision", "float32"], nothing),
         ("a layer denoised along", [], ["--aov", "ViewLayer.Denoising Albedo"], nothing),
         ("two passes", [], ["--passes", "2"], nothing),

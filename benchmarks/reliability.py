@@ -1089,7 +1089,9 @@ def no_library(estimate: str, folder: Path) -> str | None:
     done = alone(WITHOUT_LIBRARY, *words)
     if estimate != "auto":
         return done.refused
-    return done.failed or (None if "nlm" in done.said else "it does not say what it took")
+    return done.failed or (
+        None if re.search(r"estimates: (nlm|bundled)\b", done.said) else "it does not say what it took"
+    )
 
 
 def row_12() -> Cases:
