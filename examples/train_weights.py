@@ -1,13 +1,13 @@
-"""How the weights that ship were made: render shots, make clips of them, train.
+"""The weights that ship, and a training from there: render shots, make clips of them, train.
 
-    python examples/train_weights.py SCENES OUT --blender-python blender/bin/python
+    python examples/train_weights.py OUT                                  # the three presets before any training
+    python examples/train_weights.py OUT --scenes SCENES --blender-python blender/bin/python
 
-SCENES holds the .blend files named below; what is added to them and where the camera stands follows from the table, so
-the same shots come out again; 32 random shots are `ravg simulate random`, seeds from 3000 on. None of the scenes
-that ravg is judged on (contemporary_bathroom, breakfast_room, modern_hall) is among them. Needs pyoidn. Rendering takes
-four hours of one core, the clips half an hour, both resumable shot by shot; the trainings an hour and a half. The
-weights that ship had four shots more, of the same scenes, and partly other steps (their cards): the recipe is theirs,
-the numbers will differ.
+What ships is what the first line writes: the final stage on OIDN's weights, read from the installed pyoidn. The second
+line trains it. SCENES holds the .blend files named below; what is added to them and where the camera stands follows
+from the table, so the same shots come out again; 32 random shots are `ravg simulate random`, seeds from 3000 on. None
+of the scenes that ravg is judged on (contemporary_bathroom, breakfast_room, modern_hall) is among them. Rendering
+takes four hours of one core, the clips half an hour, both resumable shot by shot.
 """
 
 from __future__ import annotations
@@ -17,6 +17,12 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from network.checkpoint import save_model
+from network.models import PRESETS as ALL
+from network.robust_unet import start_from_oidn
 
 HERE = Path(__file__).parent
 
@@ -59,11 +65,17 @@ PRESETS = "fast", "balanced", "quality"
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--scenes", type=Path, help="train, on shots of these")
     parser.add_argument("--blender-python", default=sys.executable, help="a Python that has bpy")
     parser.add_argument("--minutes", type=float, default=27, help="of training, for each preset")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    for preset in PRESETS:
+        model = start_from_oidn(ALL[preset]())
+        save_model(options.out / f"{preset}.safetensors", model, {"start": "OIDN 2.5.1, nothing trained"})
+    if options.scenes is None:
+        return 0
     ravg = [sys.executable, "-m", "hybrid.cli"]
 
     def run(*words: object) -> None:
@@ -81,17 +93,13 @@ def main() -> int:
     run(*ravg, "simulate", "random", "-o", options.out / "random", *RANDOM, "--python", options.blender_python)
     folders += sorted((options.out / "random").iterdir())
     # Whole frames, of which training takes crops.
-    for estimate in ("oidn-clean", "oidn-fast", "nlm"):
-        clips = options.out / "clips" / estimate
-        run(*ravg, "prepare", *folders, "-o", clips, "--tile", 0, "--reference", "--estimate", estimate)
-    common = ["--loss", "display", "--whole", 6, "--batch", 1, "--clip", 0.1, "--ema", 0.997]
-    clips, weights = options.out / "clips", {name: options.out / f"{name}.safetensors" for name in PRESETS}
+    clips = options.out / "clips"
+    run(*ravg, "prepare", *folders, "-o", clips, "--tile", 0, "--reference", "--estimate", "oidn-fast")
+    schedule = ["--init", "oidn", "--trunk-rate", 0, "--minutes", options.minutes, "--rate", 1e-4, "--batch", 1]
+    further = ["--loss", "display", "--clip", 0.1, "--ema", 0.997, "--drop-frames", 0.3]
     for preset in PRESETS:
-        schedule = ["--minutes", options.minutes, "--rate", 6e-4]
-        run(*ravg, "train", clips, "-o", weights[preset], "--preset", preset, *schedule, *common)
-    # quality goes on beside the estimates that it is meant for.
-    further = ["--init", weights["quality"], "--minutes", options.minutes / 2, "--rate", 4e-4]
-    run(*ravg, "train", clips / "oidn-clean", "-o", options.out / "quality_clean.safetensors", *further, *common)
+        out = options.out / f"{preset}.trained.safetensors"
+        run(*ravg, "train", clips, "-o", out, "--preset", preset, *schedule, *further)
     return 0
 
 

@@ -323,7 +323,8 @@ def denoise(
         "threshold": threshold,
         "breakdown": breakdown is not None,
         "precision": denoiser.precision,
-        "weights": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        "weights": _digest(path),
+        **({"bundled": _digest(neural.shipped_weights("fast"))} if source.name == "bundled" else {}),
         "device": {"network": denoiser.device, **({"oidn": source.device} if source.device else {})},
     }
     job = Job(
@@ -360,6 +361,11 @@ def denoise(
         else:
             LOG.info("no weights to print: all frames were finished already")
         LOG.info(f"wrote {breakdown}")
+
+
+def _digest(path: Path) -> str:
+    """What tells a file of weights from another."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _spare_inputs(
