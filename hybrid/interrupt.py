@@ -44,15 +44,18 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     theirs.setblocking(False)
     left = threading.Event()
 
+    def say() -> None:
+        from hybrid.files.exr import hold_library
+
+        with hold_library(PATIENCE):  # or the report would go where the library's messages do
+            report()
+            sys.stderr.flush()
+
     def watch() -> None:
         ours.recv(1)
         if not left.wait(PATIENCE):
             remove_unfinished()
-            from hybrid.files.exr import hold_library
-
-            hold_library(PATIENCE)  # or the report would go where the library's messages do
-            report()
-            sys.stderr.flush()
+            say()
             os._exit(INTERRUPTED)
 
     before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -66,7 +69,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
         if not is_interrupt(error):
             raise
         left.set()
-        report()
+        say()
         raise KeyboardInterrupt from None
     finally:
         left.set()

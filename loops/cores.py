@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from itertools import pairwise
 
@@ -41,8 +41,9 @@ def on_all_cores(loop: Callable[..., None], count: int, *arguments: object) -> N
     try:
         loop(*own, *arguments)
     finally:
-        for other in running:
-            other.result()
+        wait(running)
+    for other in running:
+        other.result()
 
 
 @lru_cache(maxsize=1)

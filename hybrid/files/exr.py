@@ -409,15 +409,21 @@ class _Listener:
 _LIBRARY_LOCK = threading.Lock()
 
 
-def hold_library(seconds: float) -> None:
-    """Let nothing be read or written from now on, once what is under way has ended: descriptor 2 is the process's own.
+@contextmanager
+def hold_library(seconds: float) -> Iterator[None]:
+    """Let nothing be read or written within, once what is under way has ended: descriptor 2 is the process's own.
 
     Parameters
     ----------
     seconds : float
         How long to wait for that.
     """
-    _LIBRARY_LOCK.acquire(timeout=seconds)
+    held = _LIBRARY_LOCK.acquire(timeout=seconds)
+    try:
+        yield
+    finally:
+        if held:
+            _LIBRARY_LOCK.release()
 
 
 @contextmanager
