@@ -14,6 +14,7 @@ Mask = NDArray[np.bool_]
 
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)
+_AROUND_SIZE = (15, 15)
 # q = _SHARE · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is
 # noise; 0.004, one step of 8 bits, is what the estimates themselves differ by where nothing is noisy.
 _SHARE, _FLOOR = 0.3, 0.004
@@ -47,7 +48,11 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
     Notes
     -----
     exp(−(m/q)²), q = 0.3 s + 0.004. All in x / (x + exposure): m is the RMS over channels of the 9×9 mean of the
-    difference from the centre, s the 15×15 RMS of noisy − centre. Non-finite values get weight 0 and do not spread.
+    difference from the centre, or the 15×15 RMS of that, whichever is greater; s the 15×15 RMS of noisy − centre.
+    Non-finite values get weight 0 and do not spread.
+
+    Between a shadow that has come and one that has gone there is a line on which the mean difference is 0. Without the
+    RMS of what is around, averages ran along such lines: 4 dB on a shot of moving shadows, nothing elsewhere.
 
     A pixel's own difference says nothing beside: it is the error of the two estimates, and to weigh by it is to choose
     the frames whose errors are the centre's. Without it averages are up to 2 dB steadier, and gathered frames
@@ -75,6 +80,7 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
             continue
         on_all_cores(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
+        np.maximum(mean, cv2.blur(mean, _AROUND_SIZE), out=mean)
         mean *= -rate
         np.multiply(np.exp(mean, out=mean), both, out=weight[t])
     return weight

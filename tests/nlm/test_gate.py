@@ -76,3 +76,16 @@ def test_hard_values_do_not_spread(rng):
 def test_arguments_are_checked(name, arguments):
     with pytest.raises(ValueError, match=f"^{name}:"):
         color_gate(*arguments)
+
+
+def test_a_line_between_light_that_came_and_light_that_went_is_no_way_through() -> None:
+    """On it the mean difference is 0: stripes of shadow that move by half their period."""
+    _, x = np.mgrid[:48, :96].astype(np.float32)
+    stripes = [np.where((x + shift) % 32 < 16, 1.0, 0.3) for shift in (0, 16)]
+    there, here = (np.repeat(image[..., None], 3, axis=-1).astype(np.float32) for image in stripes)
+    window = np.stack([there, here, here])
+    noisy = here * np.random.default_rng(0).gamma(4, 0.25, here.shape).astype(np.float32)
+    weight = color_gate(window, noisy, 0.5)
+    assert weight[0][:, 8:-8].max() < 0.1
+    assert (weight[1] == 1).all()
+    np.testing.assert_allclose(weight[2], 1)
