@@ -187,6 +187,7 @@ def test_it_plays_all_frames_and_stops(page):
     page.wait_for_function(f"() => window.seen.size === {FRAMES}", timeout=30_000)
     assert page.get_attribute("#play", "aria-label") == "Stop"
     page.click("#play")
+    page.wait_for_timeout(200)  # the frame that was its turn when it was stopped is painted after
     stopped = page.text_content("#number")
     page.wait_for_timeout(200)
     assert page.text_content("#number") == stopped
