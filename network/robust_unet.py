@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import log
 from typing import cast
 
@@ -24,6 +25,7 @@ from network.trunk import (
     Convolutions,
     Trunk,
     TrunkConfig,
+    in_strips,
     load_oidn,
     pu_forward,
     pu_inverse,
@@ -35,8 +37,6 @@ from network.trunk import (
 KNOWN = 5
 #: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
 RESIDUAL_LIMIT = 6.0
-#: Rows of all frames that are worked on at a time.
-ROWS = 64
 #: Weight of the average in an RA block before any training.
 BLEND = 0.8
 #: Share of the average of estimates in the picture before any training, by the trunk's size: the better a trunk's
@@ -246,17 +246,18 @@ class RobustUNet(nn.Module):
         return self.finish(self.meet(frames, still, known), still)
 
     def meet(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
-        """Run what is before the first ReLU. A row depends on those beside it alone.
+        """Run the finest scale of the encoder, in whose midst the frames meet. A row depends on two on each side.
 
         Parameters
         ----------
         frames, still, known : Tensor
-            As for `forward`, of any height.
+            As for `forward`, of any even height.
 
         Returns
         -------
         Tensor
-            Features ``(T·N, width, H, W)``, or ``(N, width, H, W)`` where all frames have met.
+            What enters the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all
+            frames have met.
         """
         count, last = self.config.frames, max(self.config.ra_scales, default=-1)
         first = self.trunk.first
@@ -268,7 +269,9 @@ class RobustUNet(nn.Module):
         x = torch.cat(parts, 1).contiguous(memory_format=torch.channels_last)
         weight = torch.cat([first.weight, self.known.weight], 1).contiguous(memory_format=torch.channels_last)
         x = functional.conv2d(x, weight, first.bias, padding=1)
-        return self.average["0"](x, count, last == 0) if "0" in self.average else x
+        if "0" in self.average:
+            x = self.average["0"](x, count, last == 0)
+        return functional.max_pool2d(cast(Convolutions, self.trunk.encoder[0]).after_first(x), 2)
 
     def finish(self, x: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
         """Run all that follows `meet`, as for `forward`.
@@ -286,19 +289,27 @@ class RobustUNet(nn.Module):
             As of `forward`.
         """
         trunk, count, last = self.trunk, self.config.frames, max(self.config.ra_scales, default=-1)
-        x = cast(Convolutions, trunk.encoder[0]).after_first(x)
-        skips = [trunk.skip_of(still)]
-        for scale, stage in enumerate(trunk.encoder):
-            if scale:
-                x = functional.max_pool2d(x, 2)
+        skips, coarsest = [still], len(trunk.encoder) - 1
+        for scale in range(1, coarsest + 1):
+            if scale < coarsest:
                 # What enters a scale is handed on to the decoder: the centre's, which has the others' in it.
                 skips.append(x.chunk(count)[count // 2] if scale <= last else x)
-                x = stage(x)
-            if scale and str(scale) in self.average:
-                x = self.average[str(scale)](x, count, last == scale)
-        x = trunk.decode(x, skips[: len(trunk.decoder)])
-        keep = torch.sigmoid(self.keep(x.to(self.keep.weight.dtype)).float())
-        return trunk.finish(x), keep
+            (x,) = in_strips(partial(self._encode, scale), 2, x)
+
+        def finish(features: Tensor) -> tuple[Tensor, Tensor]:
+            keep = torch.sigmoid(self.keep(features.to(self.keep.weight.dtype)).float())
+            return trunk.finish(features), keep
+
+        picture, keep = trunk.decode(x, skips, finish)
+        return picture, keep
+
+    def _encode(self, scale: int, x: Tensor) -> list[Tensor]:
+        """Run a scale of the encoder but the finest, and halve what comes out, but of the coarsest."""
+        last = max(self.config.ra_scales, default=-1)
+        x = self.trunk.encoder[scale](x)
+        if str(scale) in self.average:
+            x = self.average[str(scale)](x, self.config.frames, last == scale)
+        return [x if scale == len(self.trunk.encoder) - 1 else functional.max_pool2d(x, 2)]
 
 
 def gather_and_denoise(
@@ -328,8 +339,8 @@ def gather_and_denoise(
 
     Notes
     -----
-    Without gradients the frames are realised, and meet, some rows at a time: no more of five frames' features is ever
-    there, and what is there fits the caches of a processor.
+    Without gradients all that is done at full size is done some rows at a time (`network.trunk.in_strips`): no more of
+    five frames' features is ever there, and what is there fits the caches of a processor.
     """
     missing = torch.full_like(window["modulation"], 0.5)
     guides = torch.cat(
@@ -339,27 +350,25 @@ def gather_and_denoise(
         ],
         1,
     )
+
+    def enter(
+        estimate: Tensor, residual: Tensor, confidence: Tensor, modulation: Tensor, guides: Tensor
+    ) -> list[Tensor]:
+        found = realise(estimate, residual, confidence, modulation, window["exposure"], window["gain"])
+        still = torch.cat([found.picture, guides], 1)
+        return [model.meet(found.frames, still, _known(found)), still, found.parts.sum(1), found.estimate]
+
     if torch.is_grad_enabled():
         found = realise(**window)
         still = torch.cat([found.picture, guides], 1)
         seen, keep = (model if run is None else run)(found.frames, still, _known(found))
-        gathered, average, scale = found.parts.sum(1), found.estimate, found.scale
+        gathered, average = found.parts.sum(1), found.estimate
     else:
-        height, strips = guides.shape[2], []
-        for top in range(0, height, ROWS):
-            stop = min(top + ROWS, height)
-            first, last = max(top - 1, 0), min(stop + 1, height)  # the first convolution sees a row around
-            here = {name: layer if layer.ndim < 4 else layer[..., first:last, :] for name, layer in window.items()}
-            found = realise(**here)
-            still = torch.cat([found.picture, guides[:, :, first:last]], 1)
-            features = model.meet(found.frames, still, _known(found))
-            own = slice(top - first, stop - first)
-            of_rows = features, still, found.parts.sum(1), found.estimate, found.scale
-            strips.append([layer[:, :, own] for layer in of_rows])
-        features, still, gathered, average, scale = (torch.cat(layers, 2) for layers in zip(*strips, strict=True))
-        seen, keep = model.finish(features.contiguous(memory_format=torch.channels_last), still)
+        layers = [window[name] for name in ("estimate", "residual", "confidence", "modulation")]
+        features, still, gathered, average = in_strips(enter, 2, *layers, guides)
+        seen, keep = model.finish(features, still)
     # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
-    light = pu_inverse(seen.float().clamp_min(0)) / scale
+    light = pu_inverse(seen.float().clamp_min(0)) / (window["modulation"] * window["gain"].view(-1, 1, 1, 1))
     return Picture(light + keep * (average.clamp_min(0) - light), gathered, window)
 
 

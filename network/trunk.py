@@ -16,8 +16,9 @@ import hashlib
 import importlib.util
 import mmap
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from math import log, prod
 from pathlib import Path
@@ -56,6 +57,9 @@ OIDN_WEIGHTS = {
     "rt_nrm_large": (7684615, "8ac7705ec5ac303116b40ad2f0880cd741ed1f4280828bf2f18f7635c3377257"),
 }
 
+
+#: Rows of the finest layer that are worked on at a time, even: their features fit the caches of a processor.
+ROWS = 64
 
 # How a TZA file begins: magic and version.
 _TZA = struct.pack("<HBB", 0x41D7, 2, 0)
@@ -133,8 +137,9 @@ class Trunk(nn.Module):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"x: expected a {name} that is a multiple of {self.multiple}, got {length}")
         bottleneck, skips = self.encode(x.to(self.first.weight.dtype, memory_format=torch.channels_last))
-        skips[0] = self.skip_of(x)
-        return self.finish(self.decode(bottleneck, skips))
+        skips[0] = x
+        (picture,) = self.decode(bottleneck, skips, lambda features: [self.finish(features)])
+        return picture
 
     def skip_of(self, x: Tensor) -> Tensor:
         """What enters the last scale of the decoder of a picture, ``(N, C, H, W)``: itself.
@@ -164,10 +169,12 @@ class Trunk(nn.Module):
         skips = []
         for stage in self.encoder[:-1]:
             skips.append(x)
-            x = functional.max_pool2d(stage(x), 2)
+            (x,) = in_strips(partial(_convolve_and_halve, cast(Convolutions, stage)), 2, x)
         return self.encoder[-1](x), skips
 
-    def decode(self, x: Tensor, skips: Sequence[Tensor]) -> Tensor:
+    def decode(
+        self, x: Tensor, skips: Sequence[Tensor], finish: Callable[[Tensor], Sequence[Tensor]]
+    ) -> Sequence[Tensor]:
         """Put a picture together again.
 
         Parameters
@@ -175,17 +182,20 @@ class Trunk(nn.Module):
         x : Tensor
             Features of the coarsest scale, from `encode`.
         skips : sequence of Tensor
-            What entered the finer ones, from `encode`.
+            What entered the finer ones, from `encode`; the first is the picture, not rounded.
+        finish : callable
+            From the ``(N, width, H, W)`` features of the finest scale, or some rows of them, to what is asked for,
+            ``(N, ., H, W)``; it may look one row around.
 
         Returns
         -------
-        Tensor
-            ``(N, width, H, W)`` features of the finest scale.
+        sequence of Tensor
+            What it gives.
         """
-        for stage, skip in zip(self.decoder, reversed(skips), strict=True):
-            x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
-            x = stage(torch.cat([x, skip], 1))
-        return x
+        *coarse, (finest, picture) = zip(self.decoder, reversed(skips), strict=True)
+        for stage, skip in coarse:
+            (x,) = in_strips(lambda x, skip, stage=stage: [stage(_join(x, skip))], 2, x, skip)
+        return in_strips(lambda x, skip: finish(finest(_join(x, self.skip_of(skip)))), 3, x, picture)
 
     def finish(self, x: Tensor) -> Tensor:
         """The picture, ``(N, 3, H, W)``, of the features of the finest scale; not rounded by any autocast."""
@@ -226,6 +236,65 @@ class Convolutions(nn.Sequential):
                 weights = layer.weight, layer.bias
                 x = torch.ops.mkldnn._convolution_pointwise(x, *weights, one, one, one, 1, "relu", [], "")
         return x
+
+
+def in_strips(run: Callable[..., Sequence[Tensor]], reach: int, *layers: Tensor) -> list[Tensor]:
+    """Run what sees a few rows around each on one strip of rows after the other; with gradients on all at once.
+
+    A strip's features fit the caches of a processor, where a frame's do not: convolutions of 32 channels take 0.6 of
+    the time. And no more than a strip of them is ever there.
+
+    Parameters
+    ----------
+    run : callable
+        From layers to layers.
+    reach : int
+        How many rows around each it sees, of the finest layer.
+    *layers : Tensor
+        ``(..., H, W)``; of coarser ones H is half as much, a quarter, ...
+
+    Returns
+    -------
+    list of Tensor
+        What it gives of all rows.
+    """
+    height = max(layer.shape[-2] for layer in layers)
+    if torch.is_grad_enabled() or height <= ROWS:
+        return list(run(*layers))
+    reach += reach % 2  # where the strip of a layer of half the size begins as well
+    whole: list[Tensor] = []
+    for top in range(0, height, ROWS):
+        stop = min(top + ROWS, height)
+        first, last = max(top - reach, 0), min(stop + reach, height)
+        parts = run(*(_rows(layer, first, last, height) for layer in layers))
+        if not whole:
+            whole = [_empty_like(part, height * part.shape[-2] // (last - first)) for part in parts]
+        for result, part in zip(whole, parts, strict=True):
+            _rows(result, top, stop, height).copy_(_rows(part, top - first, stop - first, last - first))
+    return whole
+
+
+def _rows(layer: Tensor, first: int, last: int, height: int) -> Tensor:
+    """Of a layer the rows that are these of one of that height."""
+    return layer[..., first * layer.shape[-2] // height : last * layer.shape[-2] // height, :]
+
+
+def _empty_like(part: Tensor, height: int) -> Tensor:
+    """A layer of another height, laid out as this one."""
+    last = part.is_contiguous(memory_format=torch.channels_last)
+    layout = torch.channels_last if last else torch.contiguous_format
+    return torch.empty(
+        *part.shape[:-2], height, part.shape[-1], dtype=part.dtype, device=part.device, memory_format=layout
+    )
+
+
+def _convolve_and_halve(stage: Convolutions, x: Tensor) -> list[Tensor]:
+    return [functional.max_pool2d(stage(x), 2)]
+
+
+def _join(x: Tensor, skip: Tensor) -> Tensor:
+    """Features at twice their size, and what was handed on."""
+    return torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1)
 
 
 # Where oneDNN is built in; elsewhere the two run one after the other.

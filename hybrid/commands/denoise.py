@@ -233,7 +233,7 @@ def denoise(
         typer.Option(
             min=16,
             metavar="N",
-            help="pixels on a side that the network sees at once; without: 640 or 1088, with --max-memory 384",
+            help="pixels on a side that the network sees at once; without: 640 or 2048, with --max-memory 384",
             rich_help_panel=RESOURCES,
         ),
     ] = None,

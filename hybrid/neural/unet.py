@@ -22,9 +22,8 @@ Array = NDArray[np.float32]
 
 # Pixels of context around a tile: nothing farther away changes a picture, with any of the networks.
 HALO = 112
-# Side of a tile, so that memory does not grow with the frame. 1080 and 2160 rows are one and two tiles: 1024 left
-# strips of a few rows, each with its context, a sixth more to compute.
-TILE = 1088
+# Side of a tile, so that memory does not grow with the frame: 1920×1080 is one, 3840×2160 are four.
+TILE = 2048
 
 
 def denoise_unet(

@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network import robust_unet
+from network import trunk
 from network.models import denoise_tile, filter_window, for_inference
 from network.robust_unet import KEEP, RobustUNet, RobustUNetConfig, realise, start_from_oidn
 from network.trunk import find_library, load_oidn, pu_forward, pu_inverse
@@ -190,7 +190,7 @@ def test_the_network_is_told_what_the_gather_knows() -> None:
     """Average, confidence and samples, in this order: weights are trained for it."""
     window, model = make_window(), small()
     given: list[torch.Tensor] = []
-    model.meet = lambda frames, still, known: given.append(known) or torch.zeros(1, 32, 32, 48)  # type: ignore[method-assign]
+    model.meet = lambda frames, still, known: given.append(known) or torch.zeros(1, 32, 16, 24)  # type: ignore[method-assign]
     denoise_tile(model, window)
     found = realised(window)
     torch.testing.assert_close(given[0][:, 3, :3], found.average)
@@ -203,7 +203,7 @@ def test_strips_and_the_whole_are_one_picture(monkeypatch: pytest.MonkeyPatch) -
     window, model = make_window(), small(scales=(0, 1))
     with torch.enable_grad():
         whole = filter_window(model, window)
-    monkeypatch.setattr(robust_unet, "ROWS", 10)
+    monkeypatch.setattr(trunk, "ROWS", 10)
     strips = denoise_tile(model, window)[1]
     torch.testing.assert_close(strips.irradiance, whole.irradiance, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(strips.gathered, whole.gathered)
