@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import product
@@ -109,6 +109,8 @@ class Choice:
         What was tried on all patches, best first.
     unrelated : tuple of int
         Indices of pairs that show something else in each frame, as at a cut. They are not asked, unless all are such.
+    by_surfaces : bool
+        Whether surfaces have decided, and not light; all shares are then those of what surfaces show.
     """
 
     convention: MotionConvention | None
@@ -118,6 +120,7 @@ class Choice:
     open: tuple[str, ...]
     trials: tuple[Trial, ...]
     unrelated: tuple[int, ...] = ()
+    by_surfaces: bool = False
 
     @property
     def certain(self) -> bool:
@@ -125,7 +128,12 @@ class Choice:
         return not self.open and self.still > LEAST and self.unexplained <= max(GOOD * self.still, LEAST)
 
 
-def choose_convention(pairs: Sequence[Patches], assumed: MotionConvention, settled: Collection[str] = PARTS) -> Choice:
+def choose_convention(
+    pairs: Sequence[Patches],
+    assumed: MotionConvention,
+    settled: Collection[str] = PARTS,
+    surfaces: Callable[[], Sequence[Patches]] = tuple,
+) -> Choice:
     """Find the reading of motion vectors that explains the pictures.
 
     Parameters
@@ -136,12 +144,14 @@ def choose_convention(pairs: Sequence[Patches], assumed: MotionConvention, settl
         What is taken where the pictures cannot tell.
     settled : collection of str
         The parts of it that are known. They are tried otherwise only if they explain little.
+    surfaces : callable
+        Gives such pairs of what does not depend on light, an albedo say. Asked only where light leaves a doubt.
 
     Returns
     -------
     Choice
-        `convention` is None if vectors are clearly worse than no motion, or explain less than half of what a flow found
-        in the pictures explains.
+        `convention` is None if surfaces do not confirm the vectors, and these are clearly worse than no motion or
+        explain less than half of what a flow found in the pictures explains.
 
     Raises
     ------
@@ -154,34 +164,29 @@ def choose_convention(pairs: Sequence[Patches], assumed: MotionConvention, settl
     neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1, (m/2q)²)
     less what noise alone gives; patches that leave the picture say nothing. One reading is clearly better than another
     if the mean difference, patch by patch, is three times its standard error.
+
+    Where shadows move, light is explained by no vectors, and best by a flow that follows them. Surfaces confirm a
+    reading that leaves less than a quarter of what one pixel more or less would, or that is clearly better than no
+    motion and explains three quarters of what a flow found in the surfaces does.
     """
     if not pairs:
         raise ValueError("pairs is empty, expected at least one")
     unrelated = tuple(index for index, pair in enumerate(pairs) if pair.unrelated)
-    related = [pair for index, pair in enumerate(pairs) if index not in unrelated]
-    trials, settled = _Trials(related or pairs), frozenset(settled)
+    trials, settled = _Trials(_related(pairs)), frozenset(settled)
     chosen = trials.best(assumed, settled)
-    harms = trials.clearly_better(None, chosen)
-    if settled and (harms or not trials.good(chosen)):
-        other = trials.best(assumed, frozenset())
-        if trials.overrules(other, chosen):
-            chosen, harms = other, trials.clearly_better(None, other)
-    believed, found = not harms, None
+    if (trials.clearly_better(None, chosen) or not trials.good(chosen)) and (shown := surfaces()):
+        of_surfaces = _Trials(_related(shown))
+        reading = of_surfaces.read(assumed, settled)
+        if of_surfaces.confirm(reading):
+            return of_surfaces.choice(reading, settled, unrelated=unrelated, by_surfaces=True)
+    chosen = trials.read(assumed, settled)
+    believed, found = not trials.clearly_better(None, chosen), None
     if believed and not trials.good(chosen):
         # A change of light is explained by no motion. Vectors are wrong where a search explains what they do not.
         found = trials.search()
-        possible = trials.left(None) - found
-        gained = trials.left(None) - trials.left(chosen)
-        believed = gained >= WORTH * possible or possible <= WORTH * trials.left(None)
-    return Choice(
-        convention=chosen if believed else None,
-        unexplained=trials.left(chosen),
-        still=trials.left(None),
-        found=found,
-        open=trials.open_parts(chosen, settled) if believed else (),
-        trials=trials.table(),
-        unrelated=unrelated,
-    )
+        believed = trials.worth(chosen, WORTH) or found >= (1 - WORTH) * trials.left(None)
+    choice = trials.choice(chosen, settled, found=found, unrelated=unrelated)
+    return choice if believed else replace(choice, convention=None, open=())
 
 
 ONE_PIXEL = np.ones(2, np.float32)
@@ -262,6 +267,16 @@ class Patches:
         left = _mean(self.found, self.still) - float(np.mean(self.expected))
         return left > (1 - WORTH) * changes
 
+    @cached_property
+    def one_off(self) -> float:
+        """Share of the picture in which it would show if everything were one pixel off: what structure there is."""
+        steps = np.zeros((len(self.rows) * (2 * self.radius + 1), 2 * self.radius + 1, 2), np.float32)
+        costs = []
+        for axis in (0, 1):
+            steps[:] = np.eye(2)[axis]
+            costs.append(self._compared(self.pictures[1], self.pictures[1], steps, self.all, ONE_PIXEL))
+        return float(np.nanmean(costs))
+
     def length(self, convention: MotionConvention) -> float:
         """Ninth decile of the lengths of the vectors, pixels; 0 without any."""
         unit = np.array(convention.factors(self.resolution), np.float32)
@@ -281,8 +296,12 @@ class Patches:
         return np.asarray(layer[rows, columns].reshape(-1, len(reach), layer.shape[2]))
 
     def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        return self._compared(self.pictures[centre], self.pictures[1 - centre], flow, at, unit)
+
+    def _compared(
+        self, here: np.ndarray, there: np.ndarray, flow: np.ndarray, at: np.ndarray, unit: np.ndarray
+    ) -> np.ndarray:
         difference = np.empty(len(at), np.float32)
-        here, there = self.pictures[centre], self.pictures[1 - centre]
         _compare(here, there, flow, unit, self.rows[at], self.columns[at], self.radius, difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
@@ -315,6 +334,11 @@ def _compare(
                     total += fy * ((one - fx) * other[y1, x0] + fx * other[y1, x1])
                     count += 1
         difference[p] = total / count if 2 * count >= size * size else np.nan
+
+
+def _related(pairs: Sequence[Patches]) -> Sequence[Patches]:
+    """Those that do not show something else in each frame; all, if all do."""
+    return [pair for pair in pairs if not pair.unrelated] or pairs
 
 
 class _Trials:
@@ -361,6 +385,28 @@ class _Trials:
         clearly = self.clearly_better(other, stated) and self.clearly_better(other, None)
         gain, stated_gain = (self.left(None) - self.left(reading) for reading in (other, stated))
         return clearly and (self.left(other) <= OVERRULES * self.left(stated) or stated_gain <= OVERRULES * gain)
+
+    def confirm(self, reading: MotionConvention) -> bool:
+        """Whether surfaces, which light does not change, show that a reading is right."""
+        one_off = float(np.mean([pair.one_off for pair in self.pairs]))
+        if one_off <= LEAST:
+            return False
+        if self.left(reading) <= GOOD * one_off:
+            return True
+        return self.clearly_better(reading, None) and self.worth(reading, 1 - GOOD)
+
+    def worth(self, reading: MotionConvention, share: float) -> bool:
+        """Whether a reading explains this share of what a search does."""
+        return self.left(None) - self.left(reading) >= share * (self.left(None) - self.search())
+
+    def read(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
+        """The best reading that agrees with what is settled, or one that overrules it."""
+        chosen = self.best(assumed, settled)
+        if settled and (self.clearly_better(None, chosen) or not self.good(chosen)):
+            other = self.best(assumed, frozenset())
+            if self.overrules(other, chosen):
+                return other
+        return chosen
 
     def best(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
         """The reading that leaves least, or one that is preferred to it and not clearly worse."""
@@ -432,6 +478,27 @@ class _Trials:
         equals = [r for r in others if not self.clearly_better(chosen, r)]
         differ = {part for r in equals for part in PARTS if getattr(r, part) != getattr(chosen, part)}
         return tuple(part for part in PARTS if part in differ - settled)
+
+    def choice(
+        self,
+        chosen: MotionConvention,
+        settled: frozenset[str],
+        *,
+        found: float | None = None,
+        unrelated: tuple[int, ...],
+        by_surfaces: bool = False,
+    ) -> Choice:
+        """The choice of a reading, with what it and the others leave."""
+        return Choice(
+            convention=chosen,
+            unexplained=self.left(chosen),
+            still=self.left(None),
+            found=found,
+            open=self.open_parts(chosen, settled),
+            trials=self.table(),
+            unrelated=unrelated,
+            by_surfaces=by_surfaces,
+        )
 
     def table(self) -> tuple[Trial, ...]:
         """Every reading that was tried on all patches, best first."""

@@ -6,9 +6,10 @@ convention, guides of another frame. What does not make sense is left out, and a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -206,27 +207,56 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     evidence = _Evidence(layers)
     if not pairs:
         evidence.add(shot.read(shot.available[0]))
-        return _judge(evidence, layers, [])
-    patches: list[Patches] = []
+        return _judge(evidence, layers, [], lambda roles: [])
+    light: list[Patches] = []
+    surfaces: list[Patches] = []
+
+    def look_at_surfaces(earlier: Frame, later: Frame, roles: Collection[str]) -> list[Patches]:
+        surfaces.extend(Patches(pair) for pair in _surface_pairs(earlier, later, roles, shot.step))
+        return surfaces
+
     for a, b in pairs:
         earlier, later = shot.read(a), shot.read(b)
         evidence.add(earlier, later)
-        if earlier.motion is not None and later.motion is not None:
-            resolution = earlier.resolution or earlier.motion.shape[:2]
-            pair = FramePair(earlier.color, later.color, earlier.motion, later.motion, resolution, shot.step)
-            patches.append(Patches(pair))
-        judgement = _judge(evidence, layers, patches)
+        if (pair := _pair_of(earlier, later, earlier.color, later.color, shot.step)) is not None:
+            light.append(Patches(pair))
+        judgement = _judge(evidence, layers, light, partial(look_at_surfaces, earlier, later))
         if not judgement.warnings and (judgement.motion is None or judgement.motion.certain):
             break  # nothing is left to ask
     return judgement
 
 
-def _judge(evidence: _Evidence, layers: Layers, patches: Sequence[Patches]) -> Judgement:
-    choice = None
-    if layers.motion_convention is not None and patches:
-        choice = choose_convention(patches, layers.motion_convention, layers.settled)
+def _pair_of(earlier: Frame, later: Frame, here: Array, there: Array, step: int) -> FramePair | None:
+    """Pictures of two frames with their vectors; None where one has none."""
+    if earlier.motion is None or later.motion is None:
+        return None
+    resolution = earlier.resolution or earlier.motion.shape[:2]
+    return FramePair(here, there, earlier.motion, later.motion, resolution, step)
+
+
+def _surface_pairs(earlier: Frame, later: Frame, roles: Collection[str], step: int) -> Iterator[FramePair]:
+    """What two frames show of their surfaces in these guides, as pictures."""
+    for role in roles:
+        here, there = getattr(earlier, role), getattr(later, role)
+        if here is not None and there is not None:
+            lift = np.float32(role == "normal")  # none of it is negative then
+            if (pair := _pair_of(earlier, later, here + lift, there + lift, step)) is not None:
+                yield pair
+
+
+def _judge(
+    evidence: _Evidence,
+    layers: Layers,
+    light: Sequence[Patches],
+    surfaces: Callable[[Collection[str]], Sequence[Patches]],
+) -> Judgement:
     variance_scale, judged = evidence.judge_variance()
-    findings = [*evidence.findings(), *judged, *([] if choice is None else _judge_motion(layers, choice))]
+    findings = [*evidence.findings(), *judged]
+    choice = None
+    if layers.motion_convention is not None and light:
+        sound = [role for role in ("albedo", "normal") if role not in {finding.role for finding in findings}]
+        choice = choose_convention(light, layers.motion_convention, layers.settled, lambda: surfaces(sound))
+        findings += _judge_motion(layers, choice)
     return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
 
 

@@ -111,7 +111,8 @@ def inspect(
         if not finding.warning:
             console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
     if readings := judgement.readings():
-        show("Motion: what the vectors leave unexplained", ("", "read as", "of the picture"), readings)
+        seen = "surfaces" if judgement.motion is not None and judgement.motion.by_surfaces else "picture"
+        show("Motion: what the vectors leave unexplained", ("", "read as", f"of the {seen}"), readings)
     for taken, plan in zip(layers, plans, strict=True):
         lines = [
             (

@@ -208,6 +208,66 @@ def test_a_change_of_light_that_no_motion_explains_leaves_vectors_as_they_are() 
     assert choice.convention == PLAIN
 
 
+def in_shadows(film: Film) -> tuple[list[Patches], Callable[[], list[Patches]]]:
+    """Stripes of shadow pass over a film, its vectors are right: pairs of what is lit, and of the wall itself."""
+    surfaces = film.pairs(film.previous)
+    x, _ = grid()
+    for n, color in enumerate(film.colors):
+        film.colors[n] = color * np.where((x + 4 * n) % 28 < 14, np.float32(1), np.float32(0.15))[..., None]
+    return film.pairs(film.previous), lambda: surfaces
+
+
+@pytest.mark.parametrize("film", [Film((0.4, 0.2)), Film()], ids=["slow", "still"])
+def test_right_vectors_are_believed_where_shadows_move_otherwise(film) -> None:
+    light, surfaces = in_shadows(film)
+    assert choose_convention(light, PLAIN).convention != PLAIN  # it would be what follows the shadows
+    choice = choose_convention(light, PLAIN, surfaces=surfaces)
+    assert choice.convention == PLAIN
+    assert choice.by_surfaces
+    assert choice.unexplained < 0.05
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda v: 0 * v,
+        lambda v: 0 * v + [0, 3],  # not along the shadows' way
+        lambda v: v[..., ::-1],
+        lambda v: np.random.default_rng(0).normal(0, 4, v.shape),
+    ],
+    ids=["black", "constant", "transposed", "noise"],
+)
+@pytest.mark.parametrize("settled", [PARTS, ()], ids=["stated", "unknown"])
+def test_wrong_vectors_are_not_believed_in_moving_shadows(wrong, settled) -> None:
+    film = Film((0.2, 1.5), 0.04)
+    film.previous = lambda n, right=film.previous: np.float32(wrong(right(n)))  # type: ignore[method-assign]
+    light, surfaces = in_shadows(film)
+    assert choose_convention(light, PLAIN, settled, surfaces).convention is None
+
+
+def test_surfaces_tell_how_vectors_are_meant_where_shadows_move_otherwise() -> None:
+    film = Film((1, 1.5), 0.04, faster=1.5)
+    film.previous = lambda n, right=film.previous: right(n) * np.float32([1, -1])  # type: ignore[method-assign]
+    light, surfaces = in_shadows(film)
+    choice = choose_convention(light, PLAIN, surfaces=surfaces)
+    assert choice.convention == MotionConvention(y="up")
+
+
+def test_surfaces_without_structure_confirm_nothing() -> None:
+    film = Film()
+    light, _ = in_shadows(film)
+    flat, vectors = np.full_like(film.colors[0], 0.5), film.previous(0)
+    blank = Patches(FramePair(flat, flat, vectors, vectors, (HEIGHT, WIDTH)))
+    choice = choose_convention(light, PLAIN, surfaces=lambda: [blank])
+    assert choice.convention is None
+    assert not choice.by_surfaces
+
+
+def test_surfaces_are_asked_only_where_light_leaves_a_doubt() -> None:
+    film = Film(**MOVES)
+    choose_convention(film.pairs(film.previous), PLAIN, surfaces=lambda: pytest.fail("asked"))
+
+
 def test_what_a_pan_cannot_tell_is_said() -> None:
     sideways = Film((3, 0))
     choice = choose_convention(sideways.pairs(sideways.previous), PLAIN, ())

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -108,6 +109,34 @@ def test_right_vectors_are_better_than_found_ones_and_need_no_warning(tmp_path, 
     right, said = quality(write(tmp_path), tmp_path / "out")
     assert warnings(said) == []
     assert right > found_in_pictures
+
+
+def in_shadows(index: int, channels: Channels) -> None:
+    """Shadows as of leaves pass over the shot, faster than anything in it."""
+    height, width = FRAMES[index].color.shape[:2]
+    leaves = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(height, width + 64)), (0, 0), 4)
+    shade = np.clip(0.5 + leaves[:, 3 * index :][:, :width] / leaves.std(), 0.1, 1)
+    for name in [name for name in channels if name.startswith(f"{LIGHT}.") and name[-1] in "RGB"]:
+        channels[name] = np.float32(channels[name] * shade)
+
+
+def test_right_vectors_are_kept_in_moving_shadows_and_wrong_ones_are_not(tmp_path) -> None:
+    def judged(name: str, *edits: Callable[[int, Channels], None]) -> str:
+        def edit(index: int, channels: Channels) -> None:
+            for change in (in_shadows, *edits):
+                change(index, channels)
+
+        return " ".join(judge_layers(open_shot(write(tmp_path / name, edit))).warnings)
+
+    assert judged("right") == ""
+    left_out = "no reading of the vectors explains the pictures"
+    for kind in ("black", "constant", "noise", "transposed"):
+        assert left_out in judged(kind, vector(WRONG[kind])), kind
+    # Guides that make no sense themselves have no say.
+    unseen, position = without("Denoising Albedo"), fill(*NORMAL, lambda t, i: t.normal * t.depth[..., None])
+    assert judged("normal", unseen) == ""
+    assert left_out in judged("none", unseen, without("Denoising Normal"))
+    assert left_out in judged("position", unseen, position)
 
 
 def fill(name: str, components: str, make: Callable[[Truth, int], np.ndarray]) -> Callable[[int, Channels], None]:
