@@ -297,8 +297,12 @@ def _join(x: Tensor, skip: Tensor) -> Tensor:
     return torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1)
 
 
-# Where oneDNN is built in; elsewhere the two run one after the other.
-_FUSED = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
+# Where oneDNN is built in, and takes bfloat16 on this processor; elsewhere the two run one after the other.
+_FUSED = (
+    torch.backends.mkldnn.is_available()
+    and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
+    and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+)
 
 
 @torch.no_grad()

@@ -650,19 +650,21 @@ def _warp_residuals(
     there: Sequence[tuple[PreparedFrame | None, Array | None]], flows: Sequence[Array | None], rows: slice
 ) -> Array:
     """See `AlignedWindow.residual`; a frame without a flow is the centre, or missing."""
-    parts: list[Array | None] = []
-    for (frame, estimate), flow in zip(there, flows, strict=True):
+    shape = next(
+        frame.irradiance[rows].shape for frame, estimate in there if frame is not None and estimate is not None
+    )
+    residuals = np.empty((len(there), *shape), np.float32)
+    for (frame, estimate), flow, out in zip(there, flows, residuals, strict=True):
         if frame is None or estimate is None:
-            parts.append(None)
+            out[:] = 0
             continue
         own = demodulate(estimate, frame.albedo) if frame.demodulated and frame.albedo is not None else estimate
         left = frame.irradiance - own
         if flow is None or not flow.any():
-            parts.append(left[rows])
+            out[:] = left[rows]
         else:
-            parts.append(warp(left, flow, interpolation="nearest", first_row=rows.start)[0])
-    nothing = np.zeros(next(part.shape for part in parts if part is not None), np.float32)
-    return np.stack([nothing if part is None else part for part in parts])
+            warp(left, flow, interpolation="nearest", first_row=rows.start, out=out)
+    return residuals
 
 
 def _clean(layer: Array, trust: Array, stages: Collection[str]) -> Array:

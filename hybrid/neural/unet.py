@@ -1,4 +1,7 @@
-"""OIDN's networks in torch, called as OIDN is: the same pictures, in bfloat16 in about 0.6 of the time."""
+"""OIDN's networks in torch, called as OIDN is: the same pictures, in bfloat16 in about 0.6 of the time.
+
+On processors without bfloat16 they run in float32.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ def denoise_unet(
     prefilter: Quality | None = None,
     clean: bool = False,
 ) -> Array:
-    """Denoise one frame with OIDN's networks in bfloat16, 64 to 66 dB from OIDN's own picture.
+    """Denoise one frame with OIDN's networks; in bfloat16 64 to 66 dB from OIDN's own picture.
 
     Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
 
@@ -68,7 +71,7 @@ def denoise_unet(
 
 
 def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced") -> dict[str, Array]:
-    """Take the noise out of guides, each by itself, with OIDN's networks in bfloat16.
+    """Take the noise out of guides, each by itself, with OIDN's networks.
 
     Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
 
@@ -127,8 +130,14 @@ def denoise_bundled(
 
 @lru_cache
 def _bundled() -> Trunk:
-    trunk = cast(RobustUNet, load_model(shipped_weights("fast"))).trunk.eval().requires_grad_(False)
-    return round_trunk(trunk) if has_bfloat16(torch.device("cpu")) else trunk
+    return _for_running(cast(RobustUNet, load_model(shipped_weights("fast"))).trunk)
+
+
+def _for_running(trunk: Trunk) -> Trunk:
+    """In bfloat16 where the processor has it; elsewhere oneDNN may refuse it."""
+    if has_bfloat16(torch.device("cpu")):
+        return round_trunk(trunk)
+    return trunk.eval().requires_grad_(False)
 
 
 def has_unet() -> bool:
@@ -142,7 +151,7 @@ def has_unet() -> bool:
 
 @lru_cache
 def _network(name: str) -> Trunk:
-    return round_trunk(load_oidn(name))
+    return _for_running(load_oidn(name))
 
 
 def _tensor(image: Array) -> Tensor:

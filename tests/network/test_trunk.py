@@ -414,7 +414,7 @@ def test_curves_and_their_inverses() -> None:
     torch.testing.assert_close(srgb_inverse(srgb_forward(y)), y, rtol=0, atol=1e-6)
 
 
-@pytest.mark.skipif(not trunk._FUSED, reason="torch without oneDNN")
+@pytest.mark.skipif(not trunk._FUSED, reason="torch without oneDNN, or a processor without bfloat16")
 def test_fused_convolutions_give_the_same_bits(made_up: Trunk, monkeypatch: pytest.MonkeyPatch) -> None:
     picture = torch.rand(1, made_up.config.inputs, 48, 64, generator=torch.Generator().manual_seed(1))
     rounded = round_trunk(made_up)

@@ -1,5 +1,7 @@
 """OIDN's networks in torch give OIDN's pictures, whatever its mode, and stand for it where they are quicker."""
 
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
 from __future__ import annotations
 
 import importlib.util
@@ -7,7 +9,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
@@ -16,7 +18,7 @@ from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, open_shot
 from hybrid.neural import denoiser, unet
 from hybrid.neural.unet import denoise_unet
-from network.trunk import OIDN_WEIGHTS
+from network.trunk import OIDN_WEIGHTS, Trunk, TrunkConfig
 from tests.scenes import Scene
 
 pytestmark = [
@@ -86,3 +88,9 @@ def test_denoise_takes_them_where_it_runs_in_bfloat16(tmp_path, monkeypatch, pre
     words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--frames", "1002", "--precision", precision]
     assert main(words) == 0
     assert bool(calls) == (precision == "bfloat16" and known)
+
+
+@pytest.mark.parametrize(("there", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_bfloat16_is_for_processors_that_have_it(there, dtype, monkeypatch):
+    monkeypatch.setattr(unet, "has_bfloat16", lambda device: there)
+    assert unet._for_running(Trunk(TrunkConfig(9, "small"))).first.weight.dtype == dtype
