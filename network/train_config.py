@@ -46,7 +46,7 @@ class TrainConfig:
     terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
     whole: float = 1.0  # weight of the whole window's term beside the temporal ones
     slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
-    bfloat16: bool = True  # for the convolutions; kernels and losses are float32
+    bfloat16: bool = True  # for the convolutions, where the device has it; kernels and losses are float32
     compile: bool = False  # torch.compile the network: a minute at the start, pays on a GPU
     device: str = "auto"  # the GPU if there is one
     workers: int = 0  # processes that read clips; 0: the training itself

@@ -118,12 +118,25 @@ def test_a_training_is_determined_by_its_seed(sets: tuple[Clips, Clips], tmp_pat
     assert other != runs[0]
 
 
-def test_bfloat16_training_stays_near_float32(sets: tuple[Clips, Clips], tmp_path: Path) -> None:
+def test_bfloat16_training_stays_near_float32(
+    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     none = sets[0].of([])
+    monkeypatch.setattr("network.train.has_bfloat16", lambda device: True)
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
     half = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
     assert half != full
     assert half == pytest.approx(full, rel=0.02)  # 8 bits in the features, averaged over all pixels
+
+
+def test_a_device_without_bfloat16_trains_in_float32(
+    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = sets[0].of([])
+    full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
+    monkeypatch.setattr("network.train.has_bfloat16", lambda device: False)
+    same = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
+    assert same == full
 
 
 def test_a_compiled_network_trains_alike(
