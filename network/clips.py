@@ -54,19 +54,21 @@ class Clip:
         ``(L, T, 1, H, W)`` in [0, 1].
     modulation : Tensor
         ``(L, 3, H, W)``; radiance is irradiance times modulation.
-    noisy, pseudo_reference : Tensor
-        ``(L, 3, H, W)`` radiance of the centre, as rendered and as estimated from the level's own window.
+    noisy : Tensor
+        ``(L, 3, H, W)`` radiance of the centre, as rendered.
     exposure : Tensor
         ``(L,)``, of the windows of whole frames: what the network is told when it runs.
     gain : Tensor
         ``(L,)``, OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
+    pseudo_reference : Tensor, optional
+        ``(L, 3, H, W)`` radiance of the centre, as estimated from the level's own window. There where no reference is.
     reference : Tensor, optional
         ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
 
     Raises
     ------
     ValueError
-        If shapes do not fit together or a value is not finite.
+        If shapes do not fit together, a value is not finite, or there is neither pseudo-reference nor reference.
     """
 
     color: Tensor
@@ -77,9 +79,9 @@ class Clip:
     confidence: Tensor
     modulation: Tensor
     noisy: Tensor
-    pseudo_reference: Tensor
     exposure: Tensor
     gain: Tensor
+    pseudo_reference: Tensor | None = None
     reference: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -87,6 +89,8 @@ class Clip:
         if len(shape) != 5 or shape[1] % 2 == 0 or shape[2] != 3:
             raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
         image = (shape[0], *shape[2:])
+        if self.pseudo_reference is None and self.reference is None:
+            raise ValueError("reference: expected one where there is no pseudo-reference, got none")
         expected = {
             **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), shape),
             **dict.fromkeys(("modulation", "noisy", "pseudo_reference"), image),

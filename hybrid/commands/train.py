@@ -152,6 +152,14 @@ def prepare(
             rich_help_panel=INPUT,
         ),
     ] = False,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LEVEL",
+            help="the level whose pseudo-references the others are trained towards; itself it is none",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="of the places", rich_help_panel=WHAT)] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
@@ -171,6 +179,8 @@ def prepare(
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
+    if reference and target is not None:
+        raise typer.BadParameter("--target: expected none with --reference, which is the target")
     import_neural()
     from hybrid.neural import write_clips
 
@@ -198,11 +208,16 @@ def prepare(
             bar.advance(len(first), f"{name} has clips already")
             continue
         levels_of, _ = judge_alike(shot, strict=strict)
+        if target is not None and (target not in levels_of or len(levels_of) == 1):
+            there = ", ".join(levels_of)
+            raise ValueError(f"target: expected a level of {name} that is not the only one, {there}, got {target!r}")
+        towards = levels_of.pop(target, None) if target is not None else None
+        inputs = [count for level, count in zip(shot, counts, strict=True) if level != target]
         plan = plan_shot(next(iter(levels_of.values())), radius=window // 2)
         say_cuts(plan, (), strict=strict, name=name if len(found) > 1 else "")
         write_clips(
             levels_of,
-            counts,
+            inputs,
             output,
             name,
             radius=window // 2,
@@ -212,6 +227,7 @@ def prepare(
             reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
             if reference
             else None,
+            target=towards,
             seed=seed,
             advance=partial(bar.advance, message=name),
         )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ def write_clips(
     tiles: int = 4,
     estimate: str = "auto",
     reference: Shot | None = None,
+    target: Shot | None = None,
     seed: int = 0,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Path]:
@@ -57,6 +58,8 @@ def write_clips(
         Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
     reference : Shot, optional
         The same frames clean, or some of them: clips are made of these alone, and trained towards them.
+    target : Shot, optional
+        A further render of the same frames, of more samples: clips are trained towards its pseudo-references.
     seed : int
         Of the places.
     advance : callable
@@ -70,34 +73,42 @@ def write_clips(
     Raises
     ------
     ValueError
-        If the levels have no frame in common, frames are smaller than a tile, or there are no estimates.
+        If the levels have no frame in common, frames are smaller than a tile, there are no estimates, or both a
+        reference and a target.
 
     References
     ----------
     Kalojanov and Thurston 2023, section 6, "Training Data".
     """
+    if reference is not None and target is not None:
+        raise ValueError("target: expected none beside a reference, which is the target")
     shots = list(levels.values())
-    every = shots if reference is None else [*shots, reference]
+    every = [*shots, *(shot for shot in (reference, target) if shot is not None)]
     numbers = [number for number in shots[0].numbers if all(shot.has(number) for shot in every)]
     if not numbers:
-        what = ", ".join(levels) + ("" if reference is None else " and the reference")
+        what = ", ".join(levels) + ("" if len(every) == len(shots) else " and what they are trained towards")
         raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
-    sources = [choose_estimate(estimate, shot) for shot in shots]
+    sources = [choose_estimate(estimate, shot) for shot in every if shot is not reference]
     aligners = [
         Aligner(shot, Rules(), radius=radius, estimates=source.estimates)
-        for shot, source in zip(shots, sources, strict=True)
+        for shot, source in zip((*shots, *([] if target is None else [target])), sources, strict=True)
     ]
     # Beside estimates by OIDN it is there for a second look as well.
     make_target = gather_and_denoise if all(source.name in OIDN_MODES for source in sources) else gated_average
 
+    def clean(number: int) -> NDArray[np.float32] | None:
+        """The picture that all levels of a frame are trained towards, if there is one."""
+        if reference is not None:
+            return replace_nonfinite(reference.read(number).color)[0]
+        return None if target is None else make_target(aligners[-1].align(number))
+
     def make() -> Iterator[Clip]:
         rng = np.random.default_rng(seed)
         for number in numbers:
-            levels_here = zip(shots, aligners, strict=True)
-            whole = _clip([_level(shot, aligner, number, make_target) for shot, aligner in levels_here])
-            if reference is not None:
-                clean = tensor_of(replace_nonfinite(reference.read(number).color)[0][None])[:, 0]
-                whole = replace(whole, reference=clean.expand_as(whole.noisy))
+            found = clean(number)
+            own = make_target if found is None else None
+            levels_here = zip(shots, aligners, strict=False)
+            whole = _clip([_level(shot, aligner, number, own) for shot, aligner in levels_here], found)
             if tile == 0:
                 yield whole
             else:
@@ -106,9 +117,10 @@ def write_clips(
                     raise ValueError(f"tile: expected at most the frame's {width}×{height} pixels, got {tile}")
                 noisiest = min(range(len(samples)), key=lambda level: samples[level])
                 middle, scale = whole.color.shape[1] // 2, whole.exposure[noisiest]
+                best = cast(torch.Tensor, whole.pseudo_reference if found is None else whole.reference)
                 weights = importance(
                     whole.noisy[noisiest] / scale,
-                    whole.pseudo_reference[noisiest] / scale,
+                    best[noisiest] / scale,
                     whole.albedo[noisiest, middle],
                     whole.confidence[noisiest],
                 )
@@ -120,15 +132,16 @@ def write_clips(
 
 
 def _level(
-    shot: Shot, aligner: Aligner, number: int, make_target: Callable[[AlignedWindow], NDArray[np.float32]]
+    shot: Shot, aligner: Aligner, number: int, make_target: Callable[[AlignedWindow], NDArray[np.float32]] | None
 ) -> dict[str, torch.Tensor]:
-    """What a clip holds of one noise level, with N = 1 in front."""
+    """What a clip holds of one noise level, with N = 1 in front; its own target where it needs one."""
     aligned = aligner.align(number)
     if aligned.estimate is None or aligned.residual is None:
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
-    return {
+    targets = {} if make_target is None else {"pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0]}
+    return targets | {
         "color": tensor_of(color),
         "albedo": tensor_of(np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo)),
         "normal": tensor_of(np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal)),
@@ -137,12 +150,14 @@ def _level(
         "confidence": tensor_of(aligned.confidence[..., None]),
         "modulation": tensor_of(aligned.modulation[None])[:, 0],
         "noisy": tensor_of(noisy[None])[:, 0],
-        "pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0],
         "exposure": exposure_of(aligned),
         "gain": gain_of(aligned),
     }
 
 
-def _clip(levels: list[dict[str, torch.Tensor]]) -> Clip:
-    """A clip of its levels."""
-    return Clip(**{name: torch.cat([level[name] for level in levels]) for name in levels[0]})
+def _clip(levels: list[dict[str, torch.Tensor]], clean: NDArray[np.float32] | None) -> Clip:
+    """A clip of its levels, with the picture that all of them are trained towards."""
+    values = {name: torch.cat([level[name] for level in levels]) for name in levels[0]}
+    if clean is not None:
+        values["reference"] = tensor_of(clean[None])[:, 0].expand_as(values["noisy"])
+    return Clip(**values)

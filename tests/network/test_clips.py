@@ -106,6 +106,11 @@ def test_a_level_without_an_independent_one_is_trained_towards_its_own_pseudo_re
     assert noise_pairs((16, 4))[0] == [(0, "pseudo_reference")]
 
 
+def test_a_clip_needs_something_to_be_trained_towards() -> None:
+    with pytest.raises(ValueError, match="reference: expected one where there is no pseudo-reference"):
+        replace(make_clip(), pseudo_reference=None)
+
+
 # Shards
 
 
@@ -290,9 +295,8 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
     """A clip whose images are all one image: after any variation they still are, normals up to order and sign."""
     image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) + 0.1
     window = image.expand(1, 3, 3, 16, 16).clone()
-    clip = Clip(
-        *[window] * 5, window[:, :, :1], window[:, 1], window[:, 1], window[:, 1], torch.ones(1), torch.ones(1)
-    )  # fmt: skip
+    centre, one = window[:, 1], torch.ones(1)
+    clip = Clip(*[window] * 5, window[:, :, :1], centre, centre, one, one, pseudo_reference=centre)
     write_shards(tmp_path, "s", [4], [clip])
     samples = Samples(open_clips(tmp_path), PLAIN, 0)
     seen = set()

@@ -109,6 +109,17 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
 
 
+def test_clips_are_prepared_towards_the_pseudo_references_of_a_level_where_asked(shot, tmp_path, capsys):
+    options = (shot, "-o", tmp_path / "clips", "--tile", 0, "--estimate", "nlm")
+    levels = ("--levels", "a=24,b=24,c=8")
+    assert run("prepare", *options, *levels, "--target", "d") == 1
+    assert "target: expected a level of wall that is not the only one, a, b, c, got 'd'" in capsys.readouterr().err
+    assert run("prepare", *options, *levels, "--target", "b", "--reference") == 2
+    assert run("prepare", *options, *levels, "--target", "b", "--frames", SCENE.first + 1) == 0
+    clips = open_clips(tmp_path / "clips")
+    assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]  # b is none of them
+
+
 def test_one_sequence_is_prepared_towards_the_reference_beside_it(shot, tmp_path):
     (tmp_path / "wall.b.0000.safetensors").touch()  # another shot's, whose name begins alike
     options = ("--tile", 0, "--estimate", "nlm", "--window", 3, "--reference", "--frames", SCENE.first)

@@ -121,6 +121,19 @@ def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
     np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
 
 
+def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, tmp_path, monkeypatch):
+    only = str(MIDDLE)
+    other = SCENE.write(tmp_path / "other", clean=True, edit=bright_window)
+    shot, target = open_shot(tmp_path / "dim", frames=only), open_shot(other, frames=only)
+    (clip,) = prepare(shot, monkeypatch, tmp_path, target=target)
+    window = Aligner(open_shot(other, frames=only), Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    assert clip.pseudo_reference is None
+    assert len(clip.reference) == len(clip.noisy) == 1
+    np.testing.assert_array_equal(clip.reference[0].permute(1, 2, 0).numpy(), gated_average(window))
+    with pytest.raises(ValueError, match="target: expected none beside a reference"):
+        prepare(shot, monkeypatch, tmp_path, target=target, reference=target)
+
+
 def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
     (tmp_path / "clips").mkdir()
