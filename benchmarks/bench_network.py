@@ -105,8 +105,9 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
         for bfloat16 in (False, True):
             model = for_inference(build(), bfloat16)
             color = torch.rand(1, 5, 3, tile, tile)
-            window = dict.fromkeys(("color", "albedo", "normal", "estimate"), color)
-            window |= {"confidence": torch.rand(1, 5, 1, tile, tile), "exposure": torch.ones(1)}
+            window = dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), color)
+            window |= {"confidence": torch.rand(1, 5, 1, tile, tile), "modulation": color[:, 0]}
+            window |= dict.fromkeys(("exposure", "gain"), torch.ones(1))
             yield (
                 f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
                 lambda m=model, w=window: denoise_tile(m, w),
@@ -116,11 +117,10 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
             model, config = channels_last(build()), TrainConfig(steps=1)
             color, image = torch.rand(count, 5, 3, 128, 128), torch.rand(count, 3, 128, 128)
             batch = {
-                **dict.fromkeys(("color", "albedo", "normal", "estimate"), color),
-                **dict.fromkeys(("modulation", "target"), image),
+                **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), color),
+                **dict.fromkeys(("modulation", "clean_albedo", "clean_normal", "target"), image),
+                **dict.fromkeys(("exposure", "gain", "error"), torch.ones(count)),
                 "confidence": color[:, :, :1],
-                "exposure": torch.ones(count),
-                "error": torch.ones(count),
             }
             yield (
                 f"{name}, training, batch of {count}",

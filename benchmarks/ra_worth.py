@@ -108,9 +108,8 @@ def main() -> int:
     config = TrainConfig(
         steps=options.steps, loss="display", batch=4, rate=3e-4, warmup=20, ema=0.98, checkpoint_minutes=1e9
     )
-    print(
-        "| in the block's place | untrained | trained, each seed | frames give, % | CPU-s a step |\n|---|---|---|---|---|"
-    )
+    print("| in the block's place | untrained | trained, each seed | frames give, % | CPU-s a step |")
+    print("|---|---|---|---|---|")
     for name in ("RA", "joined", "none"):
         before = judge(make(name, options.size, 0), tests)[0]
         after, gives, seconds = [], [], []

@@ -51,7 +51,20 @@ def main() -> int:
         drawn = ["--seed", seed, "--shots", count, "--python", options.blender_python]
         ravg("simulate", kind, "-o", shots, *RENDER, *drawn)
     # Whole frames, of which training takes crops.
-    ravg("prepare", *sorted(shots.iterdir()), "-o", clips, "--target", "target", "--tile", 0, "--estimate", "oidn-fast", "--frames", "2-4")
+    ravg(
+        "prepare",
+        *sorted(shots.iterdir()),
+        "-o",
+        clips,
+        "--target",
+        "target",
+        "--tile",
+        0,
+        "--estimate",
+        "oidn-fast",
+        "--frames",
+        "2-4",
+    )
     for preset, steps in STEPS.items():
         weights = options.out / f"{preset}.safetensors"
         begun = ["--resume"] if weights.with_name(f"{weights.name}.state").exists() else []

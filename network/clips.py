@@ -26,7 +26,7 @@ from network.losses import ImageLoss
 from network.train_config import SamplerConfig
 
 FORMAT = "ravg-clips"
-VERSION = "2"
+VERSION = "3"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
 #: (fireflies only) becomes this.
 HALF_MAX = 65504.0
@@ -54,6 +54,8 @@ class Clip:
         ``(L, T, 1, H, W)`` in [0, 1].
     modulation : Tensor
         ``(L, 3, H, W)``; radiance is irradiance times modulation.
+    clean_albedo, clean_normal : Tensor
+        ``(L, 3, H, W)`` of the centre, without noise: for networks that rely on their guides.
     noisy : Tensor
         ``(L, 3, H, W)`` radiance of the centre, as rendered.
     exposure : Tensor
@@ -78,6 +80,8 @@ class Clip:
     residual: Tensor
     confidence: Tensor
     modulation: Tensor
+    clean_albedo: Tensor
+    clean_normal: Tensor
     noisy: Tensor
     exposure: Tensor
     gain: Tensor
@@ -93,7 +97,7 @@ class Clip:
             raise ValueError("reference: expected one where there is no pseudo-reference, got none")
         expected = {
             **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), shape),
-            **dict.fromkeys(("modulation", "noisy", "pseudo_reference"), image),
+            **dict.fromkeys(("modulation", "clean_albedo", "clean_normal", "noisy", "pseudo_reference"), image),
             "confidence": (*shape[:2], 1, *shape[3:]),
             **dict.fromkeys(FIGURES, shape[:1]),
             "reference": image,
@@ -412,7 +416,8 @@ class Clips:
             If the file is cut short.
         """
         shard, number = self._find(index)
-        names = ("color", "albedo", "normal", "estimate", "residual", "confidence", "modulation", *FIGURES)
+        layers = ("color", "albedo", "normal", "estimate", "residual", "confidence", "modulation")
+        names = (*layers, "clean_albedo", "clean_normal", *FIGURES)
         try:
             with safe_open(shard.path, framework="pt") as file:
                 values = {name: file.get_slice(name)[number, level] for name in names}
@@ -567,8 +572,9 @@ class Samples(Dataset[dict[str, Tensor]]):
         -------
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal``, ``estimate``, ``residual`` ``(T, 3, H, W)``, ``confidence``
-            ``(T, 1, H, W)``, ``modulation``, ``target`` ``(3, H, W)``, ``exposure``, ``gain`` and ``error`` ``()`` (the
-            loss of the clip's best input). A `torch.utils.data.DataLoader` stacks them.
+            ``(T, 1, H, W)``, ``modulation``, ``clean_albedo``, ``clean_normal``, ``target`` ``(3, H, W)``,
+            ``exposure``, ``gain`` and ``error`` ``()`` (the loss of the clip's best input). A
+            `torch.utils.data.DataLoader` stacks them.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
@@ -587,7 +593,7 @@ class Samples(Dataset[dict[str, Tensor]]):
         for name, value in values.items():
             value = value[..., y : y + config.crop, x : x + config.crop].float().flip(flips)
             value = value.transpose(-2, -1) if transpose else value
-            if name == "normal":
+            if name in ("normal", "clean_normal"):
                 value = value[..., axes, :, :] * signs
             elif name != "confidence":
                 value = value[..., channels, :, :]

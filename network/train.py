@@ -57,6 +57,8 @@ def predict(
     Filtered or Picture
         The sums of each frame, or the picture.
     """
+    if isinstance(model, RobustUNet) and model.config.clean_guides:
+        batch = batch | {name: batch[f"clean_{name}"][:, None] for name in ("albedo", "normal")}
     with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
         return filter_window(model, batch, run=run)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import AlignedWindow, Aligner
 from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.frames import Shot
-from hybrid.neural.denoiser import exposure_of, gain_of
+from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average, gather_and_denoise
@@ -140,6 +140,7 @@ def _level(
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
+    clean = clean_guides(aligned)
     targets = {} if make_target is None else {"pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0]}
     return targets | {
         "color": tensor_of(color),
@@ -149,6 +150,8 @@ def _level(
         "residual": tensor_of(aligned.residual),
         "confidence": tensor_of(aligned.confidence[..., None]),
         "modulation": tensor_of(aligned.modulation[None])[:, 0],
+        "clean_albedo": tensor_of(clean.get("albedo", np.zeros_like(noisy))[None])[:, 0],
+        "clean_normal": tensor_of(clean.get("normal", np.zeros_like(noisy))[None])[:, 0],
         "noisy": tensor_of(noisy[None])[:, 0],
         "exposure": exposure_of(aligned),
         "gain": gain_of(aligned),

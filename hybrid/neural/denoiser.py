@@ -165,14 +165,8 @@ class Denoiser:
 
     def _guides(self, aligned: AlignedWindow) -> dict[str, Array]:
         """The centre's guides, (1, H, W, 3), without noise where the network wants them so."""
-        found = {"albedo": aligned.albedo, "normal": aligned.normal}
-        guides = {name: layer[aligned.centre] for name, layer in found.items() if layer is not None}
         clean = isinstance(self.model, RobustUNet) and self.model.config.clean_guides
-        if clean and "prefilter" in aligned.stages and guides:
-            if has_unet():
-                guides = prefilter_guides(guides)
-            elif aligned.guide is not None:  # ours: less good where guides are very noisy
-                guides = dict(zip(guides, np.split(aligned.guide, len(guides), axis=-1), strict=True))
+        guides = clean_guides(aligned) if clean else guides_of(aligned)
         return {name: np.asarray(layer, np.float32)[None] for name, layer in guides.items()}
 
     def _run_tiles(
@@ -286,6 +280,25 @@ def _solid(alpha: Array) -> NDArray[np.bool_]:
     box = np.ones((3, 3), np.uint8)
     covered, empty = (cv2.erode((alpha[..., 0] == value).astype(np.uint8), box) > 0 for value in (1, 0))
     return np.logical_or(covered, empty)[..., None]
+
+
+def guides_of(aligned: AlignedWindow) -> dict[str, Array]:
+    """The centre's albedo and normal, (H, W, 3), those that there are."""
+    found = {"albedo": aligned.albedo, "normal": aligned.normal}
+    return {name: layer[aligned.centre] for name, layer in found.items() if layer is not None}
+
+
+def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
+    """The same, without noise where the plan has found some: in training and in running."""
+    guides = guides_of(aligned)
+    if "prefilter" not in aligned.stages or not guides:
+        return guides
+    if has_unet():
+        return prefilter_guides(guides)
+    if aligned.guide is None:
+        return guides
+    # Ours: less good where guides are very noisy.
+    return dict(zip(guides, np.split(aligned.guide, len(guides), axis=-1), strict=True))
 
 
 def exposure_of(aligned: AlignedWindow) -> torch.Tensor:

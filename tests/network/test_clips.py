@@ -50,6 +50,8 @@ def make_clip(seed: int = 0, size: tuple[int, int] = (16, 16), frames: int = 3) 
         residual=uniform(3, frames, 3) - 0.5,
         confidence=uniform(3, frames, 1),
         modulation=uniform(3, 3) + 0.1,
+        clean_albedo=uniform(3, 3),
+        clean_normal=uniform(3, 3) * 2 - 1,
         noisy=uniform(3, 3) + 0.1,
         pseudo_reference=uniform(3, 3) + 0.1,
         exposure=torch.tensor([0.5, 1.0, 2.0]),
@@ -296,7 +298,7 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
     image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) + 0.1
     window = image.expand(1, 3, 3, 16, 16).clone()
     centre, one = window[:, 1], torch.ones(1)
-    clip = Clip(*[window] * 5, window[:, :, :1], centre, centre, one, one, pseudo_reference=centre)
+    clip = Clip(*[window] * 5, window[:, :, :1], *[centre] * 4, one, one, pseudo_reference=centre)
     write_shards(tmp_path, "s", [4], [clip])
     samples = Samples(open_clips(tmp_path), PLAIN, 0)
     seen = set()
@@ -304,8 +306,9 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
         sample = samples[number]
         for name in ("albedo", "estimate", "residual"):
             torch.testing.assert_close(sample[name], sample["color"])
-        for name in ("modulation", "target"):
+        for name in ("modulation", "clean_albedo", "target"):
             torch.testing.assert_close(sample[name], sample["color"][1])
+        torch.testing.assert_close(sample["clean_normal"], sample["normal"][1])
         channel = [i for i in range(3) if torch.equal(sample["color"][0, i], sample["confidence"][0, 0])]
         assert len(channel) == 1  # turned alike, wherever the red channel has gone
         sizes = sample["normal"].abs()

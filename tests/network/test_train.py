@@ -21,7 +21,7 @@ from network import losses
 from network.checkpoint import load_model, load_notes
 from network.clips import Clip, Clips, Samples, open_clips, split_by_shot, whole_frames, write_shards
 from network.models import Model
-from network.robust_unet import RobustUNet
+from network.robust_unet import RobustUNet, RobustUNetConfig
 from network.train import batch_loss, image_loss, predict, train, validate
 from network.train_config import LOSSES, SamplerConfig, TrainConfig
 from tests.network.small import MODELS, make_model, make_robust
@@ -45,6 +45,8 @@ def make_clip(seed: int, clean_target: bool = False, size: int = 40) -> Clip:
         "residual": noisy - flat,
         "confidence": np.ones((2, 3, 1, size, size)),
         "modulation": np.ones((2, 3, size, size)),
+        "clean_albedo": np.ones((2, 3, size, size)),
+        "clean_normal": np.zeros((2, 3, size, size)),
         "noisy": np.broadcast_to(clean, (2, *clean.shape)) if clean_target else noisy[:, 1],
         "pseudo_reference": clean * rng.gamma(8, 0.125, (2, 1, size, size)),
         "exposure": noisy.mean((1, 2, 3, 4)),
@@ -86,6 +88,20 @@ def equal_weights(a: Model, b: Model) -> bool:
 @pytest.mark.parametrize("name", [name for name in LOSSES if name != "perceptual"])
 def test_every_loss_that_can_be_asked_for_is_there(name: str) -> None:
     assert image_loss(replace(CONFIG, loss=name)) is getattr(losses, name)
+
+
+@pytest.mark.parametrize("clean", [False, True])
+def test_a_network_that_relies_on_its_guides_is_trained_with_those_without_noise(clips: Clips, clean: bool) -> None:
+    batch, seen = a_batch(clips, CONFIG, 2), []
+    model = RobustUNet(RobustUNetConfig(3, "small", clean_guides=clean))
+
+    def spy(frames: torch.Tensor, still: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(still)
+        return model(frames, still, known)
+
+    predict(model, batch, run=spy)
+    wanted = batch["clean_albedo"] if clean else batch["albedo"][:, 1]  # ones and zeros
+    torch.testing.assert_close(seen[0][:, 3:6], wanted)
 
 
 # Training
