@@ -25,9 +25,12 @@ from network.robust_unet import start_from_oidn
 SHOTS = [("random", 5100, 11), ("hard", 6100, 7)]
 RENDER = ["--frames", "1-5", "--size", "192x128", "--spp", "4-12", "--levels", "target=32,a=n,c=n/e"]
 #: Of each preset: the larger a network, the longer a step takes.
-STEPS = {"fast": 800, "balanced": 600, "quality": 400}
-TRAIN = ["--init", "oidn", "--loss", "display", "--batch", 4, "--rate", 3e-4, "--trunk-rate", 0.1, "--warmup", 50]
-TRAIN += ["--ema", 0.99]
+SCHEDULES = {
+    "fast": ["--steps", 800, "--warmup", 50, "--ema", 0.99],
+    "balanced": ["--steps", 600, "--warmup", 50, "--ema", 0.99],
+    "quality": ["--steps", 250, "--warmup", 30, "--ema", 0.98],
+}
+TRAIN = ["--init", "oidn", "--loss", "display", "--batch", 4, "--rate", 3e-4, "--trunk-rate", 0.1]
 
 
 def main() -> int:
@@ -38,7 +41,7 @@ def main() -> int:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.untrained:
-        for preset in STEPS:
+        for preset in SCHEDULES:
             model = start_from_oidn(ALL[preset]())
             save_model(options.out / f"{preset}.safetensors", model, {"start": "OIDN 2.5.1, nothing trained"})
         return 0
@@ -65,11 +68,11 @@ def main() -> int:
         "--frames",
         "2-4",
     )
-    for preset, steps in STEPS.items():
+    for preset, schedule in SCHEDULES.items():
         weights = options.out / f"{preset}.safetensors"
         begun = ["--resume"] if weights.with_name(f"{weights.name}.state").exists() else []
         if begun or not weights.exists():
-            ravg("train", clips, "-o", weights, "--preset", preset, "--steps", steps, *TRAIN, *begun)
+            ravg("train", clips, "-o", weights, "--preset", preset, *TRAIN, *schedule, *begun)
     return 0
 
 
