@@ -84,7 +84,7 @@ class AlignedWindow:
     beyond : callable or None
         What gives `residual`.
     aovs : dict of str to (T, H, W, C) array
-        Further layers, warped and demodulated like the color.
+        Further layers, warped and demodulated like the color, but for those with `tints`.
     repaired : int
         Pixels of the centre frame that were not finite.
     fireflies : int
@@ -103,6 +103,8 @@ class AlignedWindow:
         The stages that made it.
     shares : dict of str to float
         On what share of the picture a stage ran that runs only where it is called for, in [0, 1].
+    tints : dict of str to (H, W, 3) array
+        The centre's color of those of `aovs` that are light without it.
     """
 
     number: int
@@ -127,6 +129,7 @@ class AlignedWindow:
     inner: slice
     stages: frozenset[str]
     shares: dict[str, float] = field(default_factory=dict)
+    tints: dict[str, Array] = field(default_factory=dict)
 
     @cached_property
     def guide(self) -> Array | None:
@@ -476,7 +479,8 @@ class Aligner:
             there = [(self._frames.get(n), self.estimates.get(n)) for n in numbers]
             beyond = partial(_warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
-            return self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
+            aligned = self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
+        return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
 
     def _expect_alike(self, number: int, numbers: Sequence[int]) -> None:
         """Refuse a window of which one frame has a layer that another lacks: light divided by an albedo is no color."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -63,7 +63,9 @@ class PreparedFrame:
     alpha : (H, W, 1) array or None
         Coverage, finite.
     aovs : dict of str to (H, W, C) array
-        Further layers to be warped along, demodulated like the color.
+        Further layers to be warped along, demodulated like the color, but for those that are light without its color.
+    tints : dict of str to (H, W, 3) array
+        Of those the color, finite and at least 0.
     demodulated : bool
         Whether the albedo has been divided out.
     fireflies : int
@@ -86,6 +88,7 @@ class PreparedFrame:
     alpha: Array | None
     aovs: dict[str, Array]
     demodulated: bool
+    tints: dict[str, Array] = field(default_factory=dict)
     fireflies: int = 0
     burnt: float = 0.0
     lamps: Mask | None = None
@@ -164,7 +167,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     if albedo is not None and demodulated:
         color = demodulate(color, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
-        aovs = {name: demodulate(layer, albedo) for name, layer in aovs.items()}
+        aovs = {name: layer if name in frame.tints else demodulate(layer, albedo) for name, layer in aovs.items()}
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
@@ -178,6 +181,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
+        tints={name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.tints.items()},
     )
 
 
@@ -240,5 +244,5 @@ def planes_prepared(layers: Layers) -> float:
     given = (layers.albedo, layers.normal, layers.variance)
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     single = (layers.depth is not None) + (layers.alpha is not None)
-    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
+    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.tints.values()))
     return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte

@@ -223,6 +223,14 @@ def denoise(
         ),
     ] = None,
     aov: AovOption = None,
+    give_way: Annotated[
+        Literal["layers", "beauty"],
+        typer.Option(
+            help="where layers (--aov) are parts of the light: they are shared out of the denoised beauty, or it is "
+            "their sum",
+            rich_help_panel=WHAT,
+        ),
+    ] = "layers",
     preview: PreviewOption = None,
     fps: RateOption = 24,
     contact: SheetOption = None,
@@ -287,7 +295,13 @@ def denoise(
     if tile is None and max_memory is not None:
         tile = neural.SMALL_TILE
     denoiser = neural.Denoiser(
-        path, tile=tile, precision=precision, device=device, threshold=threshold, timings=timings
+        path,
+        tile=tile,
+        precision=precision,
+        device=device,
+        threshold=threshold,
+        add_layers=give_way == "beauty",
+        timings=timings,
     )
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
@@ -319,6 +333,7 @@ def denoise(
         "motion": motion,
         "estimate": estimate,
         "aov": aov,
+        "give_way": give_way,
         "tile": denoiser.tile,
         "threshold": threshold,
         "breakdown": breakdown is not None,

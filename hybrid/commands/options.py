@@ -207,7 +207,12 @@ PixelsOption = Annotated[
 ]
 AovOption = Annotated[
     list[str] | None,
-    typer.Option("--aov", metavar="LAYER", help="filter this layer with the same kernels", rich_help_panel=WHAT),
+    typer.Option(
+        "--aov",
+        metavar="LAYER",
+        help="denoise this layer along; all: every layer whose name is known for a part of the light",
+        rich_help_panel=WHAT,
+    ),
 ]
 
 

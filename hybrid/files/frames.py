@@ -51,6 +51,8 @@ class Frame:
         those of `color`.
     aovs : mapping of str to (H, W, C) array of float32
         By name, those that were asked for.
+    tints : mapping of str to (H, W, 3) array of float32
+        What those of them are multiplied by that are light without its color.
     source : Path, optional
         The file, if there is one.
     """
@@ -67,6 +69,7 @@ class Frame:
     alpha: np.ndarray | None = None
     estimate: np.ndarray | None = None
     aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tints: Mapping[str, np.ndarray] = field(default_factory=dict)
     source: Path | None = None
 
     def __post_init__(self) -> None:
@@ -816,6 +819,7 @@ def _frame(
         motion_convention=convention,
         resolution=_size(image.parts[layers.color.part])[::-1],
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
+        tints={name: _pixels(image, layer, canvas) for name, layer in layers.tints.items()},
         source=image.path,
     )
 

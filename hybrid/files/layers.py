@@ -13,6 +13,17 @@ from hybrid.files.profile import ROLES, Profile, find_profile, plain_name
 
 # Blender's name for what its compositor has made of the view layers: graded, blurred, glowing.
 COMPOSITE = "Composite"
+# What stands for every layer that is known to be a part of the light.
+ALL = "all"
+# One lobe's direct or indirect light, as Cycles and others name it; and names of parts that are there as a whole.
+_LOBES = (
+    "diff(?:use)?|gloss(?:y)?|trans(?:mission)?|volume|subsurface|sss|spec(?:ular)?|coat|sheen|reflection|refraction"
+)
+_COMPONENT = "dir|direct|ind|indirect"
+_LOBE = re.compile(f"(?P<lobe>{_LOBES})(?:{_COMPONENT})|(?:direct|indirect)(?P<other>{_LOBES})")
+_PASS = re.compile(f"{_LOBE.pattern}|{_LOBES}|direct|indirect|emit|emission|env|environment|background")
+# Blender's Combined_key, Arnold's RGBA_key.
+_LIGHT_GROUP = re.compile("(?:combined|rgba|lightgroup).")
 
 
 @dataclass(frozen=True)
@@ -33,8 +44,9 @@ class Layers:
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
 
-    `aovs` are the further layers that were asked for, by the names they were asked for by. `notes` say what was left
-    alone that a user might think is denoised; one line each.
+    `aovs` are the further layers that were asked for, by the names they were asked for by, or all `light_kind` knows.
+    `tints` are the colors by which those of them are multiplied that a renderer writes without. `notes` say what was
+    left alone that a user might think is denoised; one line each.
     """
 
     color: Layer
@@ -59,6 +71,7 @@ class Layers:
     view: str | None = None
     views: tuple[str, ...] = ()
     aovs: Mapping[str, Layer] = field(default_factory=dict)
+    tints: Mapping[str, Layer] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def without(self, roles: Collection[str]) -> Layers:
@@ -147,6 +160,8 @@ def find_layers(
     if len(image.views) > 1 and not isinstance(overrides.get("color"), Layer):
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
     convention, samples = _convention(found, taken), samples_of(image, taken)
+    written = [layer for layer in (found["target"], found["alpha"]) if layer is not None]
+    further = _find_aovs(image, aovs, color, written)
     return Layers(
         **found,  # type: ignore[arg-type]
         profile=taken.name,
@@ -158,7 +173,8 @@ def find_layers(
         samples=samples,
         view=view,
         views=image.views,
-        aovs=_find_aovs(image, aovs, [layer for layer in (found["target"], found["alpha"]) if layer is not None]),
+        aovs=further,
+        tints=_find_tints(image, further, color),
         notes=tuple(notes),
     )
 
@@ -281,14 +297,63 @@ def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> L
     return None
 
 
-def _find_aovs(image: ExrImage, names: Collection[str], written: Sequence[Layer]) -> dict[str, Layer]:
+def light_kind(name: str) -> str | None:
+    """What a layer is a part of, by its name: light is the sum of its "passes", and that of its "groups" of lamps.
+
+    Parameters
+    ----------
+    name : str
+        Of a layer, with what it belongs to before it.
+
+    Returns
+    -------
+    str or None
+        None: by its name it is no light.
+    """
+    plain = plain_name(name.rpartition(".")[2])
+    if _PASS.fullmatch(plain):
+        return "passes"
+    return "groups" if _LIGHT_GROUP.match(plain) else None
+
+
+def _find_lights(image: ExrImage, color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
+    """All layers that are known to be light, each part of it once."""
+    taken = {channel for layer in written for channel in layer.channels}
+    there = [x for x in _same_group(image, color) if light_kind(without_view(x)) and not taken & {*x.channels}]
+    # Where direct and indirect light of a lobe are apart, their sum beside them is no further part.
+    apart = {lobe for layer in there for lobe in _lobes(image, layer)}
+    fitting = {without_view(x): _fit(image, "color", x, named=True) for x in there if not apart & {*_tails(image, x)}}
+    return {name: layer for name, layer in fitting.items() if layer is not None}
+
+
+def _lobes(image: ExrImage, layer: Layer) -> set[str]:
+    """The lobe whose direct or indirect light a layer is, if it is."""
+    found = [match for tail in _tails(image, layer) if (match := _LOBE.fullmatch(tail))]
+    return {match["lobe"] or match["other"] for match in found}
+
+
+def _find_tints(image: ExrImage, aovs: Mapping[str, Layer], color: Layer) -> dict[str, Layer]:
+    """The color of each layer of light that is written without: (direct + indirect) · color, as Cycles has them."""
+    tints = {}
+    for name, light in aovs.items():
+        named = {lobe + word for lobe in _lobes(image, light) for word in ("col", "color")}
+        for layer in _same_group(image, color):
+            if named & {*_tails(image, layer)} and _group(layer) == _group(light):
+                tints[name] = replace(layer, channels=layer.channels[:3])
+    return tints
+
+
+def _find_aovs(image: ExrImage, names: Collection[str], color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
     """The layers that are denoised along; each channel of a file is written once."""
     taken: dict[str, str] = {channel: "the color or its alpha" for layer in written for channel in layer.channels}
     # Hashes of names: an average of two is the name of a third thing.
     hashed = [str(v) for p in image.parts for k, v in p.header.items() if re.fullmatch(r"cryptomatte/\w+/name", k)]
     aovs = {}
-    for name in names:
-        layer = image.layer(name)
+    found = _find_lights(image, color, written) if ALL in names else {}
+    if ALL in names and not found:
+        raise ExrError(f"{image.path}: aov all: no layer has a name for a part of the light; {image.listing()}")
+    for name in [*found, *(name for name in names if name != ALL)]:
+        layer = found.get(name) or image.layer(name)
         if name in ("color", "alpha"):
             raise ExrError(f"{image.path}: aov {name!r} is also a role, expected the whole name: {layer}")
         if clash := next((taken[channel] for channel in layer.channels if channel in taken), None):

@@ -18,6 +18,7 @@ from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import autoexposure, compress, measure_exposure
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
+from hybrid.files.layers import light_kind
 from hybrid.neural.tiling import Block, Borders, PadMode, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
 from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
@@ -29,7 +30,7 @@ from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import Picture, RobustUNet
 from nlm.average import average
 from nlm.gather import REACH, restore_mean
-from nlm.parts import is_part, split_light
+from nlm.parts import add_light, adds_up, is_part, split_light
 
 Array = NDArray[np.float32]
 
@@ -62,6 +63,8 @@ class Denoiser:
         t·K of the kernels, in [0, 1); higher stays closer to the input. Without: what it was trained with.
     breakdown : Breakdown, optional
         Where to count the weights of the frames; each frame's contribution and weight then come as extra layers.
+    add_layers : bool
+        Whether the picture is the sum of its layers where these are parts of it, and they do not give way to it.
     timings : Timings, optional
         Where to count the stages of the estimate, and "network".
 
@@ -80,6 +83,7 @@ class Denoiser:
         device: str = "cpu",
         threshold: float | None = None,
         breakdown: Breakdown | None = None,
+        add_layers: bool = False,
         timings: Timings | None = None,
     ) -> None:
         if precision not in PRECISIONS:
@@ -97,6 +101,7 @@ class Denoiser:
         self.tile = tile or (TILE_OF_TRUNK if self.takes_estimate else TILE)
         self.threshold = threshold
         self.breakdown = breakdown
+        self.add_layers = add_layers
         self.timings = timings or Timings()
 
     @property
@@ -138,7 +143,8 @@ class Denoiser:
             aovs = _apart(filtered, aligned)
         else:
             color = restore_mean(color, gathered * aligned.modulation)
-            aovs = _averaged(aligned, color / aligned.modulation)
+            aovs, light = _averaged(aligned, color / aligned.modulation, add=self.add_layers)
+            color = light * aligned.modulation if self.add_layers else color
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
@@ -240,25 +246,50 @@ def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
     return dict(zip(aligned.aovs, np.split(filtered, edges, axis=-1), strict=True)) if aligned.aovs else {}
 
 
-def _averaged(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
-    """The AOVs of a window averaged over time; those that are parts of the light add up to it if they did."""
-    centre, color = aligned.centre, aligned.color
+def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[dict[str, Array], Array]:
+    """The AOVs of a window averaged over time, and the light; parts of it add up to it if they did.
+
+    Either they give way to the denoised light, or, if that is to `add` them, it to them.
+    """
     means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
-    parts = [
-        name
-        for name, layer in aligned.aovs.items()
-        if name != ALPHA and is_part(layer[centre], means[name], color[centre], aligned.exposure)
-    ]
-    if parts:
-        whole = average(color, aligned.confidence)
-        light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
-        guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
-        moments = aligned.moments[:, : guide.shape[-1]]
-        split = split_light(
-            [means[name] for name in parts], whole, irradiance, guide, exposure=aligned.exposure, moments=moments
-        )
-        means |= dict(zip(parts, split, strict=True))
-    return means
+    kinds: dict[str, list[str]] = {}
+    for name in aligned.aovs:
+        if name != ALPHA and (kind := _kind_of(name, means[name], aligned)):
+            kinds.setdefault(kind, []).append(name)
+    if not kinds:
+        return means, irradiance
+    centre, color = aligned.centre, aligned.color
+    light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
+    guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
+    moments = aligned.moments[:, : guide.shape[-1]]
+    whole, picture = average(color, aligned.confidence), irradiance
+    # Light is the sum of its passes, and again that of its groups: the picture gives way to the first kind alone.
+    for number, names in enumerate(kinds.values()):
+        factors = [_factor(name, aligned) for name in names]
+        complete = adds_up([aligned.aovs[name][centre] for name in names], color[centre], factors)
+        given = [means[name] for name in names], None if complete else whole, picture, guide
+        if add and number == 0:
+            split, picture = add_light(*given, moments=moments, factors=factors)
+        else:
+            split = split_light(*given, exposure=aligned.exposure, moments=moments, factors=factors)
+        means |= dict(zip(names, split, strict=True))
+    return means, picture
+
+
+def _kind_of(name: str, mean: Array, aligned: AlignedWindow) -> str | None:
+    """What of the light a layer is a part of: by its name, or else by what it shows."""
+    layer, color = aligned.aovs[name][aligned.centre], aligned.color[aligned.centre]
+    if name in aligned.tints:
+        return "passes"
+    if layer.shape == color.shape and (kind := light_kind(name)) is not None:
+        return kind
+    return "passes" if is_part(layer, mean, color, aligned.exposure) else None
+
+
+def _factor(name: str, aligned: AlignedWindow) -> Array | None:
+    """What a part is multiplied by to be irradiance, where it is light without its color."""
+    tint = aligned.tints.get(name)
+    return None if tint is None else tint / aligned.modulation
 
 
 def _modulated(found: dict[str, Array], aligned: AlignedWindow) -> dict[str, Array]:
@@ -268,6 +299,8 @@ def _modulated(found: dict[str, Array], aligned: AlignedWindow) -> dict[str, Arr
         if name == ALPHA:
             own = aligned.aovs[name][aligned.centre]
             aovs[name] = np.where(_solid(own), own, light)
+        elif name in aligned.tints:  # which never were
+            aovs[name] = light
         elif light.shape[-1] == 3:
             aovs[name] = light * aligned.modulation
         else:

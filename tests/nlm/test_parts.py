@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.parts import is_part, split_light
+from nlm.parts import add_light, adds_up, is_part, split_light
 
 SIZE = (48, 64)
 
@@ -27,6 +27,32 @@ def test_parts_that_add_up_do_so_in_the_end() -> None:
     assert np.abs(np.sum(found, axis=0) - denoised).max() < 1e-5 * denoised.mean()
     for part, truth, given in zip(found, clean, noisy, strict=True):
         assert np.sqrt(np.mean((part - truth) ** 2)) < 0.3 * np.sqrt(np.mean((given - truth) ** 2))
+
+
+def test_parts_without_their_color_add_up_with_it() -> None:
+    clean, noisy = lights()
+    color = np.full((*SIZE, 3), 0.3, np.float32)
+    color[:, :20] = 0  # where it is black there is none of this light
+    factors = [color, None]
+    whole, denoised = (color * first + second for first, second in (noisy, clean))
+    assert adds_up(noisy, whole, factors)
+    assert not adds_up(noisy, whole + 1, factors)
+    found = split_light(noisy, None, denoised, None, exposure=1.0, factors=factors)
+    assert np.abs(color * found[0] + found[1] - denoised).max() < 1e-5 * denoised.mean()
+    for part, truth, given in zip(found, clean, noisy, strict=True):
+        assert np.sqrt(np.mean((part - truth) ** 2)) < 0.3 * np.sqrt(np.mean((given - truth) ** 2))
+
+
+def test_a_picture_that_gives_way_is_the_sum_of_its_parts() -> None:
+    clean, noisy = lights()
+    whole = np.sum(noisy, axis=0)
+    found, picture = add_light(noisy, None, 3 * np.sum(clean, axis=0), None)
+    np.testing.assert_allclose(np.sum(found, axis=0), picture, rtol=1e-6)
+    assert picture.mean() == pytest.approx(whole.mean(), rel=0.01)
+    # With one part alone, what is in none counts too.
+    (first,), all_of_it = add_light(noisy[:1], whole, np.sum(clean, axis=0), None)
+    assert all_of_it.mean() == pytest.approx(whole.mean(), rel=0.01)
+    assert first.mean() == pytest.approx(noisy[0].mean(), rel=0.01)
 
 
 def test_a_part_alone_leaves_the_rest_to_others() -> None:

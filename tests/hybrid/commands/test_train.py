@@ -280,6 +280,32 @@ def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
     np.testing.assert_allclose(sum(frame.aovs[layer] for layer in layers[3:]), 1, rtol=2e-3)
 
 
+@pytest.mark.parametrize("give_way", ["layers", "beauty"])
+def test_layers_in_the_file_add_up_to_the_beauty_in_it(give_way, weights, tmp_path):
+    """Light without its color, with alpha beside it; in files of half floats, of whose rounding the mean is free."""
+    scene = Scene(height=40, width=48)
+
+    def split(index, layers):
+        color = layers["ViewLayer.Combined"]
+        share = np.random.default_rng(index).uniform(0.2, 0.8, (40, 48, 1)).astype(np.float32)
+        layers["ViewLayer.DiffCol"] = layers["ViewLayer.Denoising Albedo"].copy()
+        layers["ViewLayer.DiffDir"] = share * color / layers["ViewLayer.DiffCol"]
+        layers["ViewLayer.GlossDir"] = (1 - share) * color
+        layers["ViewLayer.Combined"] = np.dstack([color, np.ones((40, 48), np.float32)])
+
+    folder = scene.write(tmp_path / "in", edit=split)
+    options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--frames", scene.first + 1]
+    parts = ("DiffDir", "GlossDir")
+    assert run("denoise", folder, "-o", tmp_path / "out", *options, "--aov", "all", "--give-way", give_way) == 0
+    frame = open_shot(tmp_path / "out", aovs=(*parts, "DiffCol")).read(scene.first + 1)
+    together = frame.aovs["DiffDir"] * frame.aovs["DiffCol"] + frame.aovs["GlossDir"]
+    assert abs((together - frame.color).mean()) < 1e-4 * frame.color.mean()
+    np.testing.assert_array_equal(frame.alpha, 1)
+    assert run("denoise", folder, "-o", tmp_path / "alone", *options) == 0
+    alone = open_shot(tmp_path / "alone").read(scene.first + 1)
+    assert np.array_equal(alone.color, frame.color) == (give_way == "layers")
+
+
 def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
     """A window of three frames sees the second frame from the first; what is in the third comes by way of that."""
 

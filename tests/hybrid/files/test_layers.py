@@ -294,6 +294,29 @@ def test_an_aov_that_is_called_like_what_is_written_needs_its_whole_name(tmp_pat
     assert str(find_layers(image, aovs=[f"light.{role}"]).aovs[f"light.{role}"]) == f"light.{role}.RGB"
 
 
+def test_all_is_every_layer_with_a_name_for_a_part_of_the_light(tmp_path):
+    lights = ["DiffDir", "DiffInd", "GlossDir", "TransInd", "VolumeDir", "Emit", "Env", "Combined_key"]
+    others = ["DiffCol", "GlossCol", "AO", "Shadow", "Mist", "UV"]
+    names = [*cycles_names(), *(f"ViewLayer.{name}.{c}" for name in (*lights, *others) for c in "RGB")]
+    layers = find_layers(headers(tmp_path, names), aovs=["all", "AO"])
+    assert list(layers.aovs) == [*sorted(f"ViewLayer.{name}" for name in lights), "AO"]
+    tinted = {"ViewLayer.DiffDir": "DiffCol", "ViewLayer.DiffInd": "DiffCol", "ViewLayer.GlossDir": "GlossCol"}
+    assert {name: tint.name for name, tint in layers.tints.items()} == {
+        name: f"ViewLayer.{tint}" for name, tint in tinted.items()
+    }
+
+
+def test_all_takes_each_part_of_the_light_once(tmp_path):
+    """Arnold's diffuse is the sum of diffuse_direct and diffuse_indirect; its alpha stays."""
+    parts = ["diffuse_direct", "diffuse_indirect", "specular", "emission"]
+    names = [*"RGBA", *(f"{name}.{c}" for name in (*parts, "diffuse", "RGBA_key") for c in "RGBA")]
+    layers = find_layers(headers(tmp_path, names), aovs=["all"])
+    assert {*layers.aovs} == {*parts, "RGBA_key"}
+    assert {len(layer.channels) for layer in layers.aovs.values()} == {3}
+    with pytest.raises(ExrError, match="aov all: no layer has a name for a part of the light"):
+        find_layers(headers(tmp_path, cycles_names()), aovs=["all"])
+
+
 def test_identifiers_are_not_averaged(tmp_path):
     names = [*cycles_names(), *(f"ViewLayer.CryptoObject00.{c}" for c in "RGBA")]
     image = headers(tmp_path, names, **{"cryptomatte/3fa1c/name": "ViewLayer.CryptoObject"})
