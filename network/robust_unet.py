@@ -351,10 +351,9 @@ def gather_and_denoise(
         1,
     )
 
-    def enter(
-        estimate: Tensor, residual: Tensor, confidence: Tensor, modulation: Tensor, guides: Tensor
-    ) -> list[Tensor]:
-        found = realise(estimate, residual, confidence, modulation, window["exposure"], window["gain"])
+    def enter(*layers: Tensor) -> list[Tensor]:
+        *given, guides = (layer.contiguous() for layer in layers)
+        found = realise(*given, window["exposure"], window["gain"])  # type: ignore[call-arg]
         still = torch.cat([found.picture, guides], 1)
         return [model.meet(found.frames, still, _known(found)), still, found.parts.sum(1), found.estimate]
 

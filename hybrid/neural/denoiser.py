@@ -237,7 +237,9 @@ class Denoiser:
 
     def _cut(self, layer: Array, outer: Block, borders: Borders) -> torch.Tensor:
         mode: PadMode = "reflect" if self.takes_estimate else "edge"
-        return tensor_of(pad(layer[:, *outer], self.model.multiple, borders, mode)).to(self._device)
+        part = pad(layer[:, *outer], self.model.multiple, borders, mode)
+        # The final stage copies some rows at a time: a frame's windows are there twice already.
+        return tensor_of(part, copied=not self.takes_estimate).to(self._device)
 
 
 def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:

@@ -15,9 +15,10 @@ Borders = tuple[tuple[int, int], tuple[int, int]]
 PadMode = Literal["edge", "reflect"]
 
 
-def tensor_of(window: Array) -> torch.Tensor:
-    """(T, H, W, C) to (1, T, C, H, W)."""
-    return torch.from_numpy(np.ascontiguousarray(window.transpose(0, 3, 1, 2)))[None]
+def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
+    """(T, H, W, C) to (1, T, C, H, W), plane by plane; or as it lies in memory, where whoever looks copies it."""
+    planes = window.transpose(0, 3, 1, 2)
+    return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
 
 
 def image_of(tensor: torch.Tensor) -> Array:
