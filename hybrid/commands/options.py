@@ -65,11 +65,10 @@ def _check_size(size: str | None) -> str | None:
 
 def check_estimate(spec: str) -> str:
     """Refuse a word that is neither a source nor the name of anything there is, before anything is made."""
-    from hybrid.estimates import OIDN_MODES
+    from hybrid.estimates import SPECS
 
-    sources = "auto", "none", "nlm", *OIDN_MODES
-    if spec not in sources and re.fullmatch(r"[\w-]*", spec) and not Path(spec).exists():
-        raise typer.BadParameter(f"it is {spec!r}, expected one of {', '.join(sources)}, or OTHER.####.exr")
+    if spec not in SPECS and re.fullmatch(r"[\w-]*", spec) and not Path(spec).exists():
+        raise typer.BadParameter(f"it is {spec!r}, expected one of {', '.join(SPECS)}, or OTHER.####.exr")
     return spec
 
 

@@ -15,7 +15,9 @@ import pytest
 import typer
 
 from hybrid.cli import app, main
+from hybrid.commands.options import check_estimate
 from hybrid.comparison.metrics import psnr
+from hybrid.estimates import SPECS
 from hybrid.files.exr import read_exr, write_layers
 from hybrid.records import read_records
 from tests.scenes import Scene
@@ -350,6 +352,24 @@ def test_bad_usage_is_two_and_makes_nothing(arguments, shot_folder, tmp_path, ca
     words = {"SHOT": str(shot_folder), "OUT": str(tmp_path / "o")}
     assert run(capsys, *(words.get(word, word) for word in arguments))[0] == 2
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("source", SPECS)
+def test_every_source_of_estimates_can_be_asked_for(source):
+    assert check_estimate(source) == source
+    with pytest.raises(typer.BadParameter, match=f"it is 'theirs', expected one of .*{source}"):
+        check_estimate("theirs")
+
+
+@pytest.mark.neural
+def test_the_bundled_network_makes_the_estimates_where_asked(shot_folder, tmp_path, capsys):
+    words = ["denoise", shot_folder, "-o", tmp_path / "out", "--frames", Scene().first, "--verbose"]
+    pictures = []
+    for source in ("bundled", "nlm"):
+        code, _, _ = run(capsys, *words, "--estimate", source)
+        assert code == 0
+        pictures.append(read_exr(tmp_path / "out" / f"shot.{Scene().first}.exr").pixels(("ViewLayer.Combined.R",)))
+    assert not np.array_equal(*pictures)
 
 
 @pytest.mark.neural
