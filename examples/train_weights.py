@@ -1,11 +1,12 @@
-"""The weights that ship: render shots, make clips of them, train the final stage from OIDN's weights.
+"""A training of the final stage from OIDN's weights: render shots, make clips of them, train each preset.
 
     python examples/train_weights.py OUT --blender-python blender/bin/python
-    python examples/train_weights.py OUT --untrained    # as the trainings begin: OIDN's weights, read from pyoidn
+    python examples/train_weights.py OUT --untrained    # as the trainings begin, which is what ships
 
 The shots are drawn from seeds (`ravg simulate random` and `hard`), so that the same come out again; none of those that
 ravg is judged or tuned on is among them. Each has a render of many samples, whose pseudo-references the others are
 trained towards. All of it goes on where it was stopped, shot by shot, and trainings from their last checkpoint.
+docs/experiments.md has what it gains.
 """
 
 from __future__ import annotations
