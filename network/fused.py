@@ -80,9 +80,9 @@ def blend_pixels(
     batch, (height, width, channels) = len(x) // frames, given.shape[1:]
     result = given.new_empty(len(kept) * batch, height, width, channels)
     arguments = np.asarray(order), np.asarray(kept), *parameters, bias, last
-    loop, bits = (_blend_rounded, torch.uint16) if x.dtype == torch.bfloat16 else (_blend, torch.float32)
+    bits = torch.uint16 if x.dtype == torch.bfloat16 else torch.uint32
     images = [values.view(bits).numpy().reshape(-1, batch * height, width, channels) for values in (given, result)]
-    on_all_cores(loop, batch * height, *images, *arguments)
+    on_all_cores(_blend, batch * height, *images, *arguments)
     return result.permute(0, 3, 1, 2)
 
 
@@ -129,35 +129,14 @@ def _blend_pixels(
 
 @njit(cache=True, nogil=True)
 def _blend(
-    first: int, stop: int, given: NDArray[np.float32], result: NDArray[np.float32], order: NDArray[Any],
-    kept: NDArray[Any], on_frame: NDArray[Any], on_average: NDArray[Any], bias: NDArray[Any], last: NDArray[Any],
+    first: int, stop: int, given: NDArray[Any], result: NDArray[Any], order: NDArray[Any], kept: NDArray[Any],
+    on_frame: NDArray[Any], on_average: NDArray[Any], bias: NDArray[Any], last: NDArray[Any],
 ) -> None:  # fmt: skip
+    # Both are bits, of float32 or of bfloat16, which is the upper half of a float32.
     T, _, W, C = given.shape
-    state, average = np.empty((T, C, _PIXELS), np.float32), np.empty((C, _PIXELS), np.float32)
-    hidden, share = np.empty((HIDDEN, _PIXELS), np.float32), np.empty((2, _PIXELS), np.float32)
-    for y in range(first, stop):
-        for start in range(0, W, _PIXELS):
-            count = min(_PIXELS, W - start)
-            for t in range(T):
-                for p in range(_PIXELS):
-                    x = start + min(p, count - 1)
-                    for c in range(C):
-                        state[t, c, p] = given[t, y, x, c]
-            _blend_pixels(state, order, on_frame, on_average, bias, last, average, hidden, share)
-            for n in range(len(kept)):
-                for p in range(count):
-                    for c in range(C):
-                        result[n, y, start + p, c] = state[kept[n], c, p]
-
-
-@njit(cache=True, nogil=True)
-def _blend_rounded(
-    first: int, stop: int, given: NDArray[np.uint16], result: NDArray[np.uint16], order: NDArray[Any],
-    kept: NDArray[Any], on_frame: NDArray[Any], on_average: NDArray[Any], bias: NDArray[Any], last: NDArray[Any],
-) -> None:  # fmt: skip
-    T, _, W, C = given.shape
+    low = np.uint32(32 - 8 * given.itemsize)
     bits, average = np.empty((T, C, _PIXELS), np.uint32), np.empty((C, _PIXELS), np.float32)
-    state = bits.view(np.float32)  # a bfloat16 is the upper half of a float32
+    state = bits.view(np.float32)
     hidden, share = np.empty((HIDDEN, _PIXELS), np.float32), np.empty((2, _PIXELS), np.float32)
     for y in range(first, stop):
         for start in range(0, W, _PIXELS):
@@ -166,11 +145,12 @@ def _blend_rounded(
                 for p in range(_PIXELS):
                     x = start + min(p, count - 1)
                     for c in range(C):
-                        bits[t, c, p] = np.uint32(given[t, y, x, c]) << np.uint32(16)
+                        bits[t, c, p] = np.uint32(given[t, y, x, c]) << low
             _blend_pixels(state, order, on_frame, on_average, bias, last, average, hidden, share)
             for n in range(len(kept)):
                 for p in range(count):
                     for c in range(C):
                         value = bits[kept[n], c, p]
-                        half = np.uint32(0x7FFF) + ((value >> np.uint32(16)) & np.uint32(1))  # ties to even
-                        result[n, y, start + p, c] = np.uint16((value + half) >> np.uint32(16))
+                        if low:
+                            value += np.uint32(0x7FFF) + ((value >> low) & np.uint32(1))  # ties to even
+                        result[n, y, start + p, c] = value >> low

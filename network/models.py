@@ -19,7 +19,7 @@ from torch.nn import functional
 from network.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
 from network.inputs import CHANNELS, network_inputs
 from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
-from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, gather_and_denoise, round_robust
+from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, denoise_window, round_robust
 
 
 @dataclass(frozen=True)
@@ -694,7 +694,7 @@ def filter_window(
     names = ("estimate", "residual", "confidence", "modulation", "exposure", "gain")
     layers = {name: cast(Tensor, window[name]) for name in names}
     albedo, normal = (None if (guide := window.get(n)) is None else centre_of(guide) for n in ("albedo", "normal"))
-    return gather_and_denoise(model, layers, albedo, normal, run)
+    return denoise_window(model, layers, albedo, normal, run)
 
 
 @torch.inference_mode()

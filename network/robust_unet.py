@@ -312,7 +312,7 @@ class RobustUNet(nn.Module):
         return [x if scale == len(self.trunk.encoder) - 1 else functional.max_pool2d(x, 2)]
 
 
-def gather_and_denoise(
+def denoise_window(
     model: RobustUNet,
     window: Mapping[str, Tensor],
     albedo: Tensor | None,

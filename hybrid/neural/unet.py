@@ -117,7 +117,7 @@ def denoise_bundled(
         Linear radiance.
     """
     half = np.full_like(color, 0.5)
-    # As where a shot has no such guide (`network.robust_unet.gather_and_denoise`): a normal of 0 is a half to a trunk.
+    # As where a shot has no such guide (`network.robust_unet.denoise_window`): a normal of 0 is a half to a trunk.
     layers = [color, half if albedo is None else albedo, np.zeros_like(color) if normal is None else normal]
     tensors = [_tensor(layer) for layer in layers]
     exposure = autoexposure(tensors[0])
