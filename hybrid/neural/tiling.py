@@ -16,7 +16,20 @@ PadMode = Literal["edge", "reflect"]
 
 
 def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
-    """(T, H, W, C) to (1, T, C, H, W), plane by plane; or as it lies in memory, where whoever looks copies it."""
+    """From layers to a tensor.
+
+    Parameters
+    ----------
+    window : (T, H, W, C) array
+        Layers.
+    copied : bool
+        Whether they are laid out plane by plane; else the tensor looks at the array, and whoever reads it copies it.
+
+    Returns
+    -------
+    Tensor
+        ``(1, T, C, H, W)``.
+    """
     planes = window.transpose(0, 3, 1, 2)
     return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
 
