@@ -108,7 +108,7 @@ def main() -> int:
     config = TrainConfig(
         steps=options.steps, loss="display", batch=4, rate=3e-4, warmup=20, ema=0.98, checkpoint_minutes=1e9
     )
-    print("| in the block's place | untrained | trained, each seed | frames give, % | CPU-s a step |")
+    print("| in the block's place | untrained | trained, each seed | frames give | CPU-s a step |")
     print("|---|---|---|---|---|")
     for name in ("RA", "joined", "none"):
         before = judge(make(name, options.size, 0), tests)[0]
@@ -122,7 +122,7 @@ def main() -> int:
             after.append(psnr)
             gives.append(shares)
         each, mean = " ".join(f"{value:.2f}" for value in after), [statistics.mean(c) for c in zip(*gives, strict=True)]
-        given = " ".join(f"{value:.0f}" for value in mean)
+        given = " ".join(f"{value:.2f}" for value in mean)
         print(f"| {name} | {before:.2f} | {each} | {given} | {statistics.mean(seconds):.2f} |", flush=True)
     return 0
 
