@@ -191,6 +191,12 @@ def prepare(
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
+    for name, there, _ in found:
+        if target is not None and (target not in there or len(there) == 1):
+            levels_there = ", ".join(there)
+            raise ValueError(
+                f"target: expected a level of {name} that is not the only one, {levels_there}, got {target!r}"
+            )
     if scheduler is not None:
         frames_of = {name: len(next(iter(shot.values()))) for name, shot, _ in found}
         words = dict(zip(names, shots, strict=True))
@@ -208,10 +214,7 @@ def prepare(
             bar.advance(len(first), f"{name} has clips already")
             continue
         levels_of, _ = judge_alike(shot, strict=strict)
-        if target is not None and (target not in levels_of or len(levels_of) == 1):
-            there = ", ".join(levels_of)
-            raise ValueError(f"target: expected a level of {name} that is not the only one, {there}, got {target!r}")
-        towards = levels_of.pop(target, None) if target is not None else None
+        towards = None if target is None else levels_of.pop(target)
         inputs = [count for level, count in zip(shot, counts, strict=True) if level != target]
         plan = plan_shot(next(iter(levels_of.values())), radius=window // 2)
         say_cuts(plan, (), strict=strict, name=name if len(found) > 1 else "")
