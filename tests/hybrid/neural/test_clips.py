@@ -121,6 +121,14 @@ def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
     np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
 
 
+def test_a_clip_holds_the_guides_without_noise_that_a_network_is_given_when_it_runs(dim, tmp_path, monkeypatch):
+    assert module.clean_guides is denoiser.clean_guides
+    monkeypatch.setattr(module, "clean_guides", lambda aligned: {"albedo": np.full_like(aligned.color[0], 0.25)})
+    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
+    assert bool((clip.clean_albedo == 0.25).all())
+    assert not bool(clip.clean_normal.any())  # as where there are none
+
+
 def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, tmp_path, monkeypatch):
     only = str(MIDDLE)
     other = SCENE.write(tmp_path / "other", clean=True, edit=bright_window)
