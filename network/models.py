@@ -19,7 +19,7 @@ from torch.nn import functional
 from network.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
 from network.inputs import CHANNELS, network_inputs
 from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
-from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, denoise_window, round_robust
+from network.robust_unet import Borders, Picture, RobustUNet, RobustUNetConfig, denoise_window, round_robust
 
 
 @dataclass(frozen=True)
@@ -659,6 +659,7 @@ def filter_window(
     window: Mapping[str, Tensor | None],
     threshold: float | None = None,
     run: Callable[..., Any] | None = None,
+    borders: Borders = ((0, 0), (0, 0)),
 ) -> Filtered | Picture:
     """Run a model on an aligned window.
 
@@ -672,6 +673,8 @@ def filter_window(
         Of the kernels, instead of the model's own; a `RobustUNet` has none.
     run : callable, optional
         Stands for the model where it is wrapped.
+    borders : pairs of int
+        By how many pixels a `RobustUNet`'s window is mirrored (`network.robust_unet.denoise_window`).
 
     Returns
     -------
@@ -694,7 +697,7 @@ def filter_window(
     names = ("estimate", "residual", "confidence", "modulation", "exposure", "gain")
     layers = {name: cast(Tensor, window[name]) for name in names}
     albedo, normal = (None if (guide := window.get(n)) is None else centre_of(guide) for n in ("albedo", "normal"))
-    return denoise_window(model, layers, albedo, normal, run)
+    return denoise_window(model, layers, albedo, normal, run, borders=borders)
 
 
 @torch.inference_mode()
@@ -704,6 +707,7 @@ def denoise_tile(
     *,
     threshold: float | None = None,
     aovs: Tensor | None = None,
+    borders: Borders = ((0, 0), (0, 0)),
 ) -> tuple[Tensor, Filtered | Picture, Tensor | None]:
     """Denoise one tile of an aligned window.
 
@@ -721,6 +725,8 @@ def denoise_tile(
     aovs : Tensor, optional
         ``(N, T, C, H, W)`` other layers, aligned like color, to be filtered with the same kernels; a `RobustUNet`
         has none.
+    borders : pairs of int
+        As for `filter_window`.
 
     Returns
     -------
@@ -736,7 +742,7 @@ def denoise_tile(
     ValueError
         See `filter_window`.
     """
-    filtered = filter_window(model, window, threshold)
+    filtered = filter_window(model, window, threshold, borders=borders)
     if isinstance(filtered, Picture):
         return filtered.irradiance, filtered, None
     denoised = filtered.image(centre_of(cast(Tensor, window["color"]))).clamp_min(0)

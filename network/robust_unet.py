@@ -13,11 +13,14 @@ from functools import partial
 from math import log
 from typing import cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from network.blocks import RobustAverage
+from network.entering import RESIDUAL_LIMIT, can_lay_out, entering
 from network.fused import HIDDEN
 from network.trunk import (
     DECODERS,
@@ -35,8 +38,6 @@ from network.trunk import (
 
 #: Channels that a frame has beside those of OIDN's networks: the gathered average, confidence, samples gathered.
 KNOWN = 5
-#: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
-RESIDUAL_LIMIT = 6.0
 #: Weight of the average in an RA block before any training.
 BLEND = 0.8
 #: Share of the average of estimates in the picture before any training, by the trunk's size: the better a trunk's
@@ -243,15 +244,22 @@ class RobustUNet(nn.Module):
         for name, length in zip(("height", "width"), still.shape[2:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"frames: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        return self.finish(self.meet(frames, still, known), still)
+        return self.finish(self.meet(self.lay_out(frames, still, known)), still)
 
-    def meet(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
+    def lay_out(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
+        """Lay all that is known of each frame side by side, ``(T·N, 14, H, W)``, time first; as for `forward`."""
+        guides = still[:, None, 3:].expand(-1, self.config.frames, -1, -1, -1)
+        # Rounded before anything is copied.
+        parts = (part.to(self.trunk.first.weight.dtype).transpose(0, 1) for part in (frames, guides, known))
+        return torch.cat(list(parts), 2).flatten(0, 1)
+
+    def meet(self, x: Tensor) -> Tensor:
         """Run the finest scale of the encoder, in whose midst the frames meet. A row depends on two on each side.
 
         Parameters
         ----------
-        frames, still, known : Tensor
-            As for `forward`, of any even height.
+        x : Tensor
+            From `lay_out`, or `network.entering.entering`, of any even height.
 
         Returns
         -------
@@ -261,12 +269,7 @@ class RobustUNet(nn.Module):
         """
         count, last = self.config.frames, max(self.config.ra_scales, default=-1)
         first = self.trunk.first
-        guides = still[:, None, 3:].expand(-1, count, -1, -1, -1)
-        # Time first, and rounded before anything is copied.
-        parts = [part.to(first.weight.dtype).transpose(0, 1).flatten(0, 1) for part in (frames, guides, known)]
-        if last < 0:
-            parts = [part.chunk(count)[count // 2] for part in parts]
-        x = torch.cat(parts, 1).contiguous(memory_format=torch.channels_last)
+        x = (x if last >= 0 else x.chunk(count)[count // 2]).to(first.weight.dtype, memory_format=torch.channels_last)
         weight = torch.cat([first.weight, self.known.weight], 1).contiguous(memory_format=torch.channels_last)
         x = functional.conv2d(x, weight, first.bias, padding=1)
         if "0" in self.average:
@@ -312,12 +315,18 @@ class RobustUNet(nn.Module):
         return [x if scale == len(self.trunk.encoder) - 1 else functional.max_pool2d(x, 2)]
 
 
+#: By how many pixels a picture is mirrored beyond its borders: rows before and after, columns before and after.
+Borders = tuple[tuple[int, int], tuple[int, int]]
+
+
 def denoise_window(
     model: RobustUNet,
     window: Mapping[str, Tensor],
     albedo: Tensor | None,
     normal: Tensor | None,
     run: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
+    *,
+    borders: Borders = ((0, 0), (0, 0)),
 ) -> Picture:
     """Run a model on an aligned window.
 
@@ -331,41 +340,62 @@ def denoise_window(
         ``(N, 3, H, W)``: the centre's guides, albedo in [0, 1], normals in [−1, 1]; without, the same everywhere.
     run : callable, optional
         Stands for the model where it is wrapped.
+    borders : pairs of int
+        By how many pixels the window is mirrored beyond its borders before the model sees it.
 
     Returns
     -------
     Picture
-        Float32.
+        Float32, of the size of the window.
 
     Notes
     -----
     Without gradients all that is done at full size is done some rows at a time (`network.trunk.in_strips`): no more of
-    five frames' features is ever there, and what is there fits the caches of a processor.
+    five frames' features is ever there, and what is there fits the caches of a processor. On a processor what enters is
+    laid out in one pass (`network.entering`).
     """
-    missing = torch.full_like(window["modulation"], 0.5)
-    guides = torch.cat(
-        [
-            missing if albedo is None else albedo.clamp(0, 1),
-            missing if normal is None else normal.clamp(-1, 1) * 0.5 + 0.5,
-        ],
-        1,
-    )
+    height, width = window["modulation"].shape[-2:]
+    sizes = zip((height, width), borders, strict=True)
+    rows, columns = (np.pad(np.arange(size), border, mode="reflect") for size, border in sizes)
 
-    def enter(*layers: Tensor) -> list[Tensor]:
-        *given, guides = (layer.contiguous() for layer in layers)
+    def realised(rows: NDArray[np.int64]) -> tuple[Realisations, Tensor]:
+        """Of these rows the frames, and what stands still beside them, in plain operations."""
+        missing = torch.full_like(window["modulation"], 0.5)
+        guides = torch.cat(
+            [
+                missing if albedo is None else albedo.clamp(0, 1),
+                missing if normal is None else normal.clamp(-1, 1) * 0.5 + 0.5,
+            ],
+            1,
+        )
+        layers = [window[name] for name in ("estimate", "residual", "confidence", "modulation")]
+        places = [torch.from_numpy(index).to(guides.device) for index in (rows, columns)]
+        *given, guides = (layer.index_select(-2, places[0]).index_select(-1, places[1]) for layer in (*layers, guides))
         found = realise(*given, window["exposure"], window["gain"])  # type: ignore[call-arg]
-        still = torch.cat([found.picture, guides], 1)
-        return [model.meet(found.frames, still, _known(found)), still, found.parts.sum(1), found.estimate]
+        return found, torch.cat([found.picture, guides], 1)
+
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        found, still = realised(rows)
+        return model.lay_out(found.frames, still, _known(found)), still, found.parts.sum(1), found.estimate
 
     if torch.is_grad_enabled():
-        found = realise(**window)
-        still = torch.cat([found.picture, guides], 1)
+        found, still = realised(rows)
         seen, keep = (model if run is None else run)(found.frames, still, _known(found))
         gathered, average = found.parts.sum(1), found.estimate
     else:
-        layers = [window[name] for name in ("estimate", "residual", "confidence", "modulation")]
-        features, still, gathered, average = in_strips(enter, 2, *layers, guides)
+        quick = can_lay_out(*window.values(), *(guide for guide in (albedo, normal) if guide is not None))
+        lay_out_rows = entering(window, albedo, normal, columns) if quick else lay_out
+
+        def enter(rows: Tensor) -> list[Tensor]:
+            frames, still, gathered, average = lay_out_rows(rows[:, 0].numpy())
+            return [model.meet(frames), still, gathered, average]
+
+        features, still, gathered, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None])
         seen, keep = model.finish(features, still)
+    (top, _), (left, _) = borders
+    seen, keep, gathered, average = (
+        layer[..., top : top + height, left : left + width] for layer in (seen, keep, gathered, average)
+    )
     # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
     light = pu_inverse(seen.float().clamp_min(0)) / (window["modulation"] * window["gain"].view(-1, 1, 1, 1))
     return Picture(light + keep * (average.clamp_min(0) - light), gathered, window)

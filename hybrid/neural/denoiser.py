@@ -19,7 +19,7 @@ from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import autoexposure, compress, measure_exposure
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.files.layers import light_kind
-from hybrid.neural.tiling import Block, Borders, PadMode, image_of, pad, tensor_of, tiles
+from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
 from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
 from hybrid.pipeline import Denoised
@@ -27,7 +27,7 @@ from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
-from network.robust_unet import Picture, RobustUNet
+from network.robust_unet import Borders, Picture, RobustUNet
 from nlm.average import average
 from nlm.gather import REACH, restore_mean
 from nlm.parts import add_light, adds_up, is_part, split_light
@@ -206,40 +206,39 @@ class Denoiser:
                 if parts is not None:
                     parts[centre][inner] = np.dstack([irradiance[inner], np.ones_like(irradiance[inner][..., :1])])
                 continue
-            borders = self._borders(outer, height, width)
-            within = tuple(
-                slice(part.start + before, part.stop + before)
-                for part, (before, _) in zip(offset, borders, strict=True)
-            )
-            window = {name: self._cut(layer, outer, borders) for name, layer in given.items()} | facts
+            window = {name: self._cut(layer, outer) for name, layer in given.items()} | facts
             if "modulation" in window:
                 window["modulation"] = window["modulation"][:, 0]
-            aovs = self._cut(others, outer, borders) if others.size else None
-            out, sums, through = denoise_tile(self.model, window, threshold=self.threshold, aovs=aovs)
-            irradiance[inner] = image_of(out)[within]
+            aovs = self._cut(others, outer) if others.size else None
+            borders = self._borders(outer, height, width)
+            out, sums, through = denoise_tile(self.model, window, threshold=self.threshold, aovs=aovs, borders=borders)
+            irradiance[inner] = image_of(out)[offset]
             if gathered is not None and isinstance(sums, Picture):
-                gathered[inner] = image_of(sums.gathered)[within]
+                gathered[inner] = image_of(sums.gathered)[offset]
             if through is not None:
-                filtered[inner] = image_of(through)[within]
+                filtered[inner] = image_of(through)[offset]
             if parts is not None:
                 tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
-                parts[:, *inner] = tile[:, *within]
+                parts[:, *inner] = tile[:, *offset]
         return irradiance, filtered, parts, gathered
 
     def _borders(self, outer: Block, height: int, width: int) -> Borders:
-        """By how many pixels a part is mirrored on each side: where the picture ends."""
-        border = MIRRORED if self.takes_estimate else 0
-        rows, columns = (
-            (border if part.start == 0 else 0, border if part.stop == size else 0)
-            for part, size in zip(outer, (height, width), strict=True)
-        )
-        return rows, columns
+        """By how many pixels a part is mirrored: where the picture ends, and up to the size that a trunk needs."""
+        if not self.takes_estimate:
+            return (0, 0), (0, 0)
 
-    def _cut(self, layer: Array, outer: Block, borders: Borders) -> torch.Tensor:
-        mode: PadMode = "reflect" if self.takes_estimate else "edge"
-        part = pad(layer[:, *outer], self.model.multiple, borders, mode)
-        # The final stage copies some rows at a time: a frame's windows are there twice already.
-        return tensor_of(part, copied=not self.takes_estimate).to(self._device)
+        def border(part: slice, size: int) -> tuple[int, int]:
+            before, after = MIRRORED * (part.start == 0), MIRRORED * (part.stop == size)
+            return before, after + -(part.stop - part.start + before + after) % self.model.multiple
+
+        rows, columns = outer
+        return border(rows, height), border(columns, width)
+
+    def _cut(self, layer: Array, outer: Block) -> torch.Tensor:
+        # The final stage reads them where they lie, and mirrors them itself.
+        if self.takes_estimate:
+            return tensor_of(layer[:, *outer], copied=False).to(self._device)
+        return tensor_of(pad(layer[:, *outer], self.model.multiple)).to(self._device)
 
 
 def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:

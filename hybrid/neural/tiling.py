@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,8 +10,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 Block = tuple[slice, slice]
-Borders = tuple[tuple[int, int], tuple[int, int]]
-PadMode = Literal["edge", "reflect"]
 
 
 def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
@@ -39,8 +36,8 @@ def image_of(tensor: torch.Tensor) -> Array:
     return tensor[0].permute(1, 2, 0).float().cpu().numpy()
 
 
-def pad(window: Array, multiple: int, borders: Borders = ((0, 0), (0, 0)), mode: PadMode = "edge") -> Array:
-    """Add to a window what a network wants around it, and up to the size that it needs.
+def pad(window: Array, multiple: int) -> Array:
+    """Repeat the edges of a window up to the size that a network needs.
 
     Parameters
     ----------
@@ -48,22 +45,14 @@ def pad(window: Array, multiple: int, borders: Borders = ((0, 0), (0, 0)), mode:
         Layers.
     multiple : int
         Of height and width.
-    borders : pairs of int
-        Rows before and after, columns before and after.
-    mode : str
-        "edge" or "reflect", of `numpy.pad`.
 
     Returns
     -------
     (T, H', W', C) array
         No smaller.
     """
-    (top, bottom), (left, right) = borders
-    bottom += -(window.shape[1] + top + bottom) % multiple
-    right += -(window.shape[2] + left + right) % multiple
-    if not (top or bottom or left or right):
-        return window
-    return np.pad(window, ((0, 0), (top, bottom), (left, right), (0, 0)), mode=mode)
+    bottom, right = (-size % multiple for size in window.shape[1:3])
+    return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
 
 
 def tiles(

@@ -1,0 +1,176 @@
+"""What enters the final stage of a window, as one pass over memory. For running, on processors.
+
+`network.robust_unet.realise` says what it is; torch makes some sixty passes over the frames for it, and copies of
+them that are mirrored beyond their borders. Here each pixel is read once, where it lies, and what a convolution takes
+is written once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from loops.cores import on_all_cores
+from network import trunk
+
+#: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
+RESIDUAL_LIMIT = 6.0
+#: Channels of a frame: its picture, the centre's albedo and normal, the gathered average, confidence, samples gathered.
+CHANNELS = 14
+_LIMIT = np.float32(RESIDUAL_LIMIT)
+# The transfer curve (`network.trunk.pu_forward`).
+_Y0, _Y1, _A, _B, _C, _D, _E, _F, _G, _WHITE = map(np.float32, trunk.PU_CURVE)
+
+
+def can_lay_out(*layers: Tensor) -> bool:
+    """Whether `entering` takes a window of these layers.
+
+    Parameters
+    ----------
+    *layers : Tensor
+        All that it is given.
+
+    Returns
+    -------
+    bool
+    """
+    return all(layer.dtype == torch.float32 and layer.device.type == "cpu" for layer in layers)
+
+
+def entering(
+    window: Mapping[str, Tensor], albedo: Tensor | None, normal: Tensor | None, columns: NDArray[np.int64]
+) -> Callable[[NDArray[np.int64]], tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Make what lays out some rows of what enters the network.
+
+    Parameters
+    ----------
+    window : mapping of str to Tensor
+        As `network.robust_unet.realise` takes it, float32; copied where the channels are not last.
+    albedo, normal : Tensor, optional
+        ``(N, 3, H, W)``: the centre's guides.
+    columns : (w,) array of int
+        Which column of the window stands in each column of the picture.
+
+    Returns
+    -------
+    callable
+        From the rows of the window that stand in h rows of the picture to four layers:
+
+        - the frames, ``(T·N, 14, h, w)``, time first: `CHANNELS`;
+        - ``(N, 9, h, w)``, the gathered picture, and albedo and normal of the centre in [0, 1];
+        - the samples of all frames gathered, irradiance, ``(N, 3, h, w)``;
+        - the average of the estimates, likewise.
+    """
+    layers = [_pixels(window[name]) for name in ("estimate", "residual", "confidence", "modulation")]
+    batch, count = layers[0].shape[:2]
+    nothing = np.empty((batch, 0, 0, 3), np.float32)
+    layers += [nothing if guide is None else _pixels(guide) for guide in (albedo, normal)]
+    exposure, gain = (window[name].numpy() for name in ("exposure", "gain"))
+
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        size = len(rows), len(columns)
+        frames = np.empty((count, batch, *size, CHANNELS), np.float32)
+        still, gathered, average = (np.empty((batch, *size, channels), np.float32) for channels in (9, 3, 3))
+        for n in range(batch):
+            given = *(layer[n] for layer in layers), exposure[n], gain[n], rows, columns
+            on_all_cores(_enter, size[0], n, *given, frames, still, gathered, average)
+        return (
+            _planes(frames.reshape(count * batch, *size, CHANNELS)),
+            _planes(still),
+            _planes(gathered),
+            _planes(average),
+        )
+
+    return lay_out
+
+
+def _pixels(layer: Tensor) -> NDArray[np.float32]:
+    """A layer with its channels last, copied only where it lies otherwise."""
+    return layer.movedim(-3, -1).contiguous().numpy()
+
+
+def _planes(pixels: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(pixels).permute(0, 3, 1, 2)
+
+
+@njit(cache=True, nogil=True)
+def _on_curve(y: Any) -> Any:
+    if y <= _Y0:
+        return _A * y / _WHITE
+    if y <= _Y1:
+        return (_B * y**_C + _D) / _WHITE
+    return (_E * np.log(y + _F) + _G) / _WHITE
+
+
+@njit(cache=True, nogil=True)
+def _enter(
+    first: int, last: int, n: int, estimates: NDArray[np.float32], residuals: NDArray[np.float32],
+    confidence: NDArray[np.float32], modulation: NDArray[np.float32], albedo: NDArray[np.float32],
+    normal: NDArray[np.float32], exposure: np.float32, gain: np.float32, rows: NDArray[np.int64],
+    columns: NDArray[np.int64], frames: NDArray[np.float32], still: NDArray[np.float32],
+    gathered: NDArray[np.float32], average: NDArray[np.float32],
+) -> None:  # fmt: skip
+    T, zero, one, half = len(estimates), np.float32(0), np.float32(1), np.float32(0.5)
+    centre = T // 2
+    trust, share, held = np.empty(T, np.float32), np.empty(T, np.float32), np.empty((T, 3), np.float32)
+    guides, seen = np.empty(6, np.float32), np.empty(3, np.float32)
+    for y in range(first, last):
+        row = rows[y]
+        for x in range(len(columns)):
+            column = columns[x]
+            total = zero
+            for t in range(T):
+                trust[t] = confidence[t, row, column, 0]
+                total += trust[t]
+            if not total > 0:
+                trust[:] = zero
+                trust[centre] = total = one
+            squares = zero
+            for t in range(T):
+                share[t] = trust[t] / total
+                squares += share[t] * share[t]
+                level, excess = zero, zero
+                for c in range(3):
+                    level += estimates[t, row, column, c]
+                    excess += residuals[t, row, column, c]
+                limit = _LIMIT * (max(level / np.float32(3), zero) + exposure)
+                kept = limit / max(abs(excess / np.float32(3)), limit)
+                for c in range(3):
+                    held[t, c] = residuals[t, row, column, c] * kept
+            samples = one / squares / np.float32(T)
+            for c in range(3):
+                guides[c] = min(max(albedo[row, column, c], zero), one) if len(albedo) else half
+                guides[3 + c] = min(max(normal[row, column, c], -one), one) * half + half if len(normal) else half
+            for c in range(3):
+                light, noise = zero, zero
+                for t in range(T):
+                    light += share[t] * estimates[t, row, column, c]
+                    noise += share[t] * (estimates[t, row, column, c] + held[t, c])
+                average[n, y, x, c], gathered[n, y, x, c] = light, noise
+                scale = modulation[row, column, c] * gain
+                own, mean = held[centre, c], zero
+                for t in range(T):
+                    shown = _on_curve(max((light + own + trust[t] * (held[t, c] - own)) * scale, zero))
+                    frames[t, n, y, x, c] = shown
+                    mean += shown
+                picture = _on_curve(max(noise * scale, zero))
+                shift = picture - mean / np.float32(T)
+                for t in range(T):
+                    frames[t, n, y, x, c] += shift
+                still[n, y, x, c] = picture
+                seen[c] = _on_curve(max(light * scale, zero))
+            for c in range(6):
+                still[n, y, x, 3 + c] = guides[c]
+            for t in range(T):
+                for c in range(6):
+                    frames[t, n, y, x, 3 + c] = guides[c]
+                for c in range(3):
+                    frames[t, n, y, x, 9 + c] = seen[c]
+                frames[t, n, y, x, 12] = trust[t]
+                frames[t, n, y, x, 13] = samples
