@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
 from hybrid.files.frames import Frame, Frames, MappedShot, Shot
-from hybrid.pipeline import DenoiseWindow
 from hybrid.plan import Rules
+from hybrid.steady import DenoiseWindow, Pictures
 
 # Pixels on a side of the part that is measured: large enough that threads have work, small enough for seconds.
 SIDE = 512
@@ -94,9 +94,10 @@ def measure_presets(
         # A sequence's pictures are whole; what is measured is a part.
         given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
         aligner = Aligner(part, rules, radius=radius, estimates=given)
+        pictures = Pictures(aligner, denoise)
         for number in numbers:
             start = time.perf_counter()
-            denoise(aligner.align(number))
+            pictures.make(number)
             seconds = time.perf_counter() - start
         yield Measured(preset, reading + max(seconds - reading, 0) / share)
 

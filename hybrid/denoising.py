@@ -9,10 +9,11 @@ from pathlib import Path
 
 from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
 from hybrid.files.frames import Shot
-from hybrid.pipeline import Denoised, DenoiseWindow, Failed, Finished, check_written, denoise_frames, describe_run
+from hybrid.pipeline import Failed, Finished, check_written, denoise_frames, describe_run
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.plausibility import judge_layers
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
+from hybrid.steady import Denoised, DenoiseWindow
 
 
 def denoise_shot(

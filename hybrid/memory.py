@@ -145,7 +145,8 @@ def _planes(
     reach = radius if estimates is None else estimates.reach(radius)
     frames = min(2 * reach + 1, shot.count)
     window = (2 * radius + 1) * planes_aligned(layers)
-    kept = frames * frame + planes_of_flows(layers, stages, frames, radius) + planes_written(layers)
+    pictures = 3 if "steady" in stages else 1
+    kept = frames * frame + planes_of_flows(layers, stages, frames, radius) + pictures * planes_written(layers)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = max(len(header.channel_names) + frame + PREPARING, PLANES_REFINING if can_refine(stages) else 0)
     worked = 2.0 * window + FILTERING + (window if neural else 0)

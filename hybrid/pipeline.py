@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow, Aligner, Estimates
-from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.align import Aligner, Estimates
 from hybrid.beside import ReadAhead
 from hybrid.estimates import OIDN_MODES, EstimateSource
 from hybrid.files.frames import Shot, output_path
@@ -21,32 +20,14 @@ from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_lost_light, find_nonfinite
+from hybrid.steady import DenoiseWindow, Pictures
 from hybrid.timing import Timings
-from nlm.fireflies import RECURS
 
 Array = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Denoised:
-    """What came out for one frame.
-
-    Attributes
-    ----------
-    color : (H, W, 3) array
-        Radiance.
-    aovs : dict of str to (H, W, C) array
-        Other layers that were filtered along, to be written over their own channels.
-    extra : dict of str to (H, W) or (H, W, C) array
-        Layers to be added to the file.
-    """
-
-    color: Array
-    aovs: Mapping[str, Array] = field(default_factory=dict)
-    extra: Mapping[str, Array] = field(default_factory=dict)
-
-
-DenoiseWindow = Callable[[AlignedWindow], Denoised]
+# In a header: the frames whose pictures were averaged with this one's.
+BESIDE = "ravg/beside"
 # From a frame's number to the files that it was made from, by what they are.
 SourcesOf = Callable[[int], dict[str, Source]]
 
@@ -229,14 +210,15 @@ def denoise_frames(
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    sources = sources_of(all_pictures, radius, before)
-    reach = reach_of(estimates, radius)
+    sources = sources_of(all_pictures, radius, rules, before)
+    reach = reach_of(estimates, radius, rules)
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
         readers = [ReadAhead(picture, reader, timings) for picture, _ in all_pictures]
         aligners = [
             Aligner(frames, rules, radius=radius, estimates=theirs, timings=timings)
             for frames, (_, theirs) in zip(readers, all_pictures, strict=True)
         ]
+        makers = [Pictures(aligner, denoise, rows=rows, keep_going=keep_going) for aligner in aligners]
 
         def make(number: int, following: int | None) -> Finished | Callable[[], Finished]:
             """Make a frame; give what writes it, or what there is to say of one that is there."""
@@ -244,7 +226,8 @@ def denoise_frames(
             read_as = [picture.taken(number) for picture, _ in all_pictures]
             # With its number: in a shot that one window holds, all frames are made from the same files.
             made_from = describe_sources(sources(number), frame=number, layers=read_as, size=list(shot.shape))
-            again = why_stale(path, {**(attributes or {}), MADE_FROM: made_from}) if resume else ""
+            planned = {**(attributes or {}), BESIDE: _words(makers[0].beside(number)), MADE_FROM: made_from}
+            again = why_stale(path, planned) if resume else ""
             if again is None:
                 return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
             # The outermost frames are read only where something shines in the one beside them, or by a later window.
@@ -253,15 +236,15 @@ def denoise_frames(
                 near += shot.near(following, reach - (following == shot.numbers[-1]))
             for frames in readers:
                 frames.expect(near if beside else ())
-            made = [_denoise_frame(aligner, number, denoise, rows or shot.shape[0]) for aligner in aligners]
+            made = [maker.make(number) for maker in makers]
             counted = [counts for _, counts in made]
-            facts = aligners[0].facts_of(aligners[0].around(number, radius))
-            plan = as_run(rules.plan(*facts), counted[0].stages, counted[0].shares)
+            plan = as_run(rules.plan(*counted[0].facts), counted[0].stages, counted[0].shares)
             layers = [{"color": denoised.color, **denoised.aovs} for denoised, _ in made]
             with timings.stage("check"):
                 for aligner, images in zip(aligners, layers, strict=True):
                     _check_picture(images, aligner, number)
-            own = {"ravg/stages": " ".join(sorted(plan.stages)), MADE_FROM: made_from}
+            beside_it = set.intersection(*({*counts.beside} for counts in counted))
+            own = {"ravg/stages": " ".join(sorted(plan.stages)), BESIDE: _words(beside_it), MADE_FROM: made_from}
             pictures = [
                 (picture, images, denoised.extra)
                 for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
@@ -326,53 +309,8 @@ def denoise_frames(
         yield from settle()
 
 
-@dataclass(frozen=True)
-class _Counts:
-    """What there is to say of a window: as `AlignedWindow` has it, over all parts of the frame."""
-
-    repaired: int
-    fireflies: int
-    outliers: int
-    stages: frozenset[str]
-    shares: dict[str, float]
-
-
-def _denoise_frame(aligner: Aligner, number: int, denoise: DenoiseWindow, rows: int) -> tuple[Denoised, _Counts]:
-    """Denoise a frame, so many rows at a time."""
-    height, width = aligner.shot.shape
-    whole: dict[tuple[str, str], Array] = {}
-    outliers = 0
-    for top in range(0, height, rows):
-        band = slice(top, min(top + rows, height))
-        aligned = aligner.align(number, band)
-        part = denoise(aligned)
-        outliers += aligned.outliers
-        counts = _Counts(aligned.repaired, aligned.fireflies, outliers, aligned.stages, aligned.shares)
-        named = {("color", ""): part.color}
-        named |= {("aovs", name): layer for name, layer in part.aovs.items()}
-        named |= {("extra", name): layer for name, layer in part.extra.items()}
-        for name, layer in named.items():
-            if rows >= height:
-                whole[name] = layer
-                continue
-            if name not in whole:
-                whole[name] = np.empty((height, width, *layer.shape[2:]), np.float32)
-            whole[name][band] = layer[aligned.inner]
-        del aligned, part, named
-    whole["color", ""] = _with_lamps(whole["color", ""], aligner.frame(number))
-    kinds = {kind: {name: layer for (k, name), layer in whole.items() if k == kind} for kind in ("aovs", "extra")}
-    return Denoised(whole["color", ""], kinds["aovs"], kinds["extra"]), counts
-
-
-def _with_lamps(color: Array, frame: PreparedFrame | None) -> Array:
-    """The picture, with the lamps of a pixel that estimates have lost as they were rendered.
-
-    Denoisers of single frames take them for fireflies; that the next frame shows them too they cannot know.
-    """
-    if frame is None or frame.lamps is None:
-        return color
-    lost = frame.lamps & (color.mean(axis=-1) < RECURS * frame.radiance.mean(axis=-1))
-    return np.where(lost[..., None], frame.radiance, color)
+def _words(numbers: Iterable[int]) -> str:
+    return " ".join(map(str, sorted(numbers)))
 
 
 def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -> None:
@@ -392,8 +330,10 @@ def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -
         raise ValueError(f"frame {number}: {fault}; it was not written")
 
 
-def reach_of(estimates: Estimates | None, radius: int) -> int:
-    """Count the frames on each side of one that it depends on: its window, and one for what shines in a frame alone.
+def reach_of(estimates: Estimates | None, radius: int, rules: Rules) -> int:
+    """Count the frames on each side of one that it depends on.
+
+    Its window, one for what shines in a frame alone, and one for the pictures beside it, which have windows too.
 
     Parameters
     ----------
@@ -401,12 +341,14 @@ def reach_of(estimates: Estimates | None, radius: int) -> int:
         Where the estimates of single frames come from.
     radius : int
         Frames on each side of the centre of a window.
+    rules : Rules
+        What decides which stages run.
     """
-    return 1 + (radius if estimates is None else estimates.reach(radius))
+    return 1 + ("steady" in rules.allowed) + (radius if estimates is None else estimates.reach(radius))
 
 
 def sources_of(
-    pictures: Sequence[tuple[Shot, Estimates | None]], radius: int, before: SourcesOf | None = None
+    pictures: Sequence[tuple[Shot, Estimates | None]], radius: int, rules: Rules, before: SourcesOf | None = None
 ) -> SourcesOf:
     """Tell of each frame which files it is made from.
 
@@ -416,6 +358,8 @@ def sources_of(
         As `denoise_frames` has them, the shot first.
     radius : int
         Frames on each side of the centre.
+    rules : Rules
+        What decides which stages run.
     before : callable, optional
         What tells it of the frames of the shot, where they are themselves made.
 
@@ -424,7 +368,7 @@ def sources_of(
     callable
         From a frame's number to all files that its window reaches, or that these were made from.
     """
-    shot, reach = pictures[0][0], reach_of(pictures[0][1], radius)
+    shot, reach = pictures[0][0], reach_of(pictures[0][1], radius, rules)
 
     def sources(number: int) -> dict[str, Source]:
         near = shot.near(number, reach)

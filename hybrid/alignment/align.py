@@ -6,7 +6,7 @@ both read the `AlignedWindow` that it returns, and nothing after it warps again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -237,7 +237,12 @@ class Aligner:
     refine : callable
         What corrects vectors, `flow.tvl1.refine_flow` with other settings perhaps.
     timings : Timings, optional
-        Where to count the stages "read", "prepare", "estimate", "flow", "warp" and "confidence".
+        Where to count the stages "read", "prepare", "estimate", "flow", "warp", "confidence" and "steady".
+
+    Attributes
+    ----------
+    hold : collection of int
+        Frames that are not forgotten though the next window is without them.
     """
 
     def __init__(
@@ -265,6 +270,7 @@ class Aligner:
         self._flows: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
         self._refined: dict[tuple[int, int], float] = {}  # on what share of the picture
         self._chains: dict[tuple[int, int], tuple[Array, Mask]] = {}
+        self.hold: Collection[int] = ()
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
         """Align the window around frame `number`.
@@ -286,7 +292,61 @@ class Aligner:
             self.load(numbers)
         else:
             self.source.make(self, numbers)
+        # Those of this window serve the later ones, which see the same pairs from the other side.
+        self._chains = {ab: chain for ab, chain in self._chains.items() if set(ab) <= set(numbers)}
         return self._assemble(number, numbers, rows, given=self.source is not None)
+
+    @property
+    def allowed(self) -> frozenset[str]:
+        """The stages that may run on some window."""
+        return self._decide.allowed
+
+    def comparable(self, number: int) -> list[int]:
+        """Numbers of a frame and those beside it that are there, and have an estimate where estimates are read."""
+        given = None if self.source is None else self.source.files
+        return [n for n in self.around(number, 1) if self.shot.has(n) and (given is None or given.has(n))]
+
+    def align_pictures(
+        self, number: int, pictures: Mapping[int, Array], rows: slice | None = None
+    ) -> tuple[Array, Array, slice]:
+        """Align finished pictures of a frame and of those beside it, which are loaded, and compare them.
+
+        Parameters
+        ----------
+        number : int
+            The centre.
+        pictures : mapping of int to (H, W, 3) array
+            Radiance, finite, by frame; the centre's among them.
+        rows : slice, optional
+            Only these rows, and `MARGIN` around them; the whole frame without.
+
+        Returns
+        -------
+        window : (3, h, W, 3) array
+            The pictures at the centre; its own where a frame shows or has none.
+        confidence : (3, h, W) array
+            As `AlignedWindow.confidence`, with the gate asked in any case.
+        inner : slice
+            The rows that were asked for.
+        """
+        numbers = self.around(number, 1)
+        stages = self.stages_of(numbers) | (self._decide.allowed & {"gate"})
+        outer, inner = self._around_rows(rows)
+        centre = self._frames[number]
+        layers = {name: layer[outer] for name, layer in _layers(centre).items() if not name.startswith("aov ")}
+        _, confidence, seen = self._gather(number, numbers, layers, outer, stages)
+        window = self._gather_estimates(number, numbers, seen, outer, pictures)
+        with self.timings.stage("steady"):
+            one = np.ones_like(layers["color"])
+            light = window / remodulate(one, layers["albedo"]) if centre.demodulated else window
+            exposure = self._lit(number).as_rendered.exposure
+            confidence = _agree(confidence, seen, light, layers["color"], exposure, stages)
+        return window, confidence, inner
+
+    def _lit(self, number: int) -> PreparedFrame:
+        """Of the window around a frame the nearest one to it that shows anything."""
+        there = [frame for n in self.around(number, self.radius) if (frame := self.frame(n)) is not None]
+        return min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - number)))
 
     def align_noisy(self, number: int) -> AlignedWindow:
         """Align the window around a frame without estimates; all of its frames are loaded already."""
@@ -308,13 +368,14 @@ class Aligner:
             Called with each frame as it is read.
         """
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
+        kept = {*numbers, *self.hold}
         near = {n + k * self.shot.step for n in numbers for k in (-1, 0, 1)}
         self._read = {n: pair for n, pair in self._read.items() if n in near}
-        self._frames = {n: frame for n, frame in self._frames.items() if n in numbers}
-        self._small = {n: small for n, small in self._small.items() if n in numbers}
+        self._frames = {n: frame for n, frame in self._frames.items() if n in kept}
+        self._small = {n: small for n, small in self._small.items() if n in kept}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
         self._refined = {ab: share for ab, share in self._refined.items() if ab in self._flows}
-        self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in numbers}
+        self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in kept}
         for n in numbers:
             if n not in self._frames and self.shot.has(n):
                 frame, prepared = self._read_once(n)
@@ -456,24 +517,18 @@ class Aligner:
         return select_flow([flow, refined], guides, visible=visible)[0], valid
 
     def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
-        # Those of this window serve the later ones, which see the same pairs from the other side.
-        self._chains = {ab: chain for ab, chain in self._chains.items() if set(ab) <= set(numbers)}
         self._expect_alike(number, numbers)
         stages = self.stages_of(numbers)
         if given:
             # Estimates are compared in any case, for outlines: that their light is alike costs nothing to ask.
             stages |= self._decide.allowed & {"gate"}
-        centre = self._frames[number]
-        height = len(centre.irradiance)
-        rows = slice(0, height) if rows is None else rows
-        outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
-        inner = slice(rows.start - outer.start, rows.stop - outer.start)
+        centre, (outer, inner) = self._frames[number], self._around_rows(rows)
         light = "gate" in stages and not given
         layers = {name: layer[outer] for name, layer in _layers(centre, light=light, alpha="alpha" in stages).items()}
         window, confidence, seen = self._gather(number, numbers, layers, outer, stages)
         estimates, beyond = None, None
         if given:
-            estimates = self._gather_estimates(number, numbers, seen, outer)
+            estimates = self._gather_estimates(number, numbers, seen, outer, self.estimates)
             links = [None if n == number else self.flow(number, n) for n in numbers]
             flows = [None if link is None else link[0][outer] for link in links]
             there = [(self._frames.get(n), self.estimates.get(n)) for n in numbers]
@@ -481,6 +536,13 @@ class Aligner:
         with self.timings.stage("confidence"):
             aligned = self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
         return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
+
+    def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
+        """The rows of a frame that these depend on, and where these are among them; all without."""
+        height = self.shot.shape[0]
+        rows = slice(0, height) if rows is None else rows
+        outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
+        return outer, slice(rows.start - outer.start, rows.stop - outer.start)
 
     def _expect_alike(self, number: int, numbers: Sequence[int]) -> None:
         """Refuse a window of which one frame has a layer that another lacks: light divided by an albedo is no color."""
@@ -522,9 +584,11 @@ class Aligner:
                 confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
         return window, confidence, seen
 
-    def _gather_estimates(self, number: int, numbers: list[int], seen: Array, rows: slice) -> Array:
+    def _gather_estimates(
+        self, number: int, numbers: list[int], seen: Array, rows: slice, given: Mapping[int, Array | None]
+    ) -> Array:
         """Warp the estimates of a window to these rows; the centre's where a frame shows or has none: not `seen`."""
-        alone = self.estimates[number]
+        alone = given[number]
         if alone is None:
             raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
         estimates = np.repeat(alone[None, rows], len(numbers), axis=0)
@@ -532,7 +596,7 @@ class Aligner:
             link = None if neighbour == number else self.flow(number, neighbour)
             if link is None:
                 continue
-            there = self.estimates.get(neighbour)
+            there = given.get(neighbour)
             if there is None:
                 seen[index] = 0
                 continue
@@ -602,8 +666,7 @@ class Aligner:
             pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
             for layer in (color, *pictures, *([] if estimates is None else [estimates])):
                 layer[middle][gone] = average(layer, confidence)[gone]
-        there = [frame for n in self.around(centre.number, self.radius) if (frame := self.frame(n)) is not None]
-        lit = min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre.number)))
+        lit = self._lit(centre.number)
         bright = lit.as_light if "light" in window else lit.as_rendered
         outliers = 0
         near = {*self.around(centre.number, self.radius)}
@@ -619,9 +682,7 @@ class Aligner:
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
             estimates /= modulation
-            gate = color_gate(estimates, color[middle], bright.exposure)
-            floor = np.minimum(seen, AGREEING) * gate
-            confidence = np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)
+            confidence = _agree(confidence, seen, estimates, color[middle], bright.exposure, stages)
         elif "gate" in stages:
             confidence = confidence * color_gate(window.pop("light"), color[middle], bright.exposure)
         return AlignedWindow(
@@ -648,6 +709,15 @@ class Aligner:
             stages=stages,
             shares={"refine": float(np.mean(refined))} if refined else {},
         )
+
+
+def _agree(
+    confidence: Array, seen: Array, light: Array, noisy: Array, exposure: float, stages: Collection[str]
+) -> Array:
+    """Confidence in aligned estimates, by geometry, by whether they show the same light, and by that alone."""
+    gate = color_gate(light, noisy, exposure)
+    floor = np.minimum(seen, AGREEING) * gate
+    return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)
 
 
 def _warp_residuals(

@@ -51,10 +51,11 @@ from hybrid.interrupt import INTERRUPTED, interruptible
 if TYPE_CHECKING:
     from hybrid.estimates import EstimateSource
     from hybrid.files.frames import Shot
-    from hybrid.pipeline import DenoiseWindow, SourcesOf
+    from hybrid.pipeline import SourcesOf
     from hybrid.plan import Rules
     from hybrid.plausibility import Judgement
     from hybrid.records import Record
+    from hybrid.steady import DenoiseWindow
     from hybrid.timing import Timings
 
 
@@ -99,10 +100,10 @@ def pseudoref(
         return
     from hybrid.estimates import choose_estimate
     from hybrid.oidn import find_device
-    from hybrid.pipeline import Denoised
     from hybrid.plan import NEURAL_STAGES
     from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL, gated_average, gather_and_denoise
     from hybrid.pseudo_reference import filter_window as estimate_centre
+    from hybrid.steady import Denoised
     from hybrid.timing import Timings
 
     rules = rules_of(stages, no_stages)
@@ -307,7 +308,7 @@ def denoise(
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
         mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
-        ahead = reach_of(None, denoiser.radius) * (passes - 1)  # what the first pass makes
+        ahead = reach_of(None, denoiser.radius, rules) * (passes - 1)  # what the first pass makes
         choose = partial(
             choose_estimate,
             wanted,
@@ -519,7 +520,7 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
     with ExitStack() as stack:
         for number in range(1, passes):
             folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
-            made = job.shot.around(reach_of(None, job.radius) * (passes - number))  # what later passes reach
+            made = job.shot.around(reach_of(None, job.radius, job.rules) * (passes - number))  # what later passes reach
             early = replace(job, shot=made, output=str(folder), keep_going=False)
             _run(replace(early, command=f"{command}, pass {number} of {passes}"))
             files = {n: output_path(folder, made, n) for n in made.numbers}
@@ -534,7 +535,9 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
                 source=source,
                 others=others,
                 command=f"{command}, pass {passes} of {passes}",
-                before=sources_of([(shot, theirs.estimates) for shot, theirs in pictures], job.radius, job.before),
+                before=sources_of(
+                    [(shot, theirs.estimates) for shot, theirs in pictures], job.radius, job.rules, job.before
+                ),
             )
         yield job
 

@@ -25,6 +25,7 @@ from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Plan, Rules, plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise
+from hybrid.steady import Pictures
 from nlm.average import average, replace_nonfinite, robust_average
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _plan(shot: Shot | MappedShot) -> Plan:
     return plan_shot(shot)
 
 
-def _windows(
+def _aligner(
     shot: Shot,
     *,
     radius: int = 2,
@@ -128,8 +129,8 @@ def _windows(
     flip: str = "",
     vectors: bool = True,
     solver: Mapping[str, Any] | None = None,
-) -> Iterator[AlignedWindow]:
-    """Every aligned window with the stages that it calls for.
+) -> Aligner:
+    """What aligns windows with the stages that they call for.
 
     `source` is that of the estimates (`hybrid.estimates`), `flip` a stage to be the other way round; without
     `vectors` those of the renderer are not looked at; `solver` has settings of TV-L1, and has it run.
@@ -141,7 +142,12 @@ def _windows(
         rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
     refine = partial(refine_flow, **(solver or {}))
     chosen = choose_estimate(source, shot, bundled=_small_network() if source == "bundled" else None)
-    aligner = Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
+    return Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
+
+
+def _windows(shot: Shot, **window: Any) -> Iterator[AlignedWindow]:
+    """Every aligned window of a shot, with the settings of `_aligner`."""
+    aligner = _aligner(shot, **window)
     for number in shot.numbers:
         yield aligner.align(number)
 
@@ -162,7 +168,7 @@ def classical(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[
     denoise : callable
         From an `AlignedWindow` to (H, W, 3) radiance.
     **window : object
-        Settings of `_windows`, by name.
+        Settings of `_aligner`, by name.
 
     Yields
     ------
@@ -215,7 +221,7 @@ def network(
     threshold : float, optional
         Of its kernels, in units of 1/K; the weights' own without.
     **window : object
-        Settings of `_windows`, by name.
+        Settings of `_aligner`, by name.
 
     Yields
     ------
@@ -223,8 +229,9 @@ def network(
         Number and linear radiance of each frame.
     """
     denoiser = _denoiser(preset, tile, precision, threshold)
-    for aligned in _windows(shot, radius=denoiser.radius, **window):
-        yield aligned.number, denoiser(aligned).color
+    pictures = Pictures(_aligner(shot, radius=denoiser.radius, **window), denoiser)
+    for number in shot.numbers:
+        yield number, pictures.make(number)[0].color
 
 
 def classical_maps(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
@@ -237,7 +244,7 @@ def classical_maps(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iter
     denoise : callable
         From an `AlignedWindow` to (H, W, 3) radiance.
     **window : object
-        Settings of `_windows`, by name.
+        Settings of `_aligner`, by name.
 
     Yields
     ------
@@ -258,7 +265,7 @@ def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[in
     preset : str
         Whose weights the network takes.
     **window : object
-        Settings of `_windows`, by name.
+        Settings of `_aligner`, by name.
 
     Yields
     ------

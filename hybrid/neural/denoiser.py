@@ -22,7 +22,7 @@ from hybrid.files.layers import light_kind
 from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
 from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
-from hybrid.pipeline import Denoised
+from hybrid.steady import Denoised
 from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
@@ -139,17 +139,20 @@ class Denoiser:
         layers = self._layers(aligned)
         irradiance, filtered, parts, gathered = self._run_tiles(aligned, layers)
         color = irradiance * aligned.modulation
+        add_up: set[str] = set()
         if gathered is None:
             aovs = _apart(filtered, aligned)
         else:
             color = restore_mean(color, gathered * aligned.modulation)
-            aovs, light = _averaged(aligned, color / aligned.modulation, add=self.add_layers)
+            aovs, light, add_up = _averaged(aligned, color / aligned.modulation, add=self.add_layers)
             color = light * aligned.modulation if self.add_layers else color
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
             extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
-        return Denoised(color, _modulated(aovs, aligned), extra)
+            if not self.takes_estimate:
+                add_up = {name for name, layer in extra.items() if layer.ndim == 3}
+        return Denoised(color, _modulated(aovs, aligned), extra, frozenset(add_up))
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
         """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
@@ -247,8 +250,8 @@ def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
     return dict(zip(aligned.aovs, np.split(filtered, edges, axis=-1), strict=True)) if aligned.aovs else {}
 
 
-def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[dict[str, Array], Array]:
-    """The AOVs of a window averaged over time, and the light; parts of it add up to it if they did.
+def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[dict[str, Array], Array, set[str]]:
+    """The AOVs of a window averaged over time, the light, and which of them are parts of it: they add up if they did.
 
     Either they give way to the denoised light, or, if that is to `add` them, it to them.
     """
@@ -258,7 +261,7 @@ def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[
         if name != ALPHA and (kind := _kind_of(name, means[name], aligned)):
             kinds.setdefault(kind, []).append(name)
     if not kinds:
-        return means, irradiance
+        return means, irradiance, set()
     centre, color = aligned.centre, aligned.color
     light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
@@ -274,7 +277,7 @@ def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[
         else:
             split = split_light(*given, exposure=aligned.exposure, moments=moments, factors=factors)
         means |= dict(zip(names, split, strict=True))
-    return means, picture
+    return means, picture, {name for names in kinds.values() for name in names}
 
 
 def _kind_of(name: str, mean: Array, aligned: AlignedWindow) -> str | None:

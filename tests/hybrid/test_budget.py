@@ -8,8 +8,8 @@ from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
 from hybrid.commands.denoise import _fitting
 from hybrid.estimates import MODE_OF
 from hybrid.files.frames import open_shot
-from hybrid.pipeline import Denoised
 from hybrid.plan import Rules
+from hybrid.steady import Denoised
 from tests.scenes import Scene
 
 SCENE = Scene(height=40, width=56, frames=5)

@@ -16,8 +16,8 @@ from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, choose_estimate
 from hybrid.files.frames import open_shot
 from hybrid.oidn import _device
-from hybrid.pipeline import Denoised, _denoise_frame
 from hybrid.pseudo_reference import SECOND_LOOK, gated_average, gather_and_denoise
+from hybrid.steady import Denoised, Pictures
 from nlm.gather import gather, restore_mean
 from tests.scenes import Scene
 
@@ -139,12 +139,13 @@ class TestWithOidn:
         scene = Scene(frames=3, height=448, width=48)
         shot = open_shot(scene.write(tmp_path))
         parts = [
-            _denoise_frame(
+            Pictures(
                 Aligner(shot, STAGES, radius=1, estimates=choose_estimate("oidn-fast", shot).estimates),
-                1002,
                 lambda aligned: Denoised(gather_and_denoise(aligned)),
-                rows,
-            )[0].color
+                rows=rows,
+            )
+            .make(1002)[0]
+            .color
             for rows in (64, 448)
         ]
         # Two networks, one after the other, see 192 rows far, and a part has 128 around it.

@@ -13,10 +13,11 @@ from hybrid.estimates import OfFrames
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import open_shot
-from hybrid.pipeline import Denoised, denoise_frames
+from hybrid.pipeline import denoise_frames
 from hybrid.plan import STAGES, Rules, plan_shot
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
 from hybrid.records import read_records
+from hybrid.steady import Denoised
 from tests.scenes import Scene
 
 # Locked off: what is odd is odd by itself. Frame numbers 1001 to 1012; the odd one is 1009.

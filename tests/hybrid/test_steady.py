@@ -1,0 +1,263 @@
+"""Finished pictures of neighbouring frames meet where they show the same, and nowhere else."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid.alignment.align import Aligner
+from hybrid.estimates import OfFrames
+from hybrid.files.exr import read_exr
+from hybrid.files.frames import open_shot
+from hybrid.files.sources import MADE_FROM
+from hybrid.pipeline import BESIDE, denoise_frames
+from hybrid.plan import Rules, decide, plan_shot
+from hybrid.records import read_records
+from hybrid.steady import MOST, WEIGHTS, Denoised, Pictures
+from tests.scenes import Scene
+
+MOVING = Scene(frames=7, noise=0.1)
+STILL = replace(MOVING, step=(0, 0))
+MIDDLE = MOVING.first + 3
+ALONE = Rules(off=frozenset({"steady"}))
+# Of a denoiser: far below what the gate lets pass (0.004 of the tone curve), far above rounding.
+ERROR = 0.003
+
+
+def truth(scene, number, scale=1.0):
+    return scene.clean(number - scene.first)["ViewLayer.Combined"] * np.float32(scale)
+
+
+def nearly(scene, scale=1.0):
+    """A denoiser that knows the truth, but for an error of its own in each pixel and frame."""
+
+    def make(aligned):
+        errors = np.random.default_rng(aligned.number).normal(0, ERROR, aligned.color.shape[1:])
+        color = truth(scene, aligned.number, scale) * np.float32(1 + errors)
+        return Denoised(np.asarray(color[: aligned.color.shape[1]], np.float32))
+
+    return make
+
+
+def pictures(shot, denoise, rules=None, **options):
+    return Pictures(Aligner(shot, rules or Rules()), denoise, **options)
+
+
+def made(shot, denoise, number=MIDDLE, rules=None, **options):
+    return pictures(shot, denoise, rules, **options).make(number)[0].color
+
+
+def flicker(shot, scene, rules):
+    maker = pictures(shot, nearly(scene), rules)
+    errors = [maker.make(n)[0].color - truth(scene, n) for n in (MIDDLE, MIDDLE + 1)]
+    inside = np.s_[8:-8, 8:-8]  # what is in all frames
+    return errors[0][inside].std()
+
+
+@pytest.mark.parametrize("scene", [STILL, MOVING])
+def test_errors_that_change_from_frame_to_frame_are_averaged(tmp_path, scene):
+    shot = open_shot(scene.write(tmp_path))
+    alone, steady = flicker(shot, scene, ALONE), flicker(shot, scene, Rules())
+    # Of weights 1 : 2 : 1 the deviation is √6 / 4 = 0.61. A pixel moved by whole pixels is not interpolated.
+    assert steady == pytest.approx(alone * np.sqrt(6) / 4, rel=0.05)
+
+
+def test_it_is_the_average_weighted_by_confidence(tmp_path):
+    shot = open_shot(STILL.write(tmp_path))
+    denoise = nearly(STILL)
+    maker = pictures(shot, denoise)
+    color = maker.make(MIDDLE)[0].color
+    own = {n: denoise(Aligner(shot, Rules()).align(n)).color for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
+    window, confidence, _ = maker.aligner.align_pictures(MIDDLE, own)
+    np.testing.assert_array_equal(window, np.stack(list(own.values())))  # nothing moves
+    assert confidence[1].min() == 1
+    assert 0.5 < confidence[0].mean() < 1
+    weight = confidence * np.array(WEIGHTS)[:, None, None]
+    expected = (weight[..., None] * window).sum(axis=0) / weight.sum(axis=0)[..., None]
+    np.testing.assert_allclose(color, expected, rtol=1e-5)
+
+
+def test_what_shows_another_light_is_left_out(tmp_path):
+    def flare(index, layers):
+        if index == 3:
+            layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * np.float32(1.3)
+
+    shot = open_shot(STILL.write(tmp_path, edit=flare))
+
+    def make(aligned):
+        return Denoised(truth(STILL, aligned.number) * np.float32(1.3 if aligned.number == MIDDLE else 1))
+
+    for number in (MIDDLE - 1, MIDDLE, MIDDLE + 1):
+        np.testing.assert_allclose(made(shot, make, number), make(Aligner(shot, ()).align(number)).color, rtol=1e-3)
+
+
+def test_nothing_is_averaged_over_a_cut(tmp_path):
+    other = np.random.default_rng(5).uniform(0, 9, (*STILL.clean(0)["ViewLayer.Combined"].shape[:2], 3))
+
+    def cut(index, layers):
+        if index > 3:
+            layers["ViewLayer.Combined"] = layers["ViewLayer.Denoising Albedo"] = other.astype(np.float32)
+            layers["ViewLayer.Denoising Normal"] = -layers["ViewLayer.Denoising Normal"]
+
+    shot = open_shot(STILL.write(tmp_path, edit=cut))
+    assert plan_shot(shot).cuts == ((MIDDLE, MIDDLE + 1),)
+    # Were the pictures alike, only the cut keeps them apart.
+    maker = pictures(shot, nearly(STILL))
+    both = {n: truth(STILL, n) for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
+    maker.make(MIDDLE)
+    _, confidence, _ = maker.aligner.align_pictures(MIDDLE, both)
+    assert confidence[0].max() > 0.5
+    assert confidence[2].max() == 0
+
+
+def test_one_frame_calls_for_none(tmp_path):
+    shot = open_shot(replace(STILL, frames=1).write(tmp_path))
+    denoised, counts = pictures(shot, nearly(STILL)).make(STILL.first)
+    np.testing.assert_array_equal(denoised.color, nearly(STILL)(Aligner(shot, ()).align(STILL.first)).color)
+    assert "steady" not in counts.stages
+    frames, pairs = counts.facts
+    assert not next(d for d in decide(frames, pairs).decisions if d.stage == "steady").on
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_scale_is_kept(tmp_path, scale):
+    one = made(open_shot(MOVING.write(tmp_path / "one")), nearly(MOVING))
+    other = made(open_shot(MOVING.write(tmp_path / "other", scale=scale)), nearly(MOVING, scale))
+    np.testing.assert_allclose(other / np.float32(scale), one, rtol=1e-4)
+
+
+def test_a_part_of_a_frame_is_what_the_whole_is_there(tmp_path):
+    scene = replace(MOVING, height=480)
+    shot = open_shot(scene.write(tmp_path))
+
+    def make(aligned):
+        rows = slice(None)
+        if aligned.color.shape[1] < scene.height:  # a part: find it in the frame
+            albedo = scene.clean(aligned.number - scene.first)["ViewLayer.Denoising Albedo"]
+            starts = range(0, scene.height, 64)
+            top = next(
+                max(s - 192, 0) for s in starts
+                if np.array_equal(albedo[max(s - 192, 0) :][: aligned.color.shape[1]], aligned.albedo[aligned.centre])
+            )  # fmt: skip
+            rows = slice(top, top + aligned.color.shape[1])
+        errors = np.random.default_rng(aligned.number).normal(0, ERROR, (scene.height, scene.width, 3))
+        return Denoised((truth(scene, aligned.number) * np.float32(1 + errors))[rows].astype(np.float32))
+
+    whole, parts = made(shot, make), made(shot, make, rows=64)
+    np.testing.assert_allclose(parts, whole, rtol=1e-6)
+
+
+def test_layers_that_add_up_to_the_color_still_do(tmp_path):
+    shot = open_shot(MOVING.write(tmp_path))
+    own = nearly(MOVING)
+
+    def make(aligned):
+        color = own(aligned).color
+        key, depth = color * np.float32(0.3), np.full(color.shape, 7, np.float32)
+        return Denoised(color, {"key": key, "depth": depth}, {"rest": color - key}, frozenset({"key", "rest"}))
+
+    denoised, _ = pictures(shot, make).make(MIDDLE)
+    assert np.abs(denoised.color - make(Aligner(shot, ()).align(MIDDLE)).color).max() > 1e-4  # something was averaged
+    np.testing.assert_allclose(denoised.aovs["key"] + denoised.extra["rest"], denoised.color, rtol=1e-5)
+    np.testing.assert_array_equal(denoised.aovs["depth"], 7)
+
+
+def test_no_pixel_changes_by_more_than_a_factor(tmp_path):
+    """One pixel of a frame is lost: its neighbours give it back as far as that goes, and a light is not doubled."""
+    shot = open_shot(STILL.write(tmp_path))
+
+    def make(aligned):
+        color = truth(STILL, aligned.number)
+        color[20, 30] *= np.float32(0.01) if aligned.number == MIDDLE else 1
+        return Denoised(color)
+
+    color = made(shot, make)
+    assert color[20, 30] == pytest.approx(MOST * 0.01 * truth(STILL, MIDDLE)[20, 30])
+    assert np.isfinite(color).all()
+
+
+class TestInFiles:
+    """`denoise_frames` makes the pictures beside a frame, and says so."""
+
+    @staticmethod
+    def run(shot, out, denoise, rules=None, **options):
+        return list(denoise_frames(shot, out, denoise, rules or Rules(), radius=1, **options))
+
+    def test_a_frame_depends_on_the_windows_beside_it(self, tmp_path):
+        shot = open_shot(MOVING.write(tmp_path / "in"), frames=str(MIDDLE))
+        begun = []
+
+        def make(aligned):
+            begun.append(aligned.number)
+            return nearly(MOVING)(aligned)
+
+        (frame,) = self.run(shot, tmp_path / "out", make)
+        assert begun == [MIDDLE - 1, MIDDLE, MIDDLE + 1]
+        header = read_exr(frame.path).parts[0].header
+        assert header[BESIDE] == f"{MIDDLE - 1} {MIDDLE} {MIDDLE + 1}"
+        assert "steady" in header["ravg/stages"].split()
+        for n in range(MIDDLE - 3, MIDDLE + 4):  # the picture beside, its window, and one for what shines alone
+            assert f"shot.{n}.exr" in header[MADE_FROM]
+
+    def test_each_picture_is_made_once(self, tmp_path):
+        begun = []
+
+        def make(aligned):
+            begun.append(aligned.number)
+            return nearly(MOVING)(aligned)
+
+        shot = open_shot(MOVING.write(tmp_path / "in"))
+        self.run(shot, tmp_path / "out", make)
+        assert begun == list(shot.numbers)
+
+    def test_a_frame_beside_that_cannot_be_made_is_done_without_where_the_run_keeps_going(self, tmp_path):
+        shot, broken = open_shot(MOVING.write(tmp_path / "in")), {MIDDLE + 1}
+
+        def make(aligned):
+            if aligned.number in broken:
+                raise ValueError("no picture")
+            return nearly(MOVING)(aligned)
+
+        with pytest.raises(ValueError, match="no picture"):
+            self.run(shot, tmp_path / "stopped", make)
+        names = sorted(path.name for path in (tmp_path / "stopped").glob("*.exr"))
+        assert names == [f"shot.{n}.exr" for n in range(MOVING.first, MIDDLE)]
+        frames = self.run(shot, tmp_path / "out", make, keep_going=True)
+        assert [type(frame).__name__ for frame in frames].count("Failed") == 1
+        assert read_exr(tmp_path / "out" / f"shot.{MIDDLE}.exr").parts[0].header[BESIDE] == f"{MIDDLE - 1} {MIDDLE}"
+        # What is whole now was not then: those beside it are made again, and no others.
+        broken.clear()
+        again = self.run(shot, tmp_path / "out", make, resume=True)
+        assert [frame.number for frame in again if not frame.resumed] == [MIDDLE, MIDDLE + 1, MIDDLE + 2]
+
+    def test_a_finished_sequence_may_end_where_the_shot_does_not(self, tmp_path):
+        folder = MOVING.write(tmp_path / "in")
+        shot = open_shot(folder, frames=f"{MOVING.first}-{MIDDLE}")
+        given = open_shot(replace(MOVING, frames=4).write(tmp_path / "given", clean=True))
+        estimates = OfFrames(
+            lambda frame: given.read(frame.number).color if given.has(frame.number) else None, 0, given
+        )
+        *_, last = self.run(shot, tmp_path / "out", nearly(MOVING), estimates=estimates)
+        assert read_exr(last.path).parts[0].header[BESIDE] == f"{MIDDLE - 1} {MIDDLE}"
+
+
+@pytest.mark.neural
+@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+def test_the_network_makes_its_pictures_so(tmp_path):
+    from hybrid.cli import main
+
+    scene = replace(MOVING, frames=3)
+    shot = scene.write(tmp_path / "in")
+
+    def run(name, *words):
+        given = ["denoise", str(shot), "-o", str(tmp_path / name), "--estimate", "bundled", "--preset", "fast"]
+        assert main([*given, "--frames", "1002", "-q", *words]) == 0
+        *_, (_, record) = read_records(tmp_path / name)
+        return read_exr(tmp_path / name / "shot.1002.exr").pixels(("ViewLayer.Combined.R",)), record
+
+    steady, record = run("steady")
+    alone, other = run("alone", "--no-stages", "steady")
+    assert np.abs(steady - alone).max() > 1e-4
+    assert "steady" in record["stages"]
+    assert "steady" not in other["stages"]
