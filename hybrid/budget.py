@@ -77,8 +77,8 @@ def measure_presets(
 
     Notes
     -----
-    Of two neighbouring frames the second is timed: while a window slides, each frame is read, estimated and aligned
-    once. The pictures of a finished sequence are counted as if they cost nothing.
+    Of two neighbouring frames the second is timed: while a window slides, each frame is read, estimated, aligned and
+    denoised once. The pictures of a finished sequence are counted as if they cost nothing.
     """
     middle = len(shot.numbers) // 2
     numbers = shot.numbers[max(0, middle - 1) : middle + 1]
@@ -94,11 +94,13 @@ def measure_presets(
         # A sequence's pictures are whole; what is measured is a part.
         given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
         aligner = Aligner(part, rules, radius=radius, estimates=given)
-        pictures = Pictures(aligner, denoise)
+        pictures, spent = Pictures(aligner, denoise), []
         for number in numbers:
             start = time.perf_counter()
             pictures.make(number)
-            seconds = time.perf_counter() - start
+            spent.append(time.perf_counter() - start)
+        # The last frame's picture is made with the one before it: then what both take together counts.
+        seconds = spent[-1] if part.has(numbers[-1] + part.step) else sum(spent) / len(spent)
         yield Measured(preset, reading + max(seconds - reading, 0) / share)
 
 

@@ -1,5 +1,8 @@
 """The preset that fits a time per frame."""
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,7 +53,18 @@ def test_presets_are_measured_from_the_most_accurate_on(tmp_path, monkeypatch, e
     measured = list(measure_presets(shot, Rules(), spec, load))
     assert [m.preset for m in measured] == ["quality", "balanced", "fast"] == list(reversed(MODE_OF))
     assert all(m.seconds > 0 for m in measured)
-    assert seen == [(m.preset, SCENE.first + k) for m in measured for k in (1, 2)]
+    # Two frames in the middle, and those beside them, whose pictures they are averaged with.
+    assert seen == [(m.preset, SCENE.first + k) for m in measured for k in (0, 1, 2, 3)]
+
+
+def test_of_two_frames_that_are_all_both_count(tmp_path):
+    shot = open_shot(replace(SCENE, frames=2).write(tmp_path))
+
+    def load(preset):
+        return (lambda window: time.sleep(0.2) or Denoised(window.color[1])), 1
+
+    # Both pictures are made for the first frame; the second alone would have cost next to nothing.
+    assert all(m.seconds >= 0.2 for m in measure_presets(shot, Rules(), "nlm", load))
 
 
 @pytest.mark.parametrize(("asked", "chosen", "tried"), [("9s", "quality", 1), ("5s", "balanced", 2), ("1s", "fast", 3)])
