@@ -226,7 +226,7 @@ def denoise_frames(
             read_as = [picture.taken(number) for picture, _ in all_pictures]
             # With its number: in a shot that one window holds, all frames are made from the same files.
             made_from = describe_sources(sources(number), frame=number, layers=read_as, size=list(shot.shape))
-            planned = {**(attributes or {}), BESIDE: _words(makers[0].beside(number)), MADE_FROM: made_from}
+            planned = {**(attributes or {}), BESIDE: _others(number, makers[0].beside(number)), MADE_FROM: made_from}
             again = why_stale(path, planned) if resume else ""
             if again is None:
                 return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
@@ -243,8 +243,12 @@ def denoise_frames(
             with timings.stage("check"):
                 for aligner, images in zip(aligners, layers, strict=True):
                     _check_picture(images, aligner, number)
-            beside_it = set.intersection(*({*counts.beside} for counts in counted))
-            own = {"ravg/stages": " ".join(sorted(plan.stages)), BESIDE: _words(beside_it), MADE_FROM: made_from}
+            others_there = _others(number, set.intersection(*({*counts.beside} for counts in counted)))
+            own = {
+                "ravg/stages": " ".join(sorted(plan.stages)),
+                BESIDE: others_there,
+                MADE_FROM: made_from,
+            }
             pictures = [
                 (picture, images, denoised.extra)
                 for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
@@ -309,8 +313,8 @@ def denoise_frames(
         yield from settle()
 
 
-def _words(numbers: Iterable[int]) -> str:
-    return " ".join(map(str, sorted(numbers)))
+def _others(number: int, numbers: Iterable[int]) -> str:
+    return " ".join(str(n) for n in sorted(numbers) if n != number)
 
 
 def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -> None:

@@ -15,12 +15,12 @@ Mask = NDArray[np.bool_]
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)
 _AROUND_SIZE = (15, 15)
-# q = _SHARE · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is
+# q = share · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is
 # noise; 0.004, one step of 8 bits, is what the estimates themselves differ by where nothing is noisy.
-_SHARE, _FLOOR = 0.3, 0.004
+SHARE, _FLOOR = 0.3, 0.004
 
 
-def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
+def color_gate(estimates: Floats, noisy: Floats, exposure: float, *, share: float = SHARE) -> Floats:
     """Weigh aligned frames by how well their denoised colours agree with the centre's.
 
     Geometry cannot see a moving shadow, highlight or reflection; the colour of a clean enough estimate can.
@@ -34,6 +34,8 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
     exposure : float
         The radiance that is mapped to one half; it scales with the frames, so that the gate does not
         depend on their scale.
+    share : float
+        How much of the centre's noise two estimates may differ by, at least 0: what they have left of it.
 
     Returns
     -------
@@ -47,7 +49,7 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
 
     Notes
     -----
-    exp(−(m/q)²), q = 0.3 s + 0.004. All in x / (x + exposure): m is the RMS over channels of the 9×9 mean of the
+    exp(−(m/q)²), q = share · s + 0.004. All in x / (x + exposure): m is the RMS over channels of the 9×9 mean of the
     difference from the centre, or the 15×15 RMS of that, whichever is greater; s the 15×15 RMS of noisy − centre.
     Non-finite values get weight 0 and do not spread.
 
@@ -72,7 +74,7 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
     on_all_cores(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
     noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
-    rate = 1 / np.square(np.float32(_SHARE) * noise + np.float32(_FLOOR))
+    rate = 1 / np.square(np.float32(share) * noise + np.float32(_FLOOR))
     weight = np.empty(estimates.shape[:3], np.float32)
     for t, estimate in enumerate(estimates):
         if t == centre_index:
