@@ -389,6 +389,9 @@ class Aligner:
                 self._read[n] = None, self._read[n][1]
                 if frame is not None:
                     seen(frame)
+        # As they were before fireflies were taken out, frames are asked only by those after them.
+        last = max(self._frames, default=0)
+        self._read = {n: pair for n, pair in self._read.items() if n >= last}
 
     def stages_of(self, numbers: Sequence[int]) -> frozenset[str]:
         """Decide which stages these frames call for; they are loaded, where they are there."""

@@ -165,6 +165,29 @@ def test_a_lamp_that_estimates_have_lost_is_as_it_was_rendered(tmp_path, step):
     np.testing.assert_array_equal(made, off)
 
 
+def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monkeypatch):
+    """Each is read once, though it is asked about those of both neighbours; a window holds no frame twice."""
+
+    def everywhere(index, layers):
+        layers["ViewLayer.Combined"][20, 2 + 5 * index] = 5000
+
+    read = []
+    monkeypatch.setattr(Aligner, "_read_once", spied(Aligner._read_once, read))
+    shot = open_shot(CALM.write(tmp_path, edit=everywhere))
+    reads = []
+    monkeypatch.setattr(type(shot), "read", spied(type(shot).read, reads))
+    aligner = Aligner(shot, Rules())
+    for number in shot.numbers:
+        assert aligner.align(number).fireflies == 1
+        # The newest, whose fireflies the next one is asked about, and what was read to ask it about its own.
+        assert set(aligner._read) <= {number + 2, number + 3, shot.numbers[-1]}
+    assert len(read) > len(reads) == len(shot.numbers)
+
+
+def spied(function, calls):
+    return lambda self, number: calls.append(number) or function(self, number)
+
+
 def test_what_fireflies_take_with_them_is_counted(tmp_path):
     shot = open_shot(CALM.write(tmp_path, edit=burnt))
     window = Aligner(shot, Rules()).align(1009)
