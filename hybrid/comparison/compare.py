@@ -243,6 +243,9 @@ def _facts_of_frames(judge: Judge) -> dict[str, str]:
     }
     if not _has_flip():
         facts["FLIP"] = "absent: flip-evaluator is not installed"
+    elif len(judge.seen_by_flip) < len(judge.numbers):
+        seen = ", ".join(map(str, judge.seen_by_flip))
+        facts["FLIP"] = f"of the frames {seen} alone: a frame of this size takes it longer than most methods"
     return facts
 
 

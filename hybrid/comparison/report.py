@@ -219,7 +219,11 @@ def report_images(
         ReportImages(
             r.name,
             partial(store.load, r.name),
-            {title: partial(store.load, r.name, title=title) for title in store.map_titles(r.name, frames[0])},
+            {
+                title: partial(store.load, r.name, title=title)
+                for title in store.map_titles(r.name, frames[0])
+                if all(store.has(r.name, number, title) for number in frames)
+            },
         )
         for r in comparison.results
         if r.absent_reason is None and not r.sweep

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from flow.motion import CYCLES, MotionConvention
+from hybrid.comparison import judging
 from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.judging import motion_between
 from hybrid.comparison.methods import external
-from hybrid.comparison.store import CHANGE_MAP, FrameStore
+from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FrameStore
 from hybrid.files.frames import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 
@@ -72,6 +73,25 @@ def test_what_changes_between_frames_is_kept_as_a_map(tmp_path: Path) -> None:
     expected = {1: 0.5, 2: 0.5, 3: 0.75, 4: 0.25, 6: 0.5}
     for number, value in expected.items():
         np.testing.assert_allclose(maps[number][4:-4, 4:-4], value, atol=1e-3)
+
+
+def test_of_large_frames_flip_judges_some_and_the_page_says_which(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("flip_evaluator")
+    shot, reference = make_shots((1, 2, 4, 5, 6))
+    every = compare_shot(shot, reference, NOISY, folder=tmp_path / "every")
+    monkeypatch.setattr(judging, "FLIP_PIXELS", SIZE[0] * SIZE[1])  # as many are none too many
+    assert compare_shot(shot, reference, NOISY).results[0].metrics["flip"] == every.results[0].metrics["flip"]
+    monkeypatch.setattr(judging, "FLIP_PIXELS", SIZE[0] * SIZE[1] - 1)
+    some = compare_shot(shot, reference, NOISY, folder=tmp_path / "some")
+    for comparison, frames in ((every, (1, 2, 4, 5, 6)), (some, (1, 5))):
+        store = FrameStore(tmp_path / ("every" if comparison is every else "some"))
+        flip = comparison.results[0].metrics["flip"].values
+        assert list(flip) == pytest.approx([float(store.load("noisy", n, FLIP_MAP).mean()) for n in frames], rel=1e-5)
+        assert len(comparison.results[0].metrics["psnr"].values) == 5
+    assert "FLIP" not in every.facts
+    assert "1, 5 alone" in some.facts["FLIP"]
 
 
 def test_only_frames_and_neighbours_that_are_there_are_judged() -> None:
