@@ -32,10 +32,11 @@ BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
 SHARE = 0.92
 # Planes that come and go while a frame is prepared, and while rows of a window are filtered.
 PREPARING, FILTERING = 14, 40
-# Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process. What is greater comes
-# once a frame, as OIDN's own 400 MiB, and would lie between what is kept of each: peak memory grew with every frame.
+# Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process. What is greater
+# comes once a frame, as OIDN's own 400 MiB, and seldom fits into what is free: peak memory grew with every frame.
+# Features of 64 rows of five frames, which come and go twenty times, are no greater.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1
-KEPT = 2**28
+KEPT = 3 * 2**26
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 

@@ -188,9 +188,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
         average = gathered.average * aligned.modulation
         image = gathered.image * aligned.modulation
     with timings.stage("denoise"):
-        albedo, normal = (
-            None if layer is None else layer[aligned.centre] for layer in (aligned.albedo, aligned.normal)
-        )
+        albedo, normal = aligned.guides.get("albedo"), aligned.guides.get("normal")
         noisy = "prefilter" in aligned.stages
         seen = denoise_oidn(
             np.maximum(image, 0),

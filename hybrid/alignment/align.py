@@ -68,8 +68,10 @@ class AlignedWindow:
         The centre frame's number.
     color : (T, H, W, 3) array
         Irradiance. A missing frame holds the centre's, with confidence 0.
-    albedo, normal : (T, H, W, 3) array or None
-        Guides.
+    guides : dict of str to (H, W, 3) array
+        The centre's albedo and normal, those that there are.
+    window_of : callable
+        What gives `albedo` and `normal`.
     confidence : (T, H, W) array
         In [0, 1]; the centre's is 1 wherever its own color was finite.
     modulation : (H, W, 3) array
@@ -112,8 +114,8 @@ class AlignedWindow:
 
     number: int
     color: Array
-    albedo: Array | None
-    normal: Array | None
+    guides: dict[str, Array]
+    window_of: Callable[[str], Array]
     confidence: Array
     modulation: Array
     clean_albedo: Array | None
@@ -134,6 +136,16 @@ class AlignedWindow:
     shares: dict[str, float] = field(default_factory=dict)
     tints: dict[str, Array] = field(default_factory=dict)
 
+    @property
+    def albedo(self) -> Array | None:
+        """That of all frames, aligned, (T, H, W, 3): each time that it is asked for, as few ask."""
+        return self.window_of("albedo") if "albedo" in self.guides else None
+
+    @property
+    def normal(self) -> Array | None:
+        """As `albedo`."""
+        return self.window_of("normal") if "normal" in self.guides else None
+
     @cached_property
     def guide(self) -> Array | None:
         """The centre's albedo and normal, prefiltered, (H, W, G).
@@ -141,8 +153,8 @@ class AlignedWindow:
         Made when asked for: averages of estimates need none.
         """
         clean = [] if self.clean_albedo is None else [self.clean_albedo]
-        if self.normal is not None:
-            clean.append(_clean(self.normal, self.trust, self.stages))
+        if "normal" in self.guides:
+            clean.append(_clean("normal", self.guides, self.window_of, self.trust, self.stages))
         return np.concatenate(clean, axis=-1) if clean else None
 
     @cached_property
@@ -337,7 +349,7 @@ class Aligner:
         outer, inner = self._around_rows(rows)
         centre = self._frames[number]
         layers = {name: layer[outer] for name, layer in _layers(centre).items() if not name.startswith("aov ")}
-        _, confidence, seen = self._gather(number, numbers, layers, outer, stages)
+        _, confidence, seen = self._gather(number, numbers, layers, outer, stages, passing=layers)
         window = self._gather_estimates(number, numbers, seen, outer, pictures)
         with self.timings.stage("steady"):
             one = np.ones_like(layers["color"])
@@ -532,16 +544,22 @@ class Aligner:
         centre, (outer, inner) = self._frames[number], self._around_rows(rows)
         light = "gate" in stages and not given
         layers = {name: layer[outer] for name, layer in _layers(centre, light=light, alpha="alpha" in stages).items()}
-        window, confidence, seen = self._gather(number, numbers, layers, outer, stages)
+        guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
+        window, confidence, seen = self._gather(number, numbers, layers, outer, stages, passing=guides)
+        flows = [None if (link := self._link(number, n)) is None else link[0][0][outer] for n in numbers]
+        frames = [self._frames.get(n) for n in numbers]
+        window_of = partial(_warp_guide, guides, frames, flows, outer)
         estimates, beyond = None, None
         if given:
             estimates = self._gather_estimates(number, numbers, seen, outer, self.estimates)
-            links = [None if n == number else self.flow(number, n) for n in numbers]
-            flows = [None if link is None else link[0][outer] for link in links]
+            steps = [None if n == number else self.flow(number, n) for n in numbers]
+            flows = [None if step is None else step[0][outer] for step in steps]
             there = [(self._frames.get(n), self.estimates.get(n)) for n in numbers]
             beyond = partial(_warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
-            aligned = self._finish(centre, window, estimates, beyond, confidence, seen, inner, stages)
+            aligned = self._finish(
+                centre, window, guides, window_of, estimates, beyond, confidence, seen, inner, stages
+            )
         return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
 
     def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
@@ -562,20 +580,30 @@ class Aligner:
                 )
 
     def _gather(
-        self, number: int, numbers: Sequence[int], layers: dict[str, Array], rows: slice, stages: frozenset[str]
+        self,
+        number: int,
+        numbers: Sequence[int],
+        layers: dict[str, Array],
+        rows: slice,
+        stages: frozenset[str],
+        passing: Collection[str],
     ) -> tuple[dict[str, Array], Array, Array]:
         """Warp the neighbours' layers to these rows of the centre, whose own are given.
 
-        Returns them, the confidence that geometry has in them, and what it could be at most: where they show anything.
+        Returns them but those that are `passing`, the confidence that geometry has in them, and what it could be at
+        most: where they show anything.
         """
         shape = len(numbers), *layers["color"].shape[:2]
-        window = {name: np.empty((*shape, layer.shape[-1]), np.float32) for name, layer in layers.items()}
+        window = {
+            name: np.empty((*shape, layer.shape[-1]), np.float32)
+            for name, layer in layers.items()
+            if name not in passing
+        }
+        passed = {name: np.empty(layers[name].shape, np.float32) for name in passing}
         confidence, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         for index, neighbour in enumerate(numbers):
-            there, link, back = self.frame(neighbour), None, None
-            if neighbour != number:
-                link, back = self.flow(number, neighbour), self.flow(neighbour, number)
-            if there is None or link is None or back is None:
+            there, links = self.frame(neighbour), self._link(number, neighbour)
+            if there is None or links is None:
                 # The centre itself, or a frame that is missing.
                 for name, kept in window.items():
                     kept[index] = layers[name]
@@ -583,13 +611,21 @@ class Aligner:
                     confidence[index] = seen[index] = self._frames[number].valid[rows]
                 continue
             with self.timings.stage("warp"):
+                link, back = links
                 flow, known = link[0][rows], link[1][rows]
-                warped = {name: kept[index] for name, kept in window.items()}
+                warped = {name: kept[index] for name, kept in window.items()} | passed
                 measured = known & self._warp(there, flow, rows, warped)
                 novelty = _novelty(flow) if "fixed-noise" in stages else 1.0
                 seen[index] = novelty * measured
                 confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
         return window, confidence, seen
+
+    def _link(self, number: int, neighbour: int) -> tuple[tuple[Array, Mask], tuple[Array, Mask]] | None:
+        """Flows to a neighbour and back; None for the centre itself, and where one of them is missing."""
+        if neighbour == number:
+            return None
+        link, back = self.flow(number, neighbour), self.flow(neighbour, number)
+        return None if link is None or back is None else (link, back)
 
     def _gather_estimates(
         self, number: int, numbers: list[int], seen: Array, rows: slice, given: Mapping[int, Array | None]
@@ -658,6 +694,8 @@ class Aligner:
         self,
         centre: PreparedFrame,
         window: dict[str, Array],
+        guides: dict[str, Array],
+        window_of: Callable[[str], Array],
         estimates: Array | None,
         beyond: Callable[[], Array] | None,
         confidence: Array,
@@ -665,7 +703,7 @@ class Aligner:
         inner: slice,
         stages: frozenset[str],
     ) -> AlignedWindow:
-        color, albedo, normal = window.pop("color"), window.get("albedo"), window.get("normal")
+        color = window.pop("color")
         middle = len(color) // 2
         gone = confidence[middle] == 0
         if gone.any():
@@ -682,7 +720,7 @@ class Aligner:
             color, rejected = reject_outliers(color, confidence)
             outliers = int(np.count_nonzero(rejected[:, inner]))
         trust = confidence
-        clean = None if albedo is None else _clean(albedo, trust, stages)
+        clean = _clean("albedo", guides, window_of, trust, stages) if "albedo" in guides else None
         modulation = np.ones_like(color[0])
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
@@ -695,8 +733,8 @@ class Aligner:
         return AlignedWindow(
             number=centre.number,
             color=color,
-            albedo=albedo,
-            normal=normal,
+            guides=guides,
+            window_of=window_of,
             confidence=confidence,
             modulation=modulation,
             clean_albedo=clean,
@@ -755,9 +793,31 @@ def _warp_residuals(
     return residuals
 
 
-def _clean(layer: Array, trust: Array, stages: Collection[str]) -> Array:
-    """The centre of a guide (T, H, W, C), prefiltered if the plan has it."""
-    return prefilter_guide(layer, trust) if "prefilter" in stages else layer[len(layer) // 2]
+def _warp_guide(
+    centre: dict[str, Array],
+    there: Sequence[PreparedFrame | None],
+    flows: Sequence[Array | None],
+    rows: slice,
+    name: str,
+) -> Array:
+    """A guide of all frames, aligned to the centre's; that of the centre where a frame has no flow."""
+    own = centre[name]
+    window = np.empty((len(there), *own.shape), np.float32)
+    for frame, flow, out in zip(there, flows, window, strict=True):
+        if frame is None or flow is None:
+            out[...] = own
+        elif flow.any():
+            warp(getattr(frame, name), flow, first_row=rows.start, out=out)
+        else:
+            out[...] = getattr(frame, name)[rows]
+    return window
+
+
+def _clean(
+    name: str, guides: dict[str, Array], window_of: Callable[[str], Array], trust: Array, stages: Collection[str]
+) -> Array:
+    """The centre's guide of this name, prefiltered if the plan has it."""
+    return prefilter_guide(window_of(name), trust) if "prefilter" in stages else guides[name]
 
 
 @dataclass(frozen=True)

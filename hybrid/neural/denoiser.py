@@ -175,7 +175,7 @@ class Denoiser:
     def _guides(self, aligned: AlignedWindow) -> dict[str, Array]:
         """The centre's guides, (1, H, W, 3), without noise where the network wants them so."""
         clean = isinstance(self.model, RobustUNet) and self.model.config.clean_guides
-        guides = clean_guides(aligned) if clean else guides_of(aligned)
+        guides = clean_guides(aligned) if clean else aligned.guides
         return {name: np.asarray(layer, np.float32)[None] for name, layer in guides.items()}
 
     def _run_tiles(
@@ -319,15 +319,9 @@ def _solid(alpha: Array) -> NDArray[np.bool_]:
     return np.logical_or(covered, empty)[..., None]
 
 
-def guides_of(aligned: AlignedWindow) -> dict[str, Array]:
-    """The centre's albedo and normal, (H, W, 3), those that there are."""
-    found = {"albedo": aligned.albedo, "normal": aligned.normal}
-    return {name: layer[aligned.centre] for name, layer in found.items() if layer is not None}
-
-
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
-    """The same, without noise where the plan has found some: in training and in running."""
-    guides = guides_of(aligned)
+    """The centre's albedo and normal, without noise where the plan has found some: in training and in running."""
+    guides = aligned.guides
     if "prefilter" not in aligned.stages or not guides:
         return guides
     if has_unet():

@@ -129,3 +129,21 @@ def test_frames_that_are_missing_have_no_confidence(tmp_path):
     assert not aligned.confidence[3:].any()
     np.testing.assert_array_equal(aligned.color[3], aligned.color[2])
     assert aligned.confidence[1].mean() > 0.5
+
+
+def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
+    """When they are asked for; the centre's are there in any case."""
+    folder = SCENE.write(tmp_path)
+    (folder / f"shot.{MIDDLE + 1}.exr").unlink()
+    aligned, alone = window(folder), open_shot(folder).read(MIDDLE)
+    for name in ("albedo", "normal"):
+        layer, own = getattr(aligned, name), aligned.guides[name]
+        np.testing.assert_array_equal(own, getattr(alone, name))
+        np.testing.assert_array_equal(layer[2], own)
+        np.testing.assert_array_equal(layer[3], own)  # a frame that is missing
+        sure = aligned.trust[1] > 0.9
+        assert sure.mean() > 0.5
+        # Whole-pixel vectors: nothing is interpolated.
+        np.testing.assert_allclose(layer[1][sure], own[sure], atol=1e-5)
+    still = Aligner(open_shot(folder), set()).align(MIDDLE)
+    assert not np.allclose(still.albedo[1][sure], still.albedo[2][sure], atol=0.01)  # something has moved
