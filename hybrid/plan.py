@@ -26,12 +26,13 @@ STAGES = {
     "gate": "do not average over time where the light itself changes",
     "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
+    "mean": "give pictures the local mean of their samples, fireflies included",
     "steady": "average finished frames with those beside them",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
 # Stages that only a network has.
-NEURAL_STAGES = frozenset({"steady", "alpha", "skip"})
+NEURAL_STAGES = frozenset({"mean", "steady", "alpha", "skip"})
 
 # Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
 STILL = 0.05
@@ -235,6 +236,7 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             ),
             _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
             _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
+            _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
             _decide("steady", float(len(pairs)), 0, "{:.0f} pairs of neighbouring frames without a cut between them"),
             Decision("alpha", False, None, 0, "no alpha in the file")
             if not transparent

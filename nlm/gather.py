@@ -18,10 +18,8 @@ Floats = NDArray[np.float32]
 # seldom goes so far; a firefly goes hundreds of times as far, and no denoiser forgives it: at 15 to 30 samples a
 # picture made without this limit lost up to 10 dB. Limits of 4 to 8 differ by less than 0.1 dB.
 _LIMIT = np.float32(6)
-# Of `restore_mean`: σ = 24 and 48 pixels bring the mean equally near.
-_SIGMA, _MOST = 24.0, 0.1
-#: How far around a pixel `restore_mean` looks: three deviations.
-REACH = 72
+# Cells of `restore_mean` on a side of σ: what is smoothed by σ = 6 cells has nothing smaller than a cell in it.
+_CELLS = 6
 
 
 @dataclass(frozen=True)
@@ -91,36 +89,62 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
     return Gathered(average, image, samples)
 
 
-def restore_mean(picture: Floats, gathered: Floats) -> Floats:
+def restore_mean(
+    picture: Floats, samples: Floats, *, sigma: float = 24, most: float = 0.1, limit: float = np.inf
+) -> Floats:
     """Give a denoised picture the local mean of the samples that it was made from.
 
     Parameters
     ----------
     picture : (H, W, 3) float32
         Denoised, linear, finite.
-    gathered : (H, W, 3) float32
+    samples : (H, W, 3) float32
         What it was made from, finite: right in the mean, and noisy.
+    sigma : float
+        Pixels, at least 6.
+    most : float
+        How much may be added or taken away, relative.
+    limit : float
+        How far from the picture a pixel of the samples may be, in units of the picture there and in the mean.
 
     Returns
     -------
     (H, W, 3) float32
-        The picture times a smooth factor between 0.9 and 1.1.
+        The picture times a smooth factor between 1 − most and 1 + most.
 
     Notes
     -----
-    With K a Gaussian mean of σ = 24 pixels and d = gathered − picture in the mean over channels, the factor is
-    1 + ρ K d / K picture, ρ = max(0, 1 − v / (K d)²): the shrinkage of James and Stein, which adds only what stands out
-    of the noise, whose variance is v = K²(d²), K² the squared weights of K.
+    With K a Gaussian mean of deviation σ and d = samples − picture in the mean over channels, held to the limit, the
+    factor is 1 + ρ K d / K picture, ρ = max(0, 1 − v / (K d)²): the shrinkage of James and Stein, which adds only what
+    stands out of the noise, whose variance is v = K²(d²), K² the squared weights of K. One bright sample is its own
+    noise, so that nothing is added for it. All means are of cells of σ / 6 pixels.
     """
-    difference, level = (_gray(image) for image in (gathered - picture, picture))
-    mean = _blur(difference, _SIGMA)
+    difference, level = _gray(samples) - _gray(picture), _gray(picture)
+    if np.isfinite(limit):
+        bound = np.float32(limit) * (level + level.mean(dtype=np.float64).astype(np.float32))
+        np.clip(difference, -bound, bound, out=difference)
+    side, (height, width) = int(sigma / _CELLS), level.shape
+    deviation = sigma / side
+    square_of_difference = _cells(np.square(difference), side)
+    mean = _blur(_cells(difference, side), deviation)
     # The squares of a Gaussian's weights are those of one narrower by √2, over 4πσ².
-    variance = _blur(np.square(difference), _SIGMA / np.sqrt(2)) / np.float32(4 * np.pi * _SIGMA**2)
+    variance = _blur(square_of_difference, deviation / np.sqrt(2)) / np.float32(4 * np.pi * sigma**2)
     square = np.square(mean)
     share = np.divide(np.maximum(square - variance, 0), square, out=np.zeros_like(square), where=square > 0)
-    below = _blur(level, _SIGMA)
+    below = _blur(_cells(level, side), deviation)
     change = np.divide(share * mean, below, out=np.zeros_like(mean), where=below > 0)
-    return np.asarray(picture * (1 + np.clip(change, -_MOST, _MOST))[..., None], np.float32)
+    factor = 1 + np.clip(change, -most, most)
+    rows, columns = factor.shape
+    factor = cv2.resize(factor, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(picture * factor[:height, :width, None], np.float32)
+
+
+def _cells(image: Floats, side: int) -> Floats:
+    """Means of cells of so many pixels on a side, mirrored to whole ones."""
+    height, width = image.shape
+    whole = cv2.copyMakeBorder(image, 0, -height % side, 0, -width % side, cv2.BORDER_REFLECT)
+    rows, columns = whole.shape[0] // side, whole.shape[1] // side
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _gray(image: Floats) -> Floats:

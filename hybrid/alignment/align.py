@@ -457,9 +457,10 @@ class Aligner:
                 known |= recurring(places, prepared.irradiance, there.irradiance, flow, valid)
         lamps = replace_fireflies(prepared.irradiance, places[known])[1] if known.any() else None
         places = places[~known]
-        clean, _, _ = replace_fireflies(prepared.irradiance, places)
-        rendered = prepared.mean
-        prepared = replace(prepared, irradiance=clean, fireflies=len(places), lamps=lamps)
+        clean, replaced, _ = replace_fireflies(prepared.irradiance, places)
+        rendered, where = prepared.mean, np.nonzero(replaced)
+        taken = (where, prepared.irradiance[where]) if len(places) else None
+        prepared = replace(prepared, irradiance=clean, fireflies=len(places), lamps=lamps, taken=taken)
         prepared = replace(prepared, burnt=max(rendered - prepared.mean, 0.0))
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
 

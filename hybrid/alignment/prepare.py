@@ -72,6 +72,8 @@ class PreparedFrame:
         Single bright samples that were taken out.
     burnt : float
         Mean radiance that went with them: what fireflies carry belongs to the picture in expectation.
+    taken : (tuple of index arrays, (K, 3) array) or None
+        Where `irradiance` is not as rendered as fireflies were taken out, and what was there.
     lamps : (H, W) bool array or None
         Single bright pixels that a neighbour shows as well; None where there are none.
     """
@@ -91,6 +93,7 @@ class PreparedFrame:
     tints: dict[str, Array] = field(default_factory=dict)
     fireflies: int = 0
     burnt: float = 0.0
+    taken: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
     lamps: Mask | None = None
 
     @cached_property
@@ -122,10 +125,22 @@ class PreparedFrame:
 
     @property
     def radiance(self) -> Array:
-        """The noisy radiance (H, W, 3)."""
+        """The noisy radiance (H, W, 3), without fireflies."""
+        return self._as_radiance(self.irradiance)
+
+    @property
+    def rendered(self) -> Array:
+        """The noisy radiance (H, W, 3), with fireflies: right in the mean."""
+        if self.taken is None:
+            return self.radiance
+        whole, (places, light) = self.irradiance.copy(), self.taken
+        whole[places] = light
+        return self._as_radiance(whole)
+
+    def _as_radiance(self, irradiance: Array) -> Array:
         if self.albedo is None or not self.demodulated:
-            return self.irradiance
-        return remodulate(self.irradiance, self.albedo)
+            return irradiance
+        return remodulate(irradiance, self.albedo)
 
     @cached_property
     def mean(self) -> float:

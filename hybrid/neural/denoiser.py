@@ -27,9 +27,8 @@ from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
-from network.robust_unet import Borders, Picture, RobustUNet
+from network.robust_unet import Borders, RobustUNet
 from nlm.average import average
-from nlm.gather import REACH, restore_mean
 from nlm.parts import add_light, adds_up, is_part, split_light
 
 Array = NDArray[np.float32]
@@ -137,22 +136,19 @@ class Denoiser:
 
     def _run(self, aligned: AlignedWindow) -> Denoised:
         layers = self._layers(aligned)
-        irradiance, filtered, parts, gathered = self._run_tiles(aligned, layers)
-        color = irradiance * aligned.modulation
-        add_up: set[str] = set()
-        if gathered is None:
-            aovs = _apart(filtered, aligned)
+        irradiance, filtered, parts = self._run_tiles(aligned, layers)
+        light, add_up = irradiance, set[str]()
+        if self.takes_estimate:
+            aovs, light, add_up = _averaged(aligned, irradiance, add=self.add_layers)
         else:
-            color = restore_mean(color, gathered * aligned.modulation)
-            aovs, light, add_up = _averaged(aligned, color / aligned.modulation, add=self.add_layers)
-            color = light * aligned.modulation if self.add_layers else color
+            aovs = _apart(filtered, aligned)
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
             extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
             if not self.takes_estimate:
                 add_up = {name for name, layer in extra.items() if layer.ndim == 3}
-        return Denoised(color, _modulated(aovs, aligned), extra, frozenset(add_up))
+        return Denoised(light * aligned.modulation, _modulated(aovs, aligned), extra, frozenset(add_up))
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
         """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
@@ -178,13 +174,8 @@ class Denoiser:
         guides = clean_guides(aligned) if clean else aligned.guides
         return {name: np.asarray(layer, np.float32)[None] for name, layer in guides.items()}
 
-    def _run_tiles(
-        self, aligned: AlignedWindow, layers: dict[str, Array]
-    ) -> tuple[Array, Array, Array | None, Array | None]:
-        """Irradiance (H, W, 3); AOVs side by side (H, W, C); with a breakdown the frames' parts (T, H, W, 4).
-
-        Fourth, for a network that gathers, the samples of all frames together, irradiance (H, W, 3).
-        """
+    def _run_tiles(self, aligned: AlignedWindow, layers: dict[str, Array]) -> tuple[Array, Array, Array | None]:
+        """Irradiance (H, W, 3); AOVs side by side (H, W, C); with a breakdown the frames' parts (T, H, W, 4)."""
         color, centre = aligned.color, aligned.centre
         frames, height, width = color.shape[:3]
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
@@ -194,15 +185,10 @@ class Denoiser:
             facts["gain"] = gain_of(aligned).to(self._device)
         # Where no tile lies, nobody looks.
         irradiance, filtered = color[centre].copy(), np.empty_like(others[centre])
-        gathered = irradiance.copy() if self.takes_estimate else None
-        rows = aligned.inner
-        if gathered is not None:  # the mean is restored from what is around
-            around = -(-REACH // self.model.multiple) * self.model.multiple
-            rows = slice(max(rows.start - around, 0), min(rows.stop + around, height))
         # A picture that is black, as far as numbers go, is left as it is.
         dark = aligned.picture is not None and measure_exposure(aligned.picture) == 1 > aligned.picture.max()
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
-        for inner, outer, offset in tiles(rows, height, width, self.tile, self.halo, self.model.multiple):
+        for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if dark or ("skip" in aligned.stages and not aligned.variance[outer].any()):
                 irradiance[inner], filtered[inner] = color[centre][inner], others[centre][inner]
@@ -216,14 +202,12 @@ class Denoiser:
             borders = self._borders(outer, height, width)
             out, sums, through = denoise_tile(self.model, window, threshold=self.threshold, aovs=aovs, borders=borders)
             irradiance[inner] = image_of(out)[offset]
-            if gathered is not None and isinstance(sums, Picture):
-                gathered[inner] = image_of(sums.gathered)[offset]
             if through is not None:
                 filtered[inner] = image_of(through)[offset]
             if parts is not None:
                 tile = torch.cat(sums.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
                 parts[:, *inner] = tile[:, *offset]
-        return irradiance, filtered, parts, gathered
+        return irradiance, filtered, parts
 
     def _borders(self, outer: Block, height: int, width: int) -> Borders:
         """By how many pixels a part is mirrored: where the picture ends, and up to the size that a trunk needs."""
