@@ -56,6 +56,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
         if not left.wait(PATIENCE):
             remove_unfinished()
             say()
+            remove_unfinished()  # what a thread has begun to write while that was said
             os._exit(INTERRUPTED)
 
     before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
