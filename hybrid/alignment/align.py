@@ -285,6 +285,9 @@ class Aligner:
         self._flows: dict[tuple[int, int], tuple[Array, Mask] | None] = {}
         self._refined: dict[tuple[int, int], float] = {}  # on what share of the picture
         self._chains: dict[tuple[int, int], tuple[Array, Mask]] = {}
+        # Of neighbours, some rows of each: where one shows the other, and how far geometry trusts it. Their pictures
+        # are compared after both windows.
+        self._trusted: dict[tuple[int, int, int, int], tuple[Mask, Array]] = {}
         self.hold: Collection[int] = ()
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
@@ -389,6 +392,7 @@ class Aligner:
         self._read = {n: pair for n, pair in self._read.items() if n in near}
         self._frames = {n: frame for n, frame in self._frames.items() if n in kept}
         self._small = {n: small for n, small in self._small.items() if n in kept}
+        self._trusted = {pair: known for pair, known in self._trusted.items() if pair[0] in kept}
         self._flows = {ab: flow for ab, flow in self._flows.items() if set(ab) <= set(self._frames)}
         self._refined = {ab: share for ab, share in self._refined.items() if ab in self._flows}
         self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in kept}
@@ -613,12 +617,16 @@ class Aligner:
                 continue
             with self.timings.stage("warp"):
                 link, back = links
-                flow, known = link[0][rows], link[1][rows]
-                warped = {name: kept[index] for name, kept in window.items()} | passed
-                measured = known & self._warp(there, flow, rows, warped)
+                flow, pair = link[0][rows], (number, neighbour, rows.start, rows.stop)
+                known = None if window else self._trusted.pop(pair, None)
+                if known is None:
+                    warped = {name: kept[index] for name, kept in window.items()} | passed
+                    measured = link[1][rows] & self._warp(there, flow, rows, warped)
+                    known = measured, self._trust(layers, warped, flow, measured, back[0], rows.start)
+                    if window and "steady" in self.allowed and abs(neighbour - number) == self.shot.step:
+                        self._trusted[pair] = known
                 novelty = _novelty(flow) if "fixed-noise" in stages else 1.0
-                seen[index] = novelty * measured
-                confidence[index] = novelty * self._trust(layers, warped, flow, measured, back[0], rows.start)
+                seen[index], confidence[index] = (novelty * part for part in known)
         return window, confidence, seen
 
     def _link(self, number: int, neighbour: int) -> tuple[tuple[Array, Mask], tuple[Array, Mask]] | None:
