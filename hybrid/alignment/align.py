@@ -455,13 +455,16 @@ class Aligner:
             places = find_fireflies(prepared.irradiance)
         if not len(places):
             return frame, prepared
-        known = np.zeros(len(places), bool)
+        # A lamp shines in every frame; noise, where there is much of it, now and then in two.
+        known, everywhere = np.zeros(len(places), bool), np.ones(len(places), bool)
         for neighbour in (prepared.number - self.shot.step, prepared.number + self.shot.step):
             if self.shot.has(neighbour):
                 _, there = self._read_once(neighbour)
                 flow, valid = rendered_flow(prepared, there) or (None, None)
-                known |= recurring(places, prepared.irradiance, there.irradiance, flow, valid)
-        lamps = replace_fireflies(prepared.irradiance, places[known])[1] if known.any() else None
+                shown = recurring(places, prepared.irradiance, there.irradiance, flow, valid)
+                known, everywhere = known | shown, everywhere & shown
+        lasting = places[known & everywhere]
+        lamps = replace_fireflies(prepared.irradiance, lasting)[1] if len(lasting) else None
         places = places[~known]
         clean, replaced, _ = replace_fireflies(prepared.irradiance, places)
         rendered, where = prepared.mean, np.nonzero(replaced)
