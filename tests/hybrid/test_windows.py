@@ -141,6 +141,22 @@ def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
     assert (window.color[2] * window.modulation)[20, 30].mean() == pytest.approx(500, rel=1e-3)
 
 
+@pytest.mark.parametrize(("shining", "lamp"), [((4, 5), False), ((4, 5, 6), True)])
+def test_what_one_neighbour_shows_too_is_kept_and_what_both_show_is_a_lamp(tmp_path, shining, lamp):
+    """Noise with long tails is bright in two frames by chance; it was put back into pictures as it was rendered."""
+
+    def shine(index, layers):
+        if index in shining:
+            layers["ViewLayer.Combined"][20, 30] = 500
+
+    aligner = Aligner(open_shot(CALM.write(tmp_path, edit=shine)), Rules())
+    aligner.load(range(1004, 1009))
+    frame = aligner.frame(1006)
+    assert frame.fireflies == 0
+    assert frame.radiance[20, 30].mean() == pytest.approx(500, rel=1e-3)
+    assert (frame.lamps is not None and bool(frame.lamps[20, 30])) == lamp
+
+
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])
 def test_a_lamp_that_estimates_have_lost_is_as_it_was_rendered(tmp_path, step):
     """OIDN, which sees one frame, takes a lamp of a pixel for a firefly: a hundredth of its light was left."""
