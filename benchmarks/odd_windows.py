@@ -25,7 +25,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flow.motion import CYCLES
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import OfFrames
 from hybrid.files.frames import Frame
 from hybrid.plan import Rules

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.transfer import measure_exposure
+from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.pictures import encode_srgb, write_png
 from nlm.average import average, replace_nonfinite

@@ -103,13 +103,13 @@ class OfGuidedFrames:
     def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
         """See `hybrid.alignment.align.Estimates`."""
         ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        around = {n: aligner.around(n, GUIDE_RADIUS) for n in ahead}
+        around = {n: aligner.frames.around(n, GUIDE_RADIUS) for n in ahead}
         aligner.load(sorted({*numbers, *chain.from_iterable(around.values())}))
         for n in ahead:
-            frame = aligner.frame(n)
+            frame = aligner.frames.get(n)
             if frame is None:
                 continue
-            noisy = "prefilter" in aligner.stages_of(around[n])
+            noisy = "prefilter" in aligner.frames.stages_of(around[n])
             alone = Frame(n, frame.radiance, frame.albedo, frame.normal)
             with aligner.timings.stage("estimate"):
                 aligner.estimates[n] = _checked(self.function(alone, noisy), alone)
@@ -137,7 +137,7 @@ class OfWindows:
     def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
         """See `hybrid.alignment.align.Estimates`."""
         ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.around(n, aligner.radius))}))
+        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.frames.around(n, aligner.radius))}))
         for n in ahead:
             aligner.estimates[n] = filter_window(aligner.align_noisy(n), self.preset, timings=aligner.timings)
 
@@ -246,7 +246,7 @@ def _choose(
             return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
         if (lacking := why_no_oidn()) is None:
             if quicker is not None and find_device(device) == "cpu":
-                return _oidn(mode, keep, "OIDN is installed; its networks run in bfloat16", "cpu", quicker)
+                return _oidn(mode, keep, "OIDN is installed; its networks run in torch", "cpu", quicker)
             return _oidn(mode, keep, "OIDN is installed", device)
         if bundled is not None:
             return _bundled(bundled, f"{lacking}; a small network comes with ravg")

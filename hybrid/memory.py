@@ -11,17 +11,9 @@ import re
 import sys
 from collections.abc import Collection
 
-from hybrid.alignment.align import (
-    MARGIN,
-    PLANES_REFINING,
-    Estimates,
-    can_refine,
-    planes_aligned,
-    planes_of_flows,
-    planes_written,
-)
-from hybrid.alignment.prepare import planes_prepared
+from hybrid.alignment.align import MARGIN, Estimates
 from hybrid.files.frames import Shot
+from hybrid.files.layers import Layers
 from hybrid.oidn import HOLDS
 
 # Rows are taken in whole strips of the guided filter.
@@ -32,6 +24,8 @@ BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
 SHARE = 0.92
 # Planes that come and go while a frame is prepared, and while rows of a window are filtered.
 PREPARING, FILTERING = 14, 40
+# And while TV-L1 solves for a flow.
+REFINING = 45
 # Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process. What is greater
 # comes once a frame, as OIDN's own 400 MiB, and seldom fits into what is free: peak memory grew with every frame.
 # Features of 64 rows of five frames, which come and go twenty times, are no greater.
@@ -143,13 +137,66 @@ def _planes(
 ) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
-    frame = planes_prepared(layers)
+    frame = _planes_prepared(layers)
     reach = radius if estimates is None else estimates.reach(radius)
     frames = min(2 * reach + 1, shot.count)
-    window = (2 * radius + 1) * planes_aligned(layers)
+    window = (2 * radius + 1) * _planes_aligned(layers)
     pictures = 3 if "steady" in stages else 1
-    kept = frames * frame + planes_of_flows(layers, stages, frames, radius) + pictures * planes_written(layers)
+    kept = frames * frame + _planes_of_flows(layers, stages, frames, radius) + pictures * _planes_written(layers)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
-    passing = max(len(header.channel_names) + frame + PREPARING, PLANES_REFINING if can_refine(stages) else 0)
+    passing = max(len(header.channel_names) + frame + PREPARING, REFINING if _can_refine(stages) else 0)
     worked = 2.0 * window + FILTERING + (window if neural else 0)
     return kept, passing, worked
+
+
+def _planes_prepared(layers: Layers) -> float:
+    """Count the float32 planes that a `PreparedFrame` of these layers holds, with its light."""
+    given = (layers.albedo, layers.normal, layers.variance)
+    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
+    single = (layers.depth is not None) + (layers.alpha is not None)
+    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.tints.values()))
+    return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
+
+
+def _planes_aligned(layers: Layers) -> float:
+    """Count the float32 planes that each frame of an `AlignedWindow` of these layers takes, with its estimate."""
+    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
+    return 3 + 3 + guides + _planes_written(layers) - 3 + 1
+
+
+def _planes_written(layers: Layers) -> float:
+    """Count the float32 planes that are made of a window: the color, and what is filtered along."""
+    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
+    return 3 + aovs + (layers.alpha is not None)
+
+
+def _planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
+    """Count the float32 planes of the flows that an `Aligner` keeps.
+
+    Parameters
+    ----------
+    layers : Layers
+        Of the shot: whether they have vectors.
+    stages : collection of str
+        That may run.
+    frames : int
+        Over which windows slide.
+    radius : int
+        Of the windows.
+
+    Returns
+    -------
+    float
+        Planes of the size of a frame, of four bytes a pixel.
+    """
+    if "warp" not in stages:
+        return 0.0
+    made = _can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
+    steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
+    chains = 2 * (radius + 1) * max(radius - 1, 0)
+    return (2 + 0.25) * (chains + steps)
+
+
+def _can_refine(stages: Collection[str]) -> bool:
+    """Whether flow may be solved for."""
+    return bool({"refine", "dense-flow"} & {*stages})

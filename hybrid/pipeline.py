@@ -253,7 +253,7 @@ def denoise_frames(
                 (picture, images, denoised.extra)
                 for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
             ]
-            extra, centre = made[0][0].extra, aligners[0].frame(number)
+            extra, centre = made[0][0].extra, aligners[0].frames.get(number)
             finished = Finished(
                 number=number,
                 path=path,
@@ -322,12 +322,12 @@ def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -
     for name, layer in images.items():
         if fault := find_nonfinite(layer):
             raise ValueError(f"frame {number}, {name}: {fault}; it was not written")
-    frame = aligner.frame(number)
+    frame = aligner.frames.get(number)
     if frame is None:
         return
 
     def around() -> float:
-        near = (aligner.frame(n) for n in aligner.around(number, aligner.radius))
+        near = (aligner.frames.get(n) for n in aligner.frames.around(number, aligner.radius))
         return max(other.mean for other in near if other is not None)
 
     if fault := find_lost_light(images["color"], frame.radiance, frame.valid, around):

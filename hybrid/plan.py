@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybrid.alignment.align import Aligner
+from hybrid.alignment.loading import LoadedFrames
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.files.frames import Frames
 from hybrid.files.sequences import format_frames
@@ -24,6 +24,7 @@ STAGES = {
     "dense-flow": "find the motion in the pictures",
     "refine": "correct the renderer's vectors by TV-L1",
     "gate": "do not average over time where the light itself changes",
+    "drift": "average less of estimates whose light drifts, as samples tell that they do not know",
     "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
     "mean": "give pictures the local mean of their samples, fireflies included",
@@ -118,7 +119,8 @@ class Plan:
 def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | None = None) -> Plan:
     """Say of the plan of a window what ran.
 
-    Where there are estimates the gate compares them in any case.
+    Where there are estimates the gate compares them in any case; where there are none, or of three frames alone, drift
+    cannot be told.
 
     Parameters
     ----------
@@ -133,15 +135,16 @@ def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | No
     -------
     Plan
     """
-    words = "estimates are compared in any case; measured: "
     decisions = []
     for decision in plan.decisions:
-        reason = decision.reason
-        if decision.stage in stages and not decision.on:
-            reason = words + reason
+        ran, reason = decision.stage in stages, decision.reason
+        if ran and not decision.on:
+            reason = f"estimates are compared in any case; measured: {reason}"
+        elif decision.on and not ran:
+            reason = f"needs estimates of five frames or more; {reason}"
         if shares is not None and decision.stage in shares:
             reason += f"; it ran on {shares[decision.stage]:.0%} of it"
-        decisions.append(replace(decision, on=decision.on or decision.stage in stages, reason=reason))
+        decisions.append(replace(decision, on=ran, reason=reason))
     return replace(plan, decisions=tuple(decisions))
 
 
@@ -214,6 +217,7 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
     unexplained = max((pair.unexplained for pair in pairs), default=0.0)
     speed = max((pair.speed for pair in pairs), default=0.0)
     moves = speed > STILL if vectors else changed > GATE_ABOVE
+    changes = "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)")
     transparent = [frame.transparent for frame in frames if frame.transparent is not None]
     return Plan(
         (
@@ -228,12 +232,8 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             _decide_warp(pairs, vectors, moves, speed, changed),
             _decide_dense_flow(pairs, vectors, moves),
             _decide_refine(moves, vectors, unexplained),
-            _decide(
-                "gate",
-                unexplained,
-                GATE_ABOVE,
-                "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)"),
-            ),
+            _decide("gate", unexplained, GATE_ABOVE, changes),
+            _decide("drift", unexplained, GATE_ABOVE, changes),
             _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
             _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
             _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
@@ -269,12 +269,12 @@ def plan_shot(
         One decision for each of `STAGES`, with the figure of the window that calls for it most.
     """
     rules = rules or Rules()
-    aligner = Aligner(shot, rules, radius=radius)
+    frames = LoadedFrames(shot, rules)
     plans = {}
     for number in shot.numbers:
-        window = aligner.around(number, radius)
-        aligner.load(window)
-        plans[number] = rules.plan(*aligner.facts_of(window))
+        window = frames.around(number, radius)
+        frames.load(window)
+        plans[number] = rules.plan(*frames.facts_of(window))
         advance()
     return merge(plans)
 

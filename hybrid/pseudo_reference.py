@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.transfer import autoexposure, compress
+from hybrid.alignment.window import AlignedWindow
 from hybrid.oidn import denoise_oidn
 from hybrid.timing import Timings
 from nlm.average import average, robust_average

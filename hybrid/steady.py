@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.window import AlignedWindow
 from nlm.average import average
 from nlm.fireflies import RECURS
 from nlm.gather import restore_mean
@@ -66,7 +67,7 @@ class Counts:
     repaired, fireflies, outliers, stages, shares
         As `AlignedWindow` has them, over all parts of the frame.
     facts : tuple
-        What its window was planned by (`Aligner.facts_of`).
+        What its window was planned by (`LoadedFrames.facts_of`).
     beside : tuple of int
         The frames whose pictures were there to be averaged, itself among them.
     """
@@ -131,12 +132,12 @@ class Pictures:
         denoised, counts = self._made[number]
         if "steady" in counts.stages and len(self._made) > 1:
             denoised = self._steady(number, denoised, {n: made.color for n, (made, _) in self._made.items()})
-        denoised = replace(denoised, color=_with_lamps(denoised.color, self.aligner.frame(number)))
+        denoised = replace(denoised, color=_with_lamps(denoised.color, self.aligner.frames.get(number)))
         return denoised, replace(counts, beside=tuple(sorted(self._made)))
 
     def beside(self, number: int) -> list[int]:
         """The frame and those beside it, whose pictures it is averaged with if they can be made."""
-        return self.aligner.comparable(number) if "steady" in self.aligner.allowed else [number]
+        return self.aligner.comparable(number) if "steady" in self.aligner.frames.allowed else [number]
 
     def _denoise(self, number: int) -> tuple[Denoised, Counts]:
         """Denoise a frame's own window."""
@@ -147,7 +148,7 @@ class Pictures:
             aligned = self.aligner.align(number, band)
             part = self.denoise(aligned)
             outliers += aligned.outliers
-            facts = self.aligner.facts_of(self.aligner.around(number, self.aligner.radius))
+            facts = self.aligner.frames.facts_of(self.aligner.frames.around(number, self.aligner.radius))
             counts = Counts(aligned.repaired, aligned.fireflies, outliers, aligned.stages, aligned.shares, facts)
             parts = part.parts
             named = {("color", ""): part.color}
@@ -165,7 +166,7 @@ class Pictures:
             {name: layer for (kind, name), layer in whole.items() if kind == wanted} for wanted in ("aovs", "extra")
         )
         denoised = Denoised(whole["color", ""], aovs, extra, parts)
-        frame = self.aligner.frame(number)
+        frame = self.aligner.frames.get(number)
         if "mean" in counts.stages and frame is not None:
             with self.aligner.timings.stage("mean"):
                 light = restore_mean(denoised.color, frame.rendered, sigma=AROUND, most=GIVEN, limit=TAKEN)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from loops.cores import on_all_cores
 from nlm.average import check_window
+from nlm.variance import gaussian_mean
 
 Floats = NDArray[np.float32]
 
@@ -126,12 +127,12 @@ def restore_mean(
     side, (height, width) = int(sigma / _CELLS), level.shape
     deviation = sigma / side
     square_of_difference = _cells(np.square(difference), side)
-    mean = _blur(_cells(difference, side), deviation)
+    mean = gaussian_mean(_cells(difference, side), deviation)
     # The squares of a Gaussian's weights are those of one narrower by √2, over 4πσ².
-    variance = _blur(square_of_difference, deviation / np.sqrt(2)) / np.float32(4 * np.pi * sigma**2)
+    variance = gaussian_mean(square_of_difference, deviation / np.sqrt(2)) / np.float32(4 * np.pi * sigma**2)
     square = np.square(mean)
     share = np.divide(np.maximum(square - variance, 0), square, out=np.zeros_like(square), where=square > 0)
-    below = _blur(_cells(level, side), deviation)
+    below = gaussian_mean(_cells(level, side), deviation)
     change = np.divide(share * mean, below, out=np.zeros_like(mean), where=below > 0)
     factor = 1 + np.clip(change, -most, most)
     rows, columns = factor.shape
@@ -149,11 +150,6 @@ def _cells(image: Floats, side: int) -> Floats:
 
 def _gray(image: Floats) -> Floats:
     return np.asarray(np.einsum("yxc->yx", image) / np.float32(image.shape[-1]), np.float32)
-
-
-def _blur(image: Floats, sigma: float) -> Floats:
-    side = 2 * int(3 * sigma) + 1
-    return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -174,6 +174,25 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0)
 
 
+def gaussian_mean(image: Floats, sigma: float) -> Floats:
+    """Average around each pixel, weighed by a Gaussian that ends at three deviations.
+
+    Parameters
+    ----------
+    image : (H, W) float32
+        In any unit, finite; mirrored beyond its borders.
+    sigma : float
+        Pixels.
+
+    Returns
+    -------
+    (H, W) float32
+        The mean. The squares of its weights are those of a Gaussian narrower by √2, over 4πσ².
+    """
+    side = 2 * int(3 * sigma) + 1
+    return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _centre_deviation(
     first: int, last: int, window: Floats, confidence: Floats, deviation: Floats, trust: Floats

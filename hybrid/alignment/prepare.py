@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame
-from hybrid.files.layers import Layers
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.guided import guided_filter, measure_guide
 
@@ -252,12 +251,3 @@ def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mas
 
 def _times(flow: Array, step: int) -> Array:
     return flow if step == 1 else flow * step
-
-
-def planes_prepared(layers: Layers) -> float:
-    """Count the float32 planes that a `PreparedFrame` of these layers holds, with its light."""
-    given = (layers.albedo, layers.normal, layers.variance)
-    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
-    single = (layers.depth is not None) + (layers.alpha is not None)
-    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.tints.values()))
-    return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.frames import Shot
 from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow
 from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import autoexposure, compress, measure_exposure
+from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.files.layers import light_kind
 from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
@@ -92,6 +92,7 @@ class Denoiser:
         if threshold is not None and not 0 <= threshold < 1:
             raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
         self.device, self._device = find_device(device)
+        self._exact = precision == "float32"
         half = precision == "bfloat16" or (precision == "auto" and has_bfloat16(self._device))
         self.precision = "bfloat16" if half else "float32"
         self.model = for_inference(load_model(weights), half).to(self._device)
@@ -110,8 +111,11 @@ class Denoiser:
 
     @property
     def quicker(self) -> Callable[..., Array] | None:
-        """What may stand for OIDN where it makes the estimates (`hybrid.estimates.choose_estimate`)."""
-        return denoise_unet if self.precision == "bfloat16" and self.device == "cpu" and has_unet() else None
+        """What may stand for OIDN where it makes the estimates (`hybrid.estimates.choose_estimate`).
+
+        Not where "float32" was asked for: then the pictures are OIDN's own.
+        """
+        return denoise_unet if self.device == "cpu" and not self._exact and has_unet() else None
 
     @property
     def halo(self) -> int:

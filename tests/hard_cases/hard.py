@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from flow.motion import CYCLES
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frames import Frame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.scenes import Scene

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import stage_layers
 from hybrid.estimates import OfFrames
 from hybrid.files.frames import open_shot

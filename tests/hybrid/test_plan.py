@@ -62,6 +62,13 @@ def test_what_ran_on_a_part_of_the_picture_says_on_how_much(shot_folder):
     assert ran["warp"] == before["warp"]
 
 
+def test_drift_that_cannot_be_told_is_not_said_to_run(shot_folder):
+    plan = plan_shot(open_shot(shot_folder)).force({"drift"})
+    ran = {d.stage: d for d in as_run(plan, {"warp"}).decisions}["drift"]
+    assert not ran.on
+    assert ran.reason.startswith("needs estimates of five frames or more; forced")
+
+
 def test_fireflies_call_for_rejection(tmp_path):
     def burn(index, layers):
         layers["ViewLayer.Combined"][7 + index, 9] = 1e5

@@ -145,7 +145,7 @@ def test_a_still_shot_is_not_warped(tmp_path):
     window = aligner.align(scene.first + 1)
     noisy = scene.noisy(0)["ViewLayer.Combined"]
     np.testing.assert_allclose(window.color[1] * window.modulation, noisy, rtol=1e-5)
-    assert (aligner.flow(scene.first + 1, scene.first)[0] == 0).all()
+    assert (aligner.flows.between(scene.first + 1, scene.first)[0] == 0).all()
 
 
 def test_without_vectors_the_motion_is_found(tmp_path):
@@ -153,7 +153,7 @@ def test_without_vectors_the_motion_is_found(tmp_path):
     folder = scene.write(tmp_path, without={"Vector"})
     aligner = Aligner(open_shot(folder), MOVING | {"dense-flow"})
     aligner.align(scene.first + 1)
-    inner = aligner.flow(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
+    inner = aligner.flows.between(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
     # The wall's 4 px squares have straight edges; most of the picture must be found to half a pixel.
     error = np.hypot(inner[..., 0] - scene.step[0], inner[..., 1] - scene.step[1])
     assert np.median(error) < 0.5

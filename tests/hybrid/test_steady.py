@@ -208,7 +208,7 @@ class TestMean:
         shot = open_shot(self.SCENE.write(tmp_path / "in", edit=shine))
         aligner = Aligner(shot, Rules())
         aligner.align(self.NUMBER)
-        frame, file = aligner.frame(self.NUMBER), shot.read(self.NUMBER).color
+        frame, file = aligner.frames.get(self.NUMBER), shot.read(self.NUMBER).color
         assert frame.fireflies >= 15
         assert frame.radiance[places(1)].mean() < 0.3 * file[places(1)].mean()
         np.testing.assert_allclose(frame.rendered, file, rtol=1e-5)

@@ -141,22 +141,6 @@ def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
     assert (window.color[2] * window.modulation)[20, 30].mean() == pytest.approx(500, rel=1e-3)
 
 
-@pytest.mark.parametrize(("shining", "lamp"), [((4, 5), False), ((4, 5, 6), True)])
-def test_what_one_neighbour_shows_too_is_kept_and_what_both_show_is_a_lamp(tmp_path, shining, lamp):
-    """Noise with long tails is bright in two frames by chance; it was put back into pictures as it was rendered."""
-
-    def shine(index, layers):
-        if index in shining:
-            layers["ViewLayer.Combined"][20, 30] = 500
-
-    aligner = Aligner(open_shot(CALM.write(tmp_path, edit=shine)), Rules())
-    aligner.load(range(1004, 1009))
-    frame = aligner.frame(1006)
-    assert frame.fireflies == 0
-    assert frame.radiance[20, 30].mean() == pytest.approx(500, rel=1e-3)
-    assert (frame.lamps is not None and bool(frame.lamps[20, 30])) == lamp
-
-
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])
 def test_a_lamp_that_estimates_have_lost_is_as_it_was_rendered(tmp_path, step):
     """OIDN, which sees one frame, takes a lamp of a pixel for a firefly: a hundredth of its light was left."""
@@ -179,29 +163,6 @@ def test_a_lamp_that_estimates_have_lost_is_as_it_was_rendered(tmp_path, step):
     assert off[at] < 6
     made[at] = off[at]
     np.testing.assert_array_equal(made, off)
-
-
-def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monkeypatch):
-    """Each is read once, though it is asked about those of both neighbours; a window holds no frame twice."""
-
-    def everywhere(index, layers):
-        layers["ViewLayer.Combined"][20, 2 + 5 * index] = 5000
-
-    read = []
-    monkeypatch.setattr(Aligner, "_read_once", spied(Aligner._read_once, read))
-    shot = open_shot(CALM.write(tmp_path, edit=everywhere))
-    reads = []
-    monkeypatch.setattr(type(shot), "read", spied(type(shot).read, reads))
-    aligner = Aligner(shot, Rules())
-    for number in shot.numbers:
-        assert aligner.align(number).fireflies == 1
-        # The newest, whose fireflies the next one is asked about, and what was read to ask it about its own.
-        assert set(aligner._read) <= {number + 2, number + 3, shot.numbers[-1]}
-    assert len(read) > len(reads) == len(shot.numbers)
-
-
-def spied(function, calls):
-    return lambda self, number: calls.append(number) or function(self, number)
 
 
 def test_what_fireflies_take_with_them_is_counted(tmp_path):
@@ -274,9 +235,9 @@ def hard_frame(layers, color, index):
 def test_every_stage_can_be_forced_either_way(tmp_path, stage):
     shot = open_shot(replace(CALM, frames=5, step=(2, 1)).write(tmp_path, edit=burnt))
     for rules, there in ((Rules(on=frozenset({stage})), True), (Rules(off=frozenset({stage})), False)):
-        window = Aligner(shot, rules, radius=1).align(1003)
+        window = Aligner(shot, rules, estimates=OfFrames(lambda frame: frame.color)).align(1003)
         assert (stage in window.stages) == there
-        decision = next(d for d in plan_shot(shot, rules, radius=1).decisions if d.stage == stage)
+        decision = next(d for d in plan_shot(shot, rules).decisions if d.stage == stage)
         assert (decision.on, decision.forced) == (there, True)
 
 
@@ -332,7 +293,7 @@ def test_vectors_that_one_frame_lacks_are_taken_from_those_beside_it_or_found(tm
 def flow_of(shot, rules):
     aligner = Aligner(shot, rules, radius=1)
     aligner.load([1002, 1003])
-    return aligner.flow(1002, 1003)
+    return aligner.flows.between(1002, 1003)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.18, 0.84])
@@ -372,3 +333,35 @@ def test_estimates_are_compared_in_any_case(tmp_path):
     assert "gate" not in off.stages
     assert np.median(off.confidence[1]) > 0.9
     assert "gate" not in plan_shot(shot).stages
+
+
+def coming(number):
+    """Light that comes and goes around frame 1006, by less a frame than estimates are off."""
+    return np.float32(1 + 0.006 * (number - 1006) ** 2)
+
+
+def test_estimates_whose_light_drifts_are_pulled_to_the_centre_and_samples_are_not(tmp_path):
+    scene = replace(CALM, height=96, width=96, noise=0.1)
+
+    def edit(index, layers):
+        layers["ViewLayer.Combined"] *= coming(index + scene.first)
+
+    shot = open_shot(scene.write(tmp_path, edit=edit))
+    clean = scene.clean(0)["ViewLayer.Combined"]
+
+    def estimate(frame):
+        grain = np.random.default_rng(frame.number).normal(1, 0.005, clean.shape[:2])
+        return clean * coming(frame.number) * grain.astype(np.float32)[..., None]
+
+    pulled, plain = (
+        Aligner(shot, rules, estimates=OfFrames(estimate)).align(1006)
+        for rules in (Rules(on=frozenset({"drift"})), Rules(off=frozenset({"drift"})))
+    )
+    assert "drift" in pulled.stages
+    assert "drift" not in plain.stages
+    assert "drift" not in Aligner(shot, Rules(on=frozenset({"drift"}))).align(1006).stages  # without estimates
+    np.testing.assert_array_equal(pulled.confidence, plain.confidence)
+    np.testing.assert_array_equal(pulled.residual, plain.residual)
+    off = [abs(gated_average(window).mean(dtype=float) / clean.mean(dtype=float) - 1) for window in (pulled, plain)]
+    assert off[1] > 0.006
+    assert off[0] < 0.6 * off[1]

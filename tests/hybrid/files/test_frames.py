@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 
 from flow.motion import CYCLES, MotionConvention
-from hybrid.alignment.align import Aligner
+from hybrid.alignment.loading import LoadedFrames
 from hybrid.files import frames as frames_module
 from hybrid.files.exr import ExrError, read_exr, write_layers
 from hybrid.files.frames import Frame, Shot, open_shot, output_path
@@ -34,7 +34,7 @@ def save(folder: Path, numbers, name: str = "shot.{:04d}.exr", size: tuple[int, 
 
 def neighbours(shot: Shot, number: int, radius: int) -> list[int | None]:
     """Numbers of a frame and what there is around it."""
-    around = Aligner(shot, ()).around(number, radius)
+    around = LoadedFrames(shot, ()).around(number, radius)
     return [n if shot.has(n) else None for n in around]
 
 

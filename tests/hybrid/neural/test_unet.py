@@ -70,7 +70,7 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
         return color
 
     source = choose_estimate("auto", shot, mode="oidn-fast", quicker=quicker)
-    assert "bfloat16" in source.reason
+    assert "torch" in source.reason
     Aligner(shot, {"demodulate"}, radius=0, estimates=source.estimates).align(1002)
     assert calls == [{"quality": "fast"}]
     named = choose_estimate("oidn-fast", shot, quicker=quicker)
@@ -78,8 +78,10 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
     assert len(calls) == 1
 
 
-@pytest.mark.parametrize(("precision", "known"), [("float32", True), ("bfloat16", True), ("bfloat16", False)])
-def test_denoise_takes_them_where_it_runs_in_bfloat16(tmp_path, monkeypatch, precision, known) -> None:
+@pytest.mark.parametrize(
+    ("precision", "known"), [("float32", True), ("bfloat16", True), ("bfloat16", False), ("auto", True)]
+)
+def test_denoise_takes_them_unless_float32_is_asked_for(tmp_path, monkeypatch, precision, known) -> None:
     folder, calls = SCENE.write(tmp_path / "noisy"), []
     if not known:  # another version of OIDN
         unet._network.cache_clear()
@@ -87,7 +89,7 @@ def test_denoise_takes_them_where_it_runs_in_bfloat16(tmp_path, monkeypatch, pre
     monkeypatch.setattr(denoiser, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
     words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--frames", "1002", "--precision", precision]
     assert main(words) == 0
-    assert bool(calls) == (precision == "bfloat16" and known)
+    assert bool(calls) == (precision != "float32" and known)
 
 
 @pytest.mark.parametrize(("there", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])

@@ -1,6 +1,7 @@
 """The weights that are shipped, on the shot that is bundled."""
 
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,14 @@ SHOT = Path(__file__).parents[3] / "examples" / "shot"
 FRAME = 11
 
 
-@pytest.fixture(scope="module")
-def window():
+@lru_cache
+def window(radius=2):
     shot = open_shot(SHOT / "noisy.####.exr")
-    return Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(FRAME)
+    return Aligner(shot, Rules(), radius=radius, estimates=OfWindows(FINAL)).align(FRAME)
+
+
+def picture(denoiser):
+    return denoiser(window(denoiser.radius)).color
 
 
 @pytest.fixture(scope="module")
@@ -36,22 +41,23 @@ def reference():
     return open_shot(SHOT / "reference.####.exr").read(FRAME).color
 
 
-def test_final_gains_what_is_promised_on_the_bundled_shot(window, reference):
-    final = psnr(filter_window(window, FINAL), reference)
-    robust = psnr(robust_average(window.color, window.confidence) * window.modulation, reference)
-    assert final > psnr(window.color[2] * window.modulation, reference) + 6
+def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
+    aligned = window()
+    final = psnr(filter_window(aligned, FINAL), reference)
+    robust = psnr(robust_average(aligned.color, aligned.confidence) * aligned.modulation, reference)
+    assert final > psnr(aligned.color[2] * aligned.modulation, reference) + 6
     assert final > robust + 2
 
 
 @pytest.mark.parametrize("preset", [*MODE_OF, "tkpcn"])
-def test_weights_reach_what_their_card_says(window, reference, preset):
+def test_weights_reach_what_their_card_says(reference, preset):
     path = shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     promised = float(re.search(r"frame 11 of the bundled shot: (\d+\.\d+) dB", card)[1])
-    image = Denoiser(path)(window).color
+    image = picture(Denoiser(path))
     # bfloat16 or float32, one processor or another: hundredths of a decibel
     assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
-    assert preset == "tkpcn" or psnr(image, reference) > psnr(filter_window(window, FINAL), reference)
+    assert preset == "tkpcn" or psnr(image, reference) > psnr(filter_window(window(), FINAL), reference)
     assert abs(mean_bias(image, reference)) < 0.01
 
 
@@ -66,19 +72,19 @@ def decibels(image, number=FRAME):
     return float(-10 * np.log10(np.mean((seen - clean[0]) * (seen - clean[1]))))
 
 
-# Measured: 0.59, 0.75 and 1.07 dB.
-@pytest.mark.parametrize(("preset", "gain"), [("fast", 0.4), ("balanced", 0.5), ("quality", 0.8)])
-def test_the_network_is_worth_more_than_the_average_it_starts_from(window, preset, gain):
+# Measured: 0.60, 0.76 and 1.18 dB.
+@pytest.mark.parametrize(("preset", "gain"), [("fast", 0.4), ("balanced", 0.5), ("quality", 0.9)])
+def test_the_network_is_worth_more_than_the_average_it_starts_from(preset, gain):
     """Put `gated_average` in its place, and something must be missing."""
-    network = decibels(Denoiser(shipped_weights(preset))(window).color)
-    assert network > decibels(gated_average(window)) + gain
+    denoiser = Denoiser(shipped_weights(preset))
+    assert decibels(picture(denoiser)) > decibels(gated_average(window(denoiser.radius))) + gain
 
 
-# Measured: 0.31, 0.22 and 0.57 dB; the gathered picture is in the skip connection too.
-@pytest.mark.parametrize(("preset", "loss"), [("fast", 0.2), ("balanced", 0.15), ("quality", 0.4)])
-def test_the_networks_ra_blocks_are_worth_something(window, preset, loss, monkeypatch):
+# Measured: 0.38, 0.32 and 1.16 dB; the gathered picture is in the skip connection too.
+@pytest.mark.parametrize(("preset", "loss"), [("fast", 0.2), ("balanced", 0.15), ("quality", 0.9)])
+def test_the_networks_ra_blocks_are_worth_something(preset, loss, monkeypatch):
     """Put the identity in the place of all of them, and something must be missing."""
     denoiser = Denoiser(shipped_weights(preset))
-    whole = decibels(denoiser(window).color)
+    whole = decibels(picture(denoiser))
     monkeypatch.setattr(RobustAverage, "forward", identity)
-    assert whole > decibels(denoiser(window).color) + loss
+    assert whole > decibels(picture(denoiser)) + loss

@@ -1,0 +1,52 @@
+"""What a window of aligned frames gives when it is asked: the centre in the place of others, guides of all frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hybrid.alignment.align import Aligner
+from hybrid.files.frames import open_shot
+from tests.scenes import Scene
+
+STAGES = {"demodulate", "outliers", "warp"}
+SCENE = Scene(frames=5)
+MIDDLE = SCENE.first + 2
+
+
+def window(folder):
+    return Aligner(open_shot(folder), STAGES).align(MIDDLE)
+
+
+def test_the_centre_takes_the_place_of_what_is_not_trusted(tmp_path):
+    aligned = window(SCENE.write(tmp_path))
+    spoilt = aligned.color.copy()
+    nowhere = aligned.confidence == 0
+    assert 0.02 < nowhere.mean() < 0.5  # what has left the frame
+    spoilt[nowhere] = 1e6
+    mixed = replace(aligned, color=spoilt).mixed(spoilt)
+    for index in range(5):
+        np.testing.assert_array_equal(mixed[index][nowhere[index]], aligned.color[2][nowhere[index]])
+        sure = aligned.confidence[index] == 1
+        np.testing.assert_array_equal(mixed[index][sure], spoilt[index][sure])
+    half = replace(aligned, confidence=np.full_like(aligned.confidence, 0.5))
+    np.testing.assert_allclose(half.mixed(aligned.color)[0], (aligned.color[0] + aligned.color[2]) / 2, rtol=1e-6)
+
+
+def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
+    """When they are asked for; the centre's are there in any case."""
+    folder = SCENE.write(tmp_path)
+    (folder / f"shot.{MIDDLE + 1}.exr").unlink()
+    aligned, alone = window(folder), open_shot(folder).read(MIDDLE)
+    for name in ("albedo", "normal"):
+        layer, own = getattr(aligned, name), aligned.guides[name]
+        np.testing.assert_array_equal(own, getattr(alone, name))
+        np.testing.assert_array_equal(layer[2], own)
+        np.testing.assert_array_equal(layer[3], own)  # a frame that is missing
+        sure = aligned.trust[1] > 0.9
+        assert sure.mean() > 0.5
+        # Whole-pixel vectors: nothing is interpolated.
+        np.testing.assert_allclose(layer[1][sure], own[sure], atol=1e-5)
+    still = Aligner(open_shot(folder), set()).align(MIDDLE)
+    assert not np.allclose(still.albedo[1][sure], still.albedo[2][sure], atol=0.01)  # something has moved
