@@ -25,8 +25,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import measure_exposure
+from hybrid.alignment.window import AlignedWindow
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import choose_estimate
 from hybrid.files.frames import open_shot

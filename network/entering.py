@@ -8,6 +8,7 @@ is written once.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,12 @@ RESIDUAL_LIMIT = 6.0
 #: Channels of a frame: its picture, the centre's albedo and normal, the gathered average, confidence, samples gathered.
 CHANNELS = 14
 _LIMIT = np.float32(RESIDUAL_LIMIT)
-# The transfer curve (`network.trunk.pu_forward`).
-_Y0, _Y1, _A, _B, _C, _D, _E, _F, _G, _WHITE = map(np.float32, trunk.PU_CURVE)
+# The transfer curve (`network.trunk.pu_forward`), which a pixel of five frames asks for 21 times: 14 ns for a power or
+# a logarithm, 3 ns for a line between two entries of a table. Of each power of two from 2^-20, below which it is one
+# line, to 2^16 there are 512: as exact as the functions in float32. The upper bits of a float32 say which it is.
+_LEAST, _GREATEST, _LOW_BITS = np.float32(2.0**-20), np.float32(2.0**16), np.uint32(14)
+_FIRST, _LAST = (int(value.view(np.uint32) >> _LOW_BITS) for value in (_LEAST, _GREATEST))
+_, _, _A, _, _, _, _E, _F, _G, _WHITE = map(np.float32, trunk.PU_CURVE)
 
 
 def can_lay_out(*layers: Tensor) -> bool:
@@ -79,7 +84,7 @@ def entering(
         still, gathered, average = (np.empty((batch, *size, channels), np.float32) for channels in (9, 3, 3))
         for n in range(batch):
             given = *(layer[n] for layer in layers), exposure[n], gain[n], rows, columns
-            on_all_cores(_enter, size[0], n, *given, frames, still, gathered, average)
+            on_all_cores(_enter, size[0], n, *given, frames, still, gathered, average, _curve())
         return (
             _planes(frames.reshape(count * batch, *size, CHANNELS)),
             _planes(still),
@@ -99,13 +104,25 @@ def _planes(pixels: NDArray[np.float32]) -> Tensor:
     return torch.from_numpy(pixels).permute(0, 3, 1, 2)
 
 
+@lru_cache(maxsize=1)
+def _curve() -> NDArray[np.float32]:
+    """The transfer curve at each entry, and how far the next one is from it, (K, 2)."""
+    places = (np.arange(_FIRST, _LAST + 1, dtype=np.uint32) << _LOW_BITS).view(np.float32)
+    values = trunk.pu_forward(torch.from_numpy(places.astype(np.float64))).numpy()
+    return np.stack([values[:-1], np.diff(values)], axis=1).astype(np.float32)
+
+
 @njit(cache=True, nogil=True)
-def _on_curve(y: Any) -> Any:
-    if y <= _Y0:
+def _on_curve(y: Any, curve: Any, value: Any, bits: Any) -> Any:
+    # The last two are one place in memory.
+    if y < _LEAST:
         return _A * y / _WHITE
-    if y <= _Y1:
-        return (_B * y**_C + _D) / _WHITE
-    return (_E * np.log(y + _F) + _G) / _WHITE
+    if not y < _GREATEST:
+        return (_E * np.log(y + _F) + _G) / _WHITE
+    value[0] = y
+    entry = np.int64(bits[0] >> _LOW_BITS) - _FIRST
+    beyond = np.float32(np.int32(bits[0] & np.uint32(2**14 - 1))) * np.float32(2.0**-14)
+    return curve[entry, 0] + beyond * curve[entry, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -114,12 +131,14 @@ def _enter(
     confidence: NDArray[np.float32], modulation: NDArray[np.float32], albedo: NDArray[np.float32],
     normal: NDArray[np.float32], exposure: np.float32, gain: np.float32, rows: NDArray[np.int64],
     columns: NDArray[np.int64], frames: NDArray[np.float32], still: NDArray[np.float32],
-    gathered: NDArray[np.float32], average: NDArray[np.float32],
+    gathered: NDArray[np.float32], average: NDArray[np.float32], curve: NDArray[np.float32],
 ) -> None:  # fmt: skip
     T, zero, one, half = len(estimates), np.float32(0), np.float32(1), np.float32(0.5)
     centre = T // 2
     trust, share, held = np.empty(T, np.float32), np.empty(T, np.float32), np.empty((T, 3), np.float32)
     guides, seen = np.empty(6, np.float32), np.empty(3, np.float32)
+    value = np.empty(1, np.float32)
+    bits = value.view(np.uint32)
     for y in range(first, last):
         row = rows[y]
         for x in range(len(columns)):
@@ -156,15 +175,16 @@ def _enter(
                 scale = modulation[row, column, c] * gain
                 own, mean = held[centre, c], zero
                 for t in range(T):
-                    shown = _on_curve(max((light + own + trust[t] * (held[t, c] - own)) * scale, zero))
+                    linear = max((light + own + trust[t] * (held[t, c] - own)) * scale, zero)
+                    shown = _on_curve(linear, curve, value, bits)
                     frames[t, n, y, x, c] = shown
                     mean += shown
-                picture = _on_curve(max(noise * scale, zero))
+                picture = _on_curve(max(noise * scale, zero), curve, value, bits)
                 shift = picture - mean / np.float32(T)
                 for t in range(T):
                     frames[t, n, y, x, c] += shift
                 still[n, y, x, c] = picture
-                seen[c] = _on_curve(max(light * scale, zero))
+                seen[c] = _on_curve(max(light * scale, zero), curve, value, bits)
             for c in range(6):
                 still[n, y, x, 3 + c] = guides[c]
             for t in range(T):

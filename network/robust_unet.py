@@ -239,12 +239,16 @@ class RobustUNet(nn.Module):
         ValueError
             If frames are not the model's, or height or width is no multiple of 16.
         """
-        if frames.shape[1] != self.config.frames:
-            raise ValueError(f"frames: expected {self.config.frames}, got {frames.shape[1]}")
+        self.expect(frames.shape[1])
         for name, length in zip(("height", "width"), still.shape[2:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"frames: expected a {name} that is a multiple of {self.multiple}, got {length}")
         return self.finish(self.meet(self.lay_out(frames, still, known)), still)
+
+    def expect(self, frames: int) -> None:
+        """Raise ValueError unless a window of so many frames is the model's."""
+        if frames != self.config.frames:
+            raise ValueError(f"frames: expected {self.config.frames}, got {frames}")
 
     def lay_out(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
         """Lay all that is known of each frame side by side, ``(T·N, 14, H, W)``, time first; as for `forward`."""
@@ -348,12 +352,18 @@ def denoise_window(
     Picture
         Float32, of the size of the window.
 
+    Raises
+    ------
+    ValueError
+        If the window has not the model's frames.
+
     Notes
     -----
     Without gradients all that is done at full size is done some rows at a time (`network.trunk.in_strips`): no more of
-    five frames' features is ever there, and what is there fits the caches of a processor. On a processor what enters is
+    all frames' features is ever there, and what is there fits the caches of a processor. On a processor what enters is
     laid out in one pass (`network.entering`).
     """
+    model.expect(window["confidence"].shape[1])
     height, width = window["modulation"].shape[-2:]
     sizes = zip((height, width), borders, strict=True)
     rows, columns = (np.pad(np.arange(size), border, mode="reflect") for size, border in sizes)

@@ -233,6 +233,8 @@ def test_what_does_not_fit_is_refused() -> None:
     model = small()
     with pytest.raises(ValueError, match="frames: expected 5, got 3"):
         model(torch.rand(1, 3, 3, 16, 16), torch.rand(1, 9, 16, 16), torch.rand(1, 3, 5, 16, 16))
+    with torch.no_grad(), pytest.raises(ValueError, match="frames: expected 3, got 5"):
+        denoise_tile(small(frames=3), make_window(5))
     with pytest.raises(ValueError, match="width that is a multiple of 16, got 20"):
         model(torch.rand(1, 5, 3, 16, 20), torch.rand(1, 9, 16, 20), torch.rand(1, 5, 5, 16, 20))
     with pytest.raises(ValueError, match="frames: expected an odd number"):

@@ -1,0 +1,51 @@
+"""What is convolved without being enlarged is what plain operations make of enlarged features."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from torch.nn import functional
+
+from network import trunk
+from network.enlarged import can_enlarge, convolve_enlarged
+from network.trunk import Convolutions
+
+pytestmark = pytest.mark.neural
+
+
+def features(size: tuple[int, int], batch: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
+    random = torch.Generator().manual_seed(sum(size))
+    height, width = size
+    x = torch.randn(batch, 12, height, width, generator=random)
+    return x, torch.randn(batch, 5, 2 * height, 2 * width, generator=random)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (9, 13)])
+def test_it_is_the_convolution_of_enlarged_features(size: tuple[int, int]) -> None:
+    x, skip = features(size)
+    stage = Convolutions(17, (8,))
+    weight, bias = stage[0].weight.detach(), stage[0].bias.detach()
+    both = torch.cat([functional.interpolate(x, scale_factor=2.0), skip], 1).double()
+    expected = torch.relu(functional.conv2d(both, weight.double(), bias.double(), padding=1))
+    found = convolve_enlarged(x, skip, weight, bias)
+    # Sums of some hundred products of float32, of about 1.
+    torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=2e-6)
+
+
+def test_it_stands_for_plain_operations_where_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, skip = features((4, 6))
+    stage, calls = Convolutions(17, (8, 8)), []
+    monkeypatch.setattr(trunk, "convolve_enlarged", lambda *layers: calls.append(layers) or convolve_enlarged(*layers))
+    trained = stage.enlarged(x, skip)
+    assert not calls
+    assert trained.requires_grad
+    with torch.no_grad():
+        torch.testing.assert_close(stage.enlarged(x, skip), trained.detach(), rtol=1e-5, atol=2e-6)
+        assert len(calls) == 1
+        stage.bfloat16().enlarged(x.bfloat16(), skip.bfloat16())
+    assert len(calls) == 1
+    assert not can_enlarge(x, skip.bfloat16())
