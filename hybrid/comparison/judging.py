@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -42,6 +45,9 @@ def _whole(reference: Reference) -> NDArray[np.floating]:
 # Of frames with more pixels than this FLIP judges every third, from the first: at 1920×1080 it takes 22 CPU seconds of
 # each, and of each method.
 FLIP_PIXELS, FLIP_EVERY = 2**20, 3
+# Frames that are measured side by side: each of 1920×1080 takes half a gigabyte, in double precision. FLIP has threads
+# of its own.
+AT_ONCE = min(os.cpu_count() or 1, 4)
 # What is measured on a frame by itself, beside FLIP and the measures over time.
 MEASURES: dict[str, Measure] = {
     "psnr": lambda x, r, e: psnr(x, r, exposure=e),
@@ -113,17 +119,16 @@ class Judge:
         if missing:
             raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(self.numbers)}")
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
-        seen = self.seen_by_flip if flip else ()
-        for number in self.numbers:
-            image, truth = self.store.load(name, number), self.store.load_reference(number)
-            for key, measure in MEASURES.items():
-                values[key].append(measure(image, truth, self.exposure))
-            if number in seen:
-                errors = flip_map(image * np.float32(self.exposure), _whole(truth) * np.float32(self.exposure))
-                self.store.save(name, number, errors, FLIP_MAP)
-                values["flip"].append(float(errors.mean(dtype=np.float64)))
-        for pair in self.pairs:
-            values["temporal_psnr"].append(self._measure_pair(name, pair))
+        with ThreadPoolExecutor(AT_ONCE) as threads:
+            for measured in threads.map(partial(self._measure_frame, name), self.numbers):
+                for key, value in measured.items():
+                    values[key].append(value)
+            values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
+        for number in self.seen_by_flip if flip else ():
+            image, truth = self.store.load(name, number), _whole(self.store.load_reference(number))
+            errors = flip_map(image * np.float32(self.exposure), truth * np.float32(self.exposure))
+            self.store.save(name, number, errors, FLIP_MAP)
+            values["flip"].append(float(errors.mean(dtype=np.float64)))
         if change and self.pairs:
             for number in self.numbers:
                 self.store.save(name, number, self._map_change(name, number), CHANGE_MAP)
@@ -147,6 +152,10 @@ class Judge:
         change = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
         change = np.where((motion[..., 2] > 0) & np.isfinite(change), change, 0)
         return np.clip(0.5 + AMPLIFIED * change, 0, 1).astype(np.float32)
+
+    def _measure_frame(self, name: str, number: int) -> dict[str, float]:
+        image, truth = self.store.load(name, number), self.store.load_reference(number)
+        return {key: measure(image, truth, self.exposure) for key, measure in MEASURES.items()}
 
     def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
         images = [self.store.load(name, number) for number in pair]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from skimage.restoration import denoise_nl_means, estimate_sigma
 
 from flow.tvl1 import refine_flow
-from hybrid.alignment.align import AlignedWindow, Aligner
+from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import compress, expand, measure_exposure
+from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -92,6 +93,23 @@ def test_of_large_frames_flip_judges_some_and_the_page_says_which(
         assert len(comparison.results[0].metrics["psnr"].values) == 5
     assert "FLIP" not in every.facts
     assert "1, 5 alone" in some.facts["FLIP"]
+
+
+def test_frames_are_measured_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two frames wait for each other; the figures are in the order of the frames."""
+    both = Barrier(2, timeout=60)
+    monkeypatch.setattr(judging, "AT_ONCE", 2)
+    shot, reference = make_shots((1, 2))
+    alone = compare_shot(shot, reference, NOISY).results[0].metrics
+
+    def meet(image: Array, *_: object) -> float:
+        both.wait()
+        return float(image.mean())
+
+    monkeypatch.setitem(judging.MEASURES, "smape", meet)
+    together = compare_shot(shot, reference, NOISY).results[0].metrics
+    assert together["smape"].values == tuple(float(shot.read(number).color.mean()) for number in (1, 2))
+    assert together["psnr"] == alone["psnr"]
 
 
 def test_only_frames_and_neighbours_that_are_there_are_judged() -> None:
