@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -407,6 +407,7 @@ class _Listener:
 
 
 _LIBRARY_LOCK = threading.Lock()
+_own_stderr: int | None = None  # where descriptor 2 led, while it is listened to
 
 
 @contextmanager
@@ -416,9 +417,12 @@ def hold_library(seconds: float) -> Iterator[None]:
     Parameters
     ----------
     seconds : float
-        How long to wait for that.
+        How long to wait for that. What takes longer is listened to no more: the process is about to end.
     """
     held = _LIBRARY_LOCK.acquire(timeout=seconds)
+    if not held and _own_stderr is not None:
+        with suppress(OSError):  # it has ended meanwhile, and has put descriptor 2 back itself
+            os.dup2(_own_stderr, 2)
     try:
         yield
     finally:
@@ -433,10 +437,11 @@ def _library_messages() -> Iterator[list[str]]:
     The C library prints to file descriptor 2 and the binding to sys.stdout. What others write to descriptor
     2 meanwhile (decoding releases the GIL) is passed on afterwards. The list is filled on leaving.
     """
+    global _own_stderr
     messages: list[str] = []
     with _LIBRARY_LOCK, tempfile.TemporaryFile() as sink:
         listener = _Listener(sys.stdout)
-        stderr = os.dup(2)
+        stderr = _own_stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)
         sys.stdout = listener
         try:
@@ -445,6 +450,7 @@ def _library_messages() -> Iterator[list[str]]:
             if sys.stdout is listener:
                 sys.stdout = listener._stream
             os.dup2(stderr, 2)
+            _own_stderr = None
             os.close(stderr)
             sink.seek(0)
             printed = sink.readlines()

@@ -238,7 +238,7 @@ from hybrid.interrupt import interruptible
 def read():
     with exr._library_messages():
         os.write(1, b"begun\\n")
-        time.sleep(1.5)
+        time.sleep(float(sys.argv[1]))
 
 with interruptible(lambda: print("2 of 5", file=sys.stderr, flush=True)):
     threading.Thread(target=read, daemon=True).start()
@@ -246,12 +246,12 @@ with interruptible(lambda: print("2 of 5", file=sys.stderr, flush=True)):
 """
 
 
-def test_the_report_of_a_stop_is_seen_while_a_file_is_read_beside_the_work():
+@pytest.mark.parametrize("seconds", [0.5, 600])
+def test_the_report_of_a_stop_is_seen_while_a_file_is_read_beside_the_work(seconds):
     """Messages of the library for files are listened for on the descriptor that the report goes to."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    child = subprocess.Popen(
-        [sys.executable, "-c", READING], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    words = [sys.executable, "-c", READING, str(seconds)]
+    child = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "begun\n"
     child.send_signal(signal.SIGINT)
     _, said = child.communicate(timeout=30)
