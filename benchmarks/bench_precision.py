@@ -67,7 +67,7 @@ def timed(make: Callable[[], Array]) -> tuple[Array, float]:
 
 def half(window: AlignedWindow) -> AlignedWindow:
     """The window as it is stored in half floats (training clips are)."""
-    return replace(window, color=window.color.astype(np.float16).astype(np.float32))
+    return replace(window, aligned_color=window.color.astype(np.float16).astype(np.float32))
 
 
 def in_bands(shot: object, stages: frozenset[str], number: int, rows: int) -> Array:

@@ -97,7 +97,7 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
         differs from the average of the estimates (of the colors, where there are none) over the frames so weighed,
         |r − a| / (a + exposure), means over channels.
     """
-    sides = [index for index in range(len(aligned.color)) if index != aligned.centre and aligned.trust[index].any()]
+    sides = [index for index, trust in enumerate(aligned.trust) if index != aligned.centre and trust.any()]
     mean = average(aligned.color if aligned.estimate is None else aligned.estimate, aligned.confidence)
     changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)
     nothing = np.zeros(irradiance.shape[:2], np.float32)

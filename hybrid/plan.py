@@ -32,6 +32,11 @@ STAGES = {
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
+# Why what is called for may yet not run.
+_NOT_RUN = {
+    "outliers": "beside estimates what single samples may add is bounded instead",
+    "drift": "needs estimates of five frames or more",
+}
 # Stages that only a network has.
 NEURAL_STAGES = frozenset({"mean", "steady", "alpha", "skip"})
 
@@ -119,8 +124,8 @@ class Plan:
 def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | None = None) -> Plan:
     """Say of the plan of a window what ran.
 
-    Where there are estimates the gate compares them in any case; where there are none, or of three frames alone, drift
-    cannot be told.
+    Where there are estimates the gate compares them in any case, and no samples are rejected; where there are none, or
+    of three frames alone, drift cannot be told.
 
     Parameters
     ----------
@@ -140,8 +145,8 @@ def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | No
         ran, reason = decision.stage in stages, decision.reason
         if ran and not decision.on:
             reason = f"estimates are compared in any case; measured: {reason}"
-        elif decision.on and not ran:
-            reason = f"needs estimates of five frames or more; {reason}"
+        elif decision.on and not ran and decision.stage in _NOT_RUN:
+            reason = f"{_NOT_RUN[decision.stage]}; {reason}"
         if shares is not None and decision.stage in shares:
             reason += f"; it ran on {shares[decision.stage]:.0%} of it"
         decisions.append(replace(decision, on=ran, reason=reason))

@@ -20,6 +20,7 @@ from loops.cores import on_all_cores
 #: Width between the convolutions: a constant, so that what is done for all of them becomes one instruction.
 HIDDEN = 16
 _PIXELS = 64  # at a time: all their features fit the fastest cache
+_VALUES = 512  # likewise, where the weight is the same in all pixels
 _MOST = 15  # frames of a window, as a network may have (`network.checkpoint.BOUNDS`)
 
 
@@ -82,7 +83,11 @@ def blend_pixels(
     arguments = np.asarray(order), np.asarray(kept), *parameters, bias, last
     bits = torch.uint16 if x.dtype == torch.bfloat16 else torch.uint32
     images = [values.view(bits).numpy().reshape(-1, batch * height, width, channels) for values in (given, result)]
-    on_all_cores(_blend, batch * height, *images, *arguments)
+    if last[:HIDDEN].any():
+        on_all_cores(_blend, batch * height, *images, *arguments)
+    else:  # before any training the weight is the same in all pixels, and no value depends on another
+        rows = (image.reshape(len(image), batch * height, -1) for image in images)
+        on_all_cores(_blend_alike, batch * height, *rows, *arguments[:2], 1 / (1 + np.exp(-last[HIDDEN])))
     return result.permute(0, 3, 1, 2)
 
 
@@ -154,3 +159,93 @@ def _blend(
                         if low:
                             value += np.uint32(0x7FFF) + ((value >> low) & np.uint32(1))  # ties to even
                         result[n, y, start + p, c] = value >> low
+
+
+# Rows of values come as arrays of their own: of others the compiler does not know that they lie side by side, and takes
+# one after the other.
+@njit(nogil=True)
+def _widen(bits: Any, given: Any, low: Any) -> None:
+    for p in range(len(given)):
+        bits[p] = np.uint32(given[p]) << low
+
+
+@njit(nogil=True)
+def _narrow(result: Any, bits: Any, low: Any) -> None:
+    for p in range(len(result)):
+        value = bits[p]
+        if low:
+            value += np.uint32(0x7FFF) + ((value >> low) & np.uint32(1))  # ties to even
+        result[p] = value >> low
+
+
+@njit(nogil=True)
+def _blend_four(x: Any, a: Any, b: Any, c: Any, d: Any, share: Any) -> None:
+    for p in range(len(x)):
+        lower, upper = max(min(a[p], b[p]), min(c[p], d[p])), min(max(a[p], b[p]), max(c[p], d[p]))
+        x[p] += share * (np.float32(0.5) * (lower + upper) - x[p])
+
+
+@njit(nogil=True)
+def _blend_six(x: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, share: Any) -> None:
+    for p in range(len(x)):
+        low, high = min(a[p], b[p]), max(a[p], b[p])
+        total = max(low, min(c[p], high))
+        low, high = min(low, c[p]), max(high, c[p])
+        total += max(low, min(d[p], high))
+        low, high = min(low, d[p]), max(high, d[p])
+        total += max(low, min(e[p], high))
+        low, high = min(low, e[p]), max(high, e[p])
+        total += max(low, min(f[p], high))
+        x[p] += share * (np.float32(0.25) * total - x[p])
+
+
+@njit(nogil=True)
+def _start(a: Any, b: Any, low: Any, high: Any, total: Any) -> None:
+    for p in range(len(a)):
+        low[p], high[p], total[p] = min(a[p], b[p]), max(a[p], b[p]), 0
+
+
+@njit(nogil=True)
+def _join(value: Any, low: Any, high: Any, total: Any) -> None:
+    for p in range(len(value)):
+        total[p] += max(low[p], min(value[p], high[p]))
+        low[p], high[p] = min(low[p], value[p]), max(high[p], value[p])
+
+
+@njit(nogil=True)
+def _blend_many(state: Any, others: Any, i: Any, share: Any, working: Any) -> None:
+    x, (low, high, total), count = state[i], (working[0], working[1], working[2]), len(others)
+    _start(state[others[0]], state[others[1]], low, high, total)
+    for t in others[2:]:
+        _join(state[t], low, high, total)
+    for p in range(len(x)):
+        mean = total[p] / np.float32(count - 2) if count > 2 else np.float32(0.5) * (low[p] + high[p])
+        x[p] += share * (mean - x[p])
+
+
+@njit(cache=True, nogil=True)
+def _blend_alike(
+    first: int, stop: int, given: NDArray[Any], result: NDArray[Any], order: NDArray[Any], kept: NDArray[Any],
+    share: np.float32,
+) -> None:  # fmt: skip
+    T, _, row = given.shape
+    low = np.uint32(32 - 8 * given.itemsize)
+    bits, working = np.zeros((T, _VALUES), np.uint32), np.zeros((3, _VALUES), np.float32)
+    state = bits.view(np.float32)
+    for y in range(first, stop):
+        for start in range(0, row, _VALUES):
+            part = slice(start, min(start + _VALUES, row))
+            for t in range(T):
+                _widen(bits[t], given[t, y][part], low)
+            for i in order:
+                o = np.array([t for t in range(T) if t != i])
+                if T == 5:
+                    _blend_four(state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], share)
+                elif T == 7:
+                    _blend_six(
+                        state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], state[o[4]], state[o[5]], share
+                    )
+                else:
+                    _blend_many(state, o, i, share, working)
+            for n in range(len(kept)):
+                _narrow(result[n, y][part], bits[kept[n]], low)

@@ -21,7 +21,7 @@ from hybrid.alignment.loading import Decide, LoadedFrames
 from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
-from hybrid.alignment.window import AlignedWindow, clean_guide, warp_guide, warp_residuals
+from hybrid.alignment.window import AlignedWindow, clean_guide, warp_layer, warp_residuals
 from hybrid.files.frames import Frame, Frames, Shot
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
@@ -174,14 +174,13 @@ class Aligner:
         stages = self.frames.stages_of(numbers) | (self.frames.allowed & {"gate"})
         outer, inner = self._around_rows(rows)
         centre = self.frames[number]
-        layers = {name: layer[outer] for name, layer in layers_of(centre).items() if not name.startswith("aov ")}
-        _, confidence, seen = self._gather(number, numbers, layers, outer, stages, passing=layers)
+        guides = {name: layer[outer] for name, layer in layers_of(centre).items() if name in ("albedo", "normal")}
+        _, confidence, seen = self._gather(number, numbers, guides, outer, stages, passing=guides, again=True)
         window = self._gather_estimates(number, numbers, seen, outer, pictures)
         with self.timings.stage("steady"):
-            one = np.ones_like(layers["color"])
-            light = window / remodulate(one, layers["albedo"]) if centre.demodulated else window
+            noisy = centre.irradiance[outer]
+            light = window / remodulate(np.ones_like(noisy), guides["albedo"]) if centre.demodulated else window
             exposure = self._lit(number).as_rendered.exposure
-            noisy = layers["color"]
             # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
             # bundled shot with its chrome that is worth 0.4 dB.
             confidence = trust_light(confidence, seen, light, noisy, exposure, stages, agreeing=0.0, share=FINISHED)
@@ -214,16 +213,19 @@ class Aligner:
         if given:
             # Estimates are compared in any case, for outlines: that their light is alike costs nothing to ask.
             stages |= self.frames.allowed & {"gate"}
+            stages -= {"outliers"}  # what samples show beyond estimates is held where it is averaged
         if not given or self.radius < 2:
             stages -= {"drift"}  # there is nothing to hold against the samples
         centre, (outer, inner) = self.frames[number], self._around_rows(rows)
         light = "gate" in stages and not given
         layers = {name: layer[outer] for name, layer in layers_of(centre, light=light, alpha="alpha" in stages).items()}
         guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
+        # Beside estimates the colors of all frames are asked for by few: they are warped when they are.
+        own = layers.pop("color") if given else layers["color"]
         window, confidence, seen = self._gather(number, numbers, layers, outer, stages, passing=guides)
         flows = [None if (link := self._link(number, n)) is None else link[0][0][outer] for n in numbers]
         frames = [self.frames.get(n) for n in numbers]
-        window_of = partial(warp_guide, guides, frames, flows, outer)
+        window_of = partial(warp_layer, {**guides, "irradiance": own}, frames, flows, outer)
         estimates, beyond = None, None
         if given:
             estimates = self._gather_estimates(number, numbers, seen, outer, self.estimates)
@@ -233,11 +235,11 @@ class Aligner:
             beyond = partial(warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
             aligned = self._finish(
-                centre, window, guides, window_of, estimates, beyond, confidence, seen, inner, stages
+                centre, own, window, guides, window_of, estimates, beyond, confidence, seen, inner, stages
             )
             if estimates is not None and "drift" in stages:
-                own, confidence = aligned.color[aligned.centre], aligned.confidence
-                weight = drift_weights(estimates, own, confidence, aligned.exposure, first_row=outer.start)
+                confidence = aligned.confidence
+                weight = drift_weights(estimates, aligned.own, confidence, aligned.exposure, first_row=outer.start)
                 pull_to_centre(estimates, confidence, weight)
         return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
 
@@ -271,13 +273,14 @@ class Aligner:
         rows: slice,
         stages: frozenset[str],
         passing: Collection[str],
+        again: bool = False,
     ) -> tuple[dict[str, Array], Array, Array]:
         """Warp the neighbours' layers to these rows of the centre, whose own are given.
 
         Returns them but those that are `passing`, the confidence that geometry has in them, and what it could be at
-        most: where they show anything.
+        most: where they show anything. That is kept of the frames beside the centre, for when it is asked for `again`.
         """
-        shape = len(numbers), *layers["color"].shape[:2]
+        shape = len(numbers), rows.stop - rows.start, self.shot.shape[1]
         window = {
             name: np.empty((*shape, layer.shape[-1]), np.float32)
             for name, layer in layers.items()
@@ -297,12 +300,12 @@ class Aligner:
             with self.timings.stage("warp"):
                 link, back = links
                 flow, pair = link[0][rows], (number, neighbour, rows.start, rows.stop)
-                known = None if window else self._trusted.pop(pair, None)
+                known = self._trusted.pop(pair, None) if again else None
                 if known is None:
                     warped = {name: kept[index] for name, kept in window.items()} | passed
                     measured = link[1][rows] & warp_layers(there, flow, rows, warped)
                     known = measured, trust_geometry(layers, warped, flow, measured, back[0], rows.start)
-                    if window and "steady" in self.frames.allowed and abs(neighbour - number) == self.shot.step:
+                    if not again and "steady" in self.frames.allowed and abs(neighbour - number) == self.shot.step:
                         self._trusted[pair] = known
                 novelty = novelty_of(flow) if "fixed-noise" in stages else 1.0
                 seen[index], confidence[index] = (novelty * part for part in known)
@@ -345,6 +348,7 @@ class Aligner:
     def _finish(
         self,
         centre: PreparedFrame,
+        own: Array,
         window: dict[str, Array],
         guides: dict[str, Array],
         window_of: Callable[[str], Array],
@@ -355,36 +359,41 @@ class Aligner:
         inner: slice,
         stages: frozenset[str],
     ) -> AlignedWindow:
-        color = window.pop("color")
-        middle = len(color) // 2
+        color = window.pop("color", None)
+        middle = len(confidence) // 2
         gone = confidence[middle] == 0
         if gone.any():
             # What the neighbours in space made of it is good for a pixel, not for a block: first those in time.
+            own = own.copy()
+            own[gone] = average(window_of("irradiance") if color is None else color, confidence)[gone]
             pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
-            for layer in (color, *pictures, *([] if estimates is None else [estimates])):
+            for layer in (*pictures, *([] if estimates is None else [estimates])):
                 layer[middle][gone] = average(layer, confidence)[gone]
+        if color is not None:
+            color[middle] = own
         lit = self._lit(centre.number)
         bright = lit.as_light if "light" in window else lit.as_rendered
         outliers = 0
         near = {*self.frames.around(centre.number, self.radius)}
         refined = [share for pair, share in self.flows.refined.items() if {*pair} <= near]
-        if "outliers" in stages:
+        if color is not None and "outliers" in stages:
             color, rejected = reject_outliers(color, confidence)
-            outliers = int(np.count_nonzero(rejected[:, inner]))
+            own, outliers = color[middle], int(np.count_nonzero(rejected[:, inner]))
         trust = confidence
         clean = clean_guide("albedo", guides, window_of, trust, stages) if "albedo" in guides else None
-        modulation = np.ones_like(color[0])
+        modulation = np.ones_like(own)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
             estimates /= modulation
-            confidence = trust_light(confidence, seen, estimates, color[middle], bright.exposure, stages)
+            confidence = trust_light(confidence, seen, estimates, own, bright.exposure, stages)
         elif "gate" in stages:
-            confidence = confidence * color_gate(window.pop("light"), color[middle], bright.exposure)
+            confidence = confidence * color_gate(window.pop("light"), own, bright.exposure)
         return AlignedWindow(
             number=centre.number,
-            color=color,
+            own=own,
+            aligned_color=color,
             guides=guides,
             window_of=window_of,
             confidence=confidence,

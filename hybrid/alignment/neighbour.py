@@ -71,12 +71,13 @@ def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str
         for name, out in warped.items():
             out[...] = layers[name][rows]
         return there.valid[rows]
+    inside = None
     for name, out in warped.items():
         _, inside = warp(layers[name], flow, first_row=rows.start, out=out)
-    if there.valid.all():
+    if inside is not None and there.valid.all():
         return inside
     # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
-    share, _ = warp(there.valid.astype(np.float32), flow, first_row=rows.start)
+    share, inside = warp(there.valid.astype(np.float32), flow, first_row=rows.start)
     return np.asarray(inside & (share > 0.999))
 
 

@@ -29,12 +29,14 @@ class AlignedWindow:
     ----------
     number : int
         The centre frame's number.
-    color : (T, H, W, 3) array
-        Irradiance. A missing frame holds the centre's, with confidence 0.
+    own : (H, W, 3) array
+        The centre's irradiance.
+    aligned_color : (T, H, W, 3) array or None
+        `color`, where it was made at once.
     guides : dict of str to (H, W, 3) array
         The centre's albedo and normal, those that there are.
     window_of : callable
-        What gives `albedo` and `normal`.
+        What gives `albedo` and `normal`, and `color` where it was not.
     confidence : (T, H, W) array
         In [0, 1]; the centre's is 1 wherever its own color was finite.
     modulation : (H, W, 3) array
@@ -77,7 +79,8 @@ class AlignedWindow:
     """
 
     number: int
-    color: Array
+    own: Array
+    aligned_color: Array | None
     guides: dict[str, Array]
     window_of: Callable[[str], Array]
     confidence: Array
@@ -99,6 +102,18 @@ class AlignedWindow:
     stages: frozenset[str]
     shares: dict[str, float] = field(default_factory=dict)
     tints: dict[str, Array] = field(default_factory=dict)
+
+    @cached_property
+    def color(self) -> Array:
+        """Irradiance of all frames, aligned, (T, H, W, 3). A missing one holds the centre's, with confidence 0.
+
+        Without outliers where the plan rejects them. Made when asked for where there are estimates, as few ask then.
+        """
+        if self.aligned_color is not None:
+            return self.aligned_color
+        color = self.window_of("irradiance")
+        color[self.centre] = self.own
+        return color
 
     @property
     def albedo(self) -> Array | None:
@@ -140,7 +155,7 @@ class AlignedWindow:
     @property
     def centre(self) -> int:
         """Index of the centre frame."""
-        return len(self.color) // 2
+        return len(self.confidence) // 2
 
     def mixed(self, layer: Array) -> Array:
         """Mix the centre into the side frames of `layer` (T, H, W, C), in inverse proportion to confidence."""
@@ -171,32 +186,32 @@ def clean_guide(
     return prefilter_guide(window_of(name), trust) if "prefilter" in stages else guides[name]
 
 
-def warp_guide(
+def warp_layer(
     centre: dict[str, Array],
     there: Sequence[PreparedFrame | None],
     flows: Sequence[Array | None],
     rows: slice,
     name: str,
 ) -> Array:
-    """Align a guide of all frames to the centre's.
+    """Align a layer of all frames to the centre's.
 
     Parameters
     ----------
     centre : dict of str to (h, W, 3) array
-        Guides of the centre, these rows of them.
+        Layers of the centre, these rows of them.
     there : sequence of PreparedFrame
         The frames of the window; None for those that are missing.
     flows : sequence of (h, W, 2) array
-        To each; None where there is none, and the centre's guide takes its place.
+        To each; None where there is none, and the centre's layer takes its place.
     rows : slice
         Of the centre.
     name : str
-        "albedo" or "normal".
+        "albedo", "normal" or "irradiance".
 
     Returns
     -------
     (T, h, W, 3) array
-        The guide.
+        The layer.
     """
     own = centre[name]
     window = np.empty((len(there), *own.shape), np.float32)

@@ -299,14 +299,14 @@ def window_maps(aligned: AlignedWindow, denoise: DenoiseWindow) -> dict[str, Arr
     The contribution is by how many per cent the result brightens when the other frames do by one: for a weighted
     mean that is the share of their weight in the light, and it is defined for any denoiser.
     """
-    side = np.arange(len(aligned.color)) != aligned.centre
+    side = np.arange(len(aligned.confidence)) != aligned.centre
     # Small enough to change no decision, and large enough to stand far above the rounding of float32.
     step = np.float32(1 / 256)
     part = np.where(side, step, 0).astype(np.float32)[:, None, None]
     estimate = aligned.estimate
     if estimate is not None:
         estimate = estimate * (1 + part[..., None])
-    brighter = replace(aligned, color=aligned.color * (1 + part[..., None]), estimate=estimate)
+    brighter = replace(aligned, aligned_color=aligned.color * (1 + part[..., None]), estimate=estimate)
     before, after = (denoise(window).mean(axis=-1) for window in (aligned, brighter))
     change = step * before  # which underflows where it is all but black
     share = np.divide(after - before, change, out=np.zeros_like(before), where=change > 0)

@@ -180,22 +180,22 @@ class Denoiser:
 
     def _run_tiles(self, aligned: AlignedWindow, layers: dict[str, Array]) -> tuple[Array, Array, Array | None]:
         """Irradiance (H, W, 3); AOVs side by side (H, W, C); with a breakdown the frames' parts (T, H, W, 4)."""
-        color, centre = aligned.color, aligned.centre
-        frames, height, width = color.shape[:3]
+        own, centre = aligned.own, aligned.centre
+        frames, height, width = aligned.confidence.shape
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
         given = {name: layer for name, layer in layers.items() if name != "aovs"}
         facts = {"exposure": exposure_of(aligned).to(self._device)}
         if aligned.picture is not None:
             facts["gain"] = gain_of(aligned).to(self._device)
         # Where no tile lies, nobody looks.
-        irradiance, filtered = color[centre].copy(), np.empty_like(others[centre])
+        irradiance, filtered = own.copy(), np.empty_like(others[centre])
         # A picture that is black, as far as numbers go, is left as it is.
         dark = aligned.picture is not None and measure_exposure(aligned.picture) == 1 > aligned.picture.max()
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
             if dark or ("skip" in aligned.stages and not aligned.variance[outer].any()):
-                irradiance[inner], filtered[inner] = color[centre][inner], others[centre][inner]
+                irradiance[inner], filtered[inner] = own[inner], others[centre][inner]
                 if parts is not None:
                     parts[centre][inner] = np.dstack([irradiance[inner], np.ones_like(irradiance[inner][..., :1])])
                 continue
@@ -250,15 +250,15 @@ def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[
             kinds.setdefault(kind, []).append(name)
     if not kinds:
         return means, irradiance, set()
-    centre, color = aligned.centre, aligned.color
+    centre = aligned.centre
     light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
     moments = aligned.moments[:, : guide.shape[-1]]
-    whole, picture = average(color, aligned.confidence), irradiance
+    whole, picture = average(aligned.color, aligned.confidence), irradiance
     # Light is the sum of its passes, and again that of its groups: the picture gives way to the first kind alone.
     for number, names in enumerate(kinds.values()):
         factors = [_factor(name, aligned) for name in names]
-        complete = adds_up([aligned.aovs[name][centre] for name in names], color[centre], factors)
+        complete = adds_up([aligned.aovs[name][centre] for name in names], aligned.own, factors)
         given = [means[name] for name in names], None if complete else whole, picture, guide
         if add and number == 0:
             split, picture = add_light(*given, moments=moments, factors=factors)
@@ -270,7 +270,7 @@ def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[
 
 def _kind_of(name: str, mean: Array, aligned: AlignedWindow) -> str | None:
     """What of the light a layer is a part of: by its name, or else by what it shows."""
-    layer, color = aligned.aovs[name][aligned.centre], aligned.color[aligned.centre]
+    layer, color = aligned.aovs[name][aligned.centre], aligned.own
     if name in aligned.tints:
         return "passes"
     if layer.shape == color.shape and (kind := light_kind(name)) is not None:

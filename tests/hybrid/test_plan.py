@@ -62,6 +62,13 @@ def test_what_ran_on_a_part_of_the_picture_says_on_how_much(shot_folder):
     assert ran["warp"] == before["warp"]
 
 
+def test_samples_that_are_not_rejected_are_not_said_to_be(tmp_path):
+    plan = plan_shot(open_shot(Scene().write(tmp_path)), Rules(on=frozenset({"outliers"})))
+    ran = {d.stage: d for d in as_run(plan, {"warp"}).decisions}["outliers"]
+    assert not ran.on
+    assert ran.reason.startswith("beside estimates")
+
+
 def test_drift_that_cannot_be_told_is_not_said_to_run(shot_folder):
     plan = plan_shot(open_shot(shot_folder)).force({"drift"})
     ran = {d.stage: d for d in as_run(plan, {"warp"}).decisions}["drift"]

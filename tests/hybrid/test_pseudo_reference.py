@@ -87,7 +87,8 @@ def test_draft_leaves_out_what_a_single_frame_shows(tmp_path):
     window = align(SCENE.write(tmp_path))
     ghost = window.color.copy()
     ghost[1, 12:28, 16:40] += 50
-    plain, haunted = (filter_window(replace(window, color=color), DRAFT) for color in (window.color, ghost))
+    seen = (replace(window, aligned_color=color) for color in (window.color, ghost))
+    plain, haunted = (filter_window(shown, DRAFT) for shown in seen)
     inner = np.s_[14:26, 20:36]  # where four frames at least show the wall
     assert (window.confidence[:, *inner] > 0.9).all()
     # The ghost takes the place of what was the maximum before: a fifth of the noise, and not a fifth of 50.

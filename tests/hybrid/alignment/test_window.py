@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from hybrid.alignment.align import Aligner
+from hybrid.estimates import OfFrames
 from hybrid.files.frames import open_shot
+from nlm.average import replace_nonfinite
 from tests.scenes import Scene
 
 STAGES = {"demodulate", "outliers", "warp"}
@@ -25,13 +27,31 @@ def test_the_centre_takes_the_place_of_what_is_not_trusted(tmp_path):
     nowhere = aligned.confidence == 0
     assert 0.02 < nowhere.mean() < 0.5  # what has left the frame
     spoilt[nowhere] = 1e6
-    mixed = replace(aligned, color=spoilt).mixed(spoilt)
+    mixed = replace(aligned, aligned_color=spoilt).mixed(spoilt)
     for index in range(5):
         np.testing.assert_array_equal(mixed[index][nowhere[index]], aligned.color[2][nowhere[index]])
         sure = aligned.confidence[index] == 1
         np.testing.assert_array_equal(mixed[index][sure], spoilt[index][sure])
     half = replace(aligned, confidence=np.full_like(aligned.confidence, 0.5))
     np.testing.assert_allclose(half.mixed(aligned.color)[0], (aligned.color[0] + aligned.color[2]) / 2, rtol=1e-6)
+
+
+def test_colors_beside_estimates_are_those_without(tmp_path):
+    """They are aligned when they are asked for; what a frame has lost is as it was in those around it."""
+
+    def lose(index, layers):
+        if index == 2:
+            layers["ViewLayer.Combined"][10:14, 20:24] = np.nan
+
+    shot = open_shot(SCENE.write(tmp_path, edit=lose))
+    stages = {"demodulate", "outliers", "warp"}
+    beside = Aligner(shot, stages, estimates=OfFrames(lambda frame: replace_nonfinite(frame.color)[0])).align(MIDDLE)
+    without = Aligner(shot, stages - {"outliers"}).align(MIDDLE)
+    assert beside.aligned_color is None
+    assert "outliers" not in beside.stages
+    assert (beside.confidence[2, 10:14, 20:24] == 0).all()
+    np.testing.assert_array_equal(beside.color, without.color)
+    np.testing.assert_array_equal(beside.own, without.color[2])
 
 
 def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
