@@ -82,9 +82,7 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float, *, share: floa
             continue
         on_all_cores(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
-        np.maximum(mean, cv2.blur(mean, _AROUND_SIZE), out=mean)
-        mean *= -rate
-        np.multiply(np.exp(mean, out=mean), both, out=weight[t])
+        on_all_cores(_weigh, shape[0], mean, cv2.blur(mean, _AROUND_SIZE), rate, both, weight[t])
     return weight
 
 
@@ -109,4 +107,24 @@ def _compare(
 
 
 def _mean_square(x: Floats) -> Floats:
-    return np.asarray(np.einsum("...c,...c->...", x, x) / np.float32(x.shape[-1]), np.float32)
+    mean = np.empty(x.shape[:2], np.float32)
+    on_all_cores(_square, len(x), x, mean)
+    return mean
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _square(first: int, last: int, x: Floats, mean: Floats) -> None:
+    channels = x.shape[2]
+    for row in range(first, last):
+        for column in range(x.shape[1]):
+            total = np.float32(0)
+            for c in range(channels):
+                total += x[row, column, c] * x[row, column, c]
+            mean[row, column] = total / np.float32(channels)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(first: int, last: int, mean: Floats, around: Floats, rate: Floats, both: Mask, weight: Floats) -> None:
+    for y in range(first, last):
+        for x in range(mean.shape[1]):
+            weight[y, x] = np.exp(-rate[y, x] * max(mean[y, x], around[y, x])) if both[y, x] else np.float32(0)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from loops.cores import on_all_cores
 
 Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 # The image is cut into tiles whose planes stay in the cache. Long rows, because every pass over a row
 # costs as much again before its first pixel (64 wide: 2.5 times slower than 512).
@@ -42,6 +43,7 @@ def joint_nlm(
     radius: int = 3,
     patch_radius: int = 3,
     k: float = 0.5,
+    where: Mask | None = None,
 ) -> Floats:
     """Average the pixels of an aligned window whose patches differ by no more than noise.
 
@@ -61,6 +63,8 @@ def joint_nlm(
         Of the search, and of the patches that are compared, in pixels.
     k : float
         Strength of the colour distance: more smooths more.
+    where : (H, W) bool, optional
+        Pixels that call for it; a tile without any stays as the centre is.
 
     Returns
     -------
@@ -101,9 +105,12 @@ def joint_nlm(
         confidence = np.ones(window.shape[:3], np.float32)
     if features.ndim != 3 or features.shape[:2] != (height, width):
         raise ValueError(f"features: expected ({height}, {width}, channels), got {features.shape}")
+    if where is None:
+        where = np.ones((height, width), np.bool_)
     for name, array, shape in (
         ("variance", variance, window.shape[1:]),
         ("confidence", confidence, window.shape[:3]),
+        ("where", where, (height, width)),
     ):
         if array.shape != shape:
             raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
@@ -117,7 +124,7 @@ def joint_nlm(
     )
     out = np.empty(window.shape[1:], np.float32)
     tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
-    given = window, variance, features, confidence, radius, patch_radius, np.float32(k)
+    given = window, variance, features, confidence, where, radius, patch_radius, np.float32(k)
     on_all_cores(_filter, tiles, *given, out)
     return out
 
@@ -224,8 +231,8 @@ def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: i
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _filter(
-    first: int, last: int, window: Floats, variance: Floats, features: Floats, confidence: Floats, radius: int,
-    patch: int, k: np.float32, out: Floats,
+    first: int, last: int, window: Floats, variance: Floats, features: Floats, confidence: Floats, where: Mask,
+    radius: int, patch: int, k: np.float32, out: Floats,
 ) -> None:  # fmt: skip
     """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
     T, H, W, C = window.shape
@@ -237,6 +244,9 @@ def _filter(
     for tile in range(first, last):
         y0, x0 = tile // columns * _TILE_HEIGHT, tile % columns * _TILE_WIDTH
         th, tw = min(_TILE_HEIGHT, H - y0), min(_TILE_WIDTH, W - x0)
+        if not where[y0 : y0 + th, x0 : x0 + tw].any():
+            out[y0 : y0 + th, x0 : x0 + tw] = window[centre, y0 : y0 + th, x0 : x0 + tw]
+            continue
         pw = tw + 2 * patch
         margin = radius + patch
         h, w = th + 2 * margin, tw + 2 * margin

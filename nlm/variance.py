@@ -19,6 +19,9 @@ _CAP = 16.0
 # Variance of a bilinearly warped frame over the centre's: the mean of (2/3)² (any fraction of a pixel along
 # both axes), 2/3 (along one) and 1 (none). It counts only where side frames are few.
 _WARPED = 0.7
+# Variance of guides without noise: deviations of a thousandth of their range. What the filter would change in a tile
+# that has no more is 1e-4 (RMS, five shots).
+_NOISELESS = np.float32(1e-6)
 # Of the boxes that variances are smoothed with, pixels.
 _RADIUS = 2
 
@@ -75,12 +78,20 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
     fades into `variance_from_residual`. Light that moves looks like noise; texture does, where the flow is wrong.
     """
     window, confidence = check_window(window, confidence, "confidence")
-    deviation, trust = np.zeros(window.shape[1:], np.float32), np.zeros(window.shape[1:3], np.float32)
-    on_all_cores(_centre_deviation, len(trust), window, confidence, deviation, trust)
-    temporal = smooth_variance(deviation)
+    temporal, trust = _temporal_variance(window, confidence)
     if trust.min() >= 1:
         return temporal
-    spatial = variance_from_residual(window[window.shape[0] // 2])
+    return _fade(temporal, variance_from_residual(window[window.shape[0] // 2]), trust)
+
+
+def _temporal_variance(window: Floats, confidence: Floats) -> tuple[Floats, Floats]:
+    """The variance that side frames tell, and in [0, 1] whether two of those are trusted."""
+    deviation, trust = np.zeros(window.shape[1:], np.float32), np.zeros(window.shape[1:3], np.float32)
+    on_all_cores(_centre_deviation, len(trust), window, confidence, deviation, trust)
+    return smooth_variance(deviation), trust
+
+
+def _fade(temporal: Floats, spatial: Floats, trust: Floats) -> Floats:
     # Not the sum where trust is 1: it would round otherwise in a part of a frame than in the whole.
     return np.where(trust[..., None] >= 1, temporal, spatial + trust[..., None] * (temporal - spatial))
 
@@ -165,13 +176,16 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     -----
     Non-local means over 3×3 pixels and all frames, steered by the guides' own variance: the lesser of that between
     frames and that of the spatial residual, for noise shows in both, while texture shows only in the
-    second, and texture resampled by warping mainly in the first. A radius above 1 gains nothing on Cycles shots.
+    second, and texture resampled by warping mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles
+    of the picture without noise are left out.
     """
     guides, confidence = check_window(guides, confidence, "confidence")
-    between = variance_from_window(guides, confidence)
+    temporal, trust = _temporal_variance(guides, confidence)
+    spatial = variance_from_residual(guides[guides.shape[0] // 2])
     # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
-    variance = np.maximum(np.minimum(between, variance_from_residual(guides[guides.shape[0] // 2])), np.float32(1e-8))
-    return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0)
+    variance = np.maximum(np.minimum(_fade(temporal, spatial, trust), spatial), np.float32(1e-8))
+    noisy = np.any(variance > _NOISELESS, axis=-1)
+    return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0, where=noisy)
 
 
 def gaussian_mean(image: Floats, sigma: float) -> Floats:

@@ -325,14 +325,14 @@ class Aligner:
         alone = given[number]
         if alone is None:
             raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
-        estimates = np.repeat(alone[None, rows], len(numbers), axis=0)
+        estimates = np.empty((len(numbers), *alone[rows].shape), np.float32)
         for index, neighbour in enumerate(numbers):
             link = None if neighbour == number else self.flows.between(number, neighbour)
-            if link is None:
-                continue
-            there = given.get(neighbour)
-            if there is None:
-                seen[index] = 0
+            there = None if link is None else given.get(neighbour)
+            if link is None or there is None:
+                estimates[index] = alone[rows]
+                if link is not None:
+                    seen[index] = 0
                 continue
             with self.timings.stage("warp"):
                 # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth up to

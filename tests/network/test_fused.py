@@ -15,10 +15,10 @@ pytestmark = pytest.mark.neural
 
 
 def block_and_features(
-    frames: int, dtype: torch.dtype = torch.float32, channels: int = 8
+    frames: int, dtype: torch.dtype = torch.float32, channels: int = 8, blend: float | None = None
 ) -> tuple[RobustAverage, torch.Tensor]:
     torch.manual_seed(0)
-    block = RobustAverage(channels, 1, fused.HIDDEN).to(dtype)
+    block = RobustAverage(channels, 1, fused.HIDDEN, blend).to(dtype)
     with torch.no_grad():
         block.weight.weight.mul_(20)  # so that blends differ from pixel to pixel
     # Two windows, a width that is no multiple of what is done at a time, and more than one of those.
@@ -26,10 +26,12 @@ def block_and_features(
     return block, x.to(memory_format=torch.channels_last)
 
 
+@pytest.mark.parametrize("blend", [None, 0.8])
 @pytest.mark.parametrize("centre", [False, True])
-@pytest.mark.parametrize("frames", [3, 4, 5, 6, 7])
-def test_it_gives_what_torch_gives(frames: int, centre: bool) -> None:
-    block, x = block_and_features(frames)
+@pytest.mark.parametrize("frames", [3, 4, 5, 6, 7, 9])
+def test_it_gives_what_torch_gives(frames: int, centre: bool, blend: float | None) -> None:
+    """Also as it begins, with one weight for all pixels: what is then done is not what is done of trained ones."""
+    block, x = block_and_features(frames, blend=blend)
     wanted = block(x, frames, centre)  # with gradients: torch
     with torch.no_grad():
         found = block(x, frames, centre)
@@ -40,13 +42,14 @@ def test_it_gives_what_torch_gives(frames: int, centre: bool) -> None:
     assert float((found - given).abs().mean()) > 0.1  # it does something
 
 
-def test_in_bfloat16_it_is_nearer_to_exact_than_torch_is() -> None:
-    block, x = block_and_features(5, torch.bfloat16)
-    exact = block.float()(x.float(), 5).detach()
+@pytest.mark.parametrize(("frames", "blend"), [(5, None), (5, 0.8), (7, 0.8)])
+def test_in_bfloat16_it_is_nearer_to_exact_than_torch_is(frames: int, blend: float | None) -> None:
+    block, x = block_and_features(frames, torch.bfloat16, blend=blend)
+    exact = block.float()(x.float(), frames).detach()
     rounded = block.bfloat16()
-    slow = rounded(x, 5).detach().float()
+    slow = rounded(x, frames).detach().float()
     with torch.no_grad():
-        quick = rounded(x, 5)
+        quick = rounded(x, frames)
     assert quick.dtype == torch.bfloat16
     # One rounding, at the end: half a step of 2^-8.
     assert float(((quick.float() - exact).abs() / exact.abs().clamp_min(0.05)).max()) < 2**-8

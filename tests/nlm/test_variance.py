@@ -96,6 +96,16 @@ def test_noisy_guides_lose_their_noise_and_keep_their_edges(rng):
     assert edge == pytest.approx(0.6, abs=0.02)
 
 
+def test_only_tiles_whose_guides_are_noisy_are_filtered(rng):
+    clean = np.full((96, 40, 3), 0.5, np.float32)
+    guides = np.repeat(clean[None], 5, axis=0)
+    guides[:, 70:] += rng.normal(0, 0.05, (5, 26, 40, 3)).astype(np.float32)
+    guides[2, :32] += 1e-4  # which the filter would average away
+    result = prefilter_guide(guides, np.ones((5, 96, 40), np.float32))
+    np.testing.assert_array_equal(result[:32], guides[2, :32])
+    assert np.abs(result[70:] - clean[70:]).mean() < 0.5 * np.abs(guides[2, 70:] - clean[70:]).mean()
+
+
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"^b:"):
         variance_from_halves(np.zeros((4, 4, 3), np.float32), np.zeros((4, 5, 3), np.float32))
