@@ -50,7 +50,7 @@ def can_lay_out(*layers: Tensor) -> bool:
 
 def entering(
     window: Mapping[str, Tensor], albedo: Tensor | None, normal: Tensor | None, columns: NDArray[np.int64]
-) -> Callable[[NDArray[np.int64]], tuple[Tensor, Tensor, Tensor, Tensor]]:
+) -> Callable[[NDArray[np.int64]], tuple[Tensor, Tensor, Tensor]]:
     """Make what lays out some rows of what enters the network.
 
     Parameters
@@ -65,12 +65,11 @@ def entering(
     Returns
     -------
     callable
-        From the rows of the window that stand in h rows of the picture to four layers:
+        From the rows of the window that stand in h rows of the picture to three layers:
 
         - the frames, ``(T·N, 14, h, w)``, time first: `CHANNELS`;
         - ``(N, 9, h, w)``, the gathered picture, and albedo and normal of the centre in [0, 1];
-        - the samples of all frames gathered, irradiance, ``(N, 3, h, w)``;
-        - the average of the estimates, likewise.
+        - the average of the estimates, irradiance, ``(N, 3, h, w)``.
     """
     layers = [_pixels(window[name]) for name in ("estimate", "residual", "confidence", "modulation")]
     batch, count = layers[0].shape[:2]
@@ -78,19 +77,14 @@ def entering(
     layers += [nothing if guide is None else _pixels(guide) for guide in (albedo, normal)]
     exposure, gain = (window[name].numpy() for name in ("exposure", "gain"))
 
-    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         size = len(rows), len(columns)
         frames = np.empty((count, batch, *size, CHANNELS), np.float32)
-        still, gathered, average = (np.empty((batch, *size, channels), np.float32) for channels in (9, 3, 3))
+        still, average = (np.empty((batch, *size, channels), np.float32) for channels in (9, 3))
         for n in range(batch):
             given = *(layer[n] for layer in layers), exposure[n], gain[n], rows, columns
-            on_all_cores(_enter, size[0], n, *given, frames, still, gathered, average, _curve())
-        return (
-            _planes(frames.reshape(count * batch, *size, CHANNELS)),
-            _planes(still),
-            _planes(gathered),
-            _planes(average),
-        )
+            on_all_cores(_enter, size[0], n, *given, frames, still, average, _curve())
+        return _planes(frames.reshape(count * batch, *size, CHANNELS)), _planes(still), _planes(average)
 
     return lay_out
 
@@ -131,7 +125,7 @@ def _enter(
     confidence: NDArray[np.float32], modulation: NDArray[np.float32], albedo: NDArray[np.float32],
     normal: NDArray[np.float32], exposure: np.float32, gain: np.float32, rows: NDArray[np.int64],
     columns: NDArray[np.int64], frames: NDArray[np.float32], still: NDArray[np.float32],
-    gathered: NDArray[np.float32], average: NDArray[np.float32], curve: NDArray[np.float32],
+    average: NDArray[np.float32], curve: NDArray[np.float32],
 ) -> None:  # fmt: skip
     T, zero, one, half = len(estimates), np.float32(0), np.float32(1), np.float32(0.5)
     centre = T // 2
@@ -171,7 +165,7 @@ def _enter(
                 for t in range(T):
                     light += share[t] * estimates[t, row, column, c]
                     noise += share[t] * (estimates[t, row, column, c] + held[t, c])
-                average[n, y, x, c], gathered[n, y, x, c] = light, noise
+                average[n, y, x, c] = light
                 scale = modulation[row, column, c] * gain
                 own, mean = held[centre, c], zero
                 for t in range(T):

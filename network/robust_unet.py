@@ -159,14 +159,11 @@ class Picture:
     ----------
     irradiance : Tensor
         ``(N, 3, H, W)``, at least 0.
-    gathered : Tensor
-        The samples of all frames, irradiance: right in the mean, and noisy, ``(N, 3, H, W)``.
     window : mapping of str to Tensor
         What it was made from, as `realise` takes it.
     """
 
     irradiance: Tensor
-    gathered: Tensor
     window: Mapping[str, Tensor]
 
     def parts(self) -> tuple[Tensor, Tensor]:
@@ -384,31 +381,35 @@ def denoise_window(
         found = realise(*given, window["exposure"], window["gain"])  # type: ignore[call-arg]
         return found, torch.cat([found.picture, guides], 1)
 
-    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         found, still = realised(rows)
-        return model.lay_out(found.frames, still, _known(found)), still, found.parts.sum(1), found.estimate
+        return model.lay_out(found.frames, still, _known(found)), still, found.estimate
 
     if torch.is_grad_enabled():
         found, still = realised(rows)
         seen, keep = (model if run is None else run)(found.frames, still, _known(found))
-        gathered, average = found.parts.sum(1), found.estimate
+        average = found.estimate
     else:
         quick = can_lay_out(*window.values(), *(guide for guide in (albedo, normal) if guide is not None))
         lay_out_rows = entering(window, albedo, normal, columns) if quick else lay_out
 
         def enter(rows: Tensor) -> list[Tensor]:
-            frames, still, gathered, average = lay_out_rows(rows[:, 0].numpy())
-            return [model.meet(frames), still, gathered, average]
+            frames, still, average = lay_out_rows(rows[:, 0].numpy())
+            return [model.meet(frames), still, average]
 
-        features, still, gathered, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None])
+        features, still, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None])
         seen, keep = model.finish(features, still)
+        del features, still
     (top, _), (left, _) = borders
-    seen, keep, gathered, average = (
-        layer[..., top : top + height, left : left + width] for layer in (seen, keep, gathered, average)
-    )
-    # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
-    light = pu_inverse(seen.float().clamp_min(0)) / (window["modulation"] * window["gain"].view(-1, 1, 1, 1))
-    return Picture(light + keep * (average.clamp_min(0) - light), gathered, window)
+    seen, keep, average = (layer[..., top : top + height, left : left + width] for layer in (seen, keep, average))
+
+    def mix(seen: Tensor, keep: Tensor, average: Tensor, modulation: Tensor) -> list[Tensor]:
+        # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
+        light = pu_inverse(seen.float().clamp_min(0)) / (modulation * window["gain"].view(-1, 1, 1, 1))
+        return [light + keep * (average.clamp_min(0) - light)]
+
+    (irradiance,) = in_strips(mix, 0, seen, keep, average, window["modulation"])
+    return Picture(irradiance, window)
 
 
 def _known(found: Realisations) -> Tensor:

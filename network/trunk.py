@@ -543,12 +543,14 @@ def denoise_picture(
         If the inputs are not as many as the trunk's, or differ in shape.
     """
     scale = (autoexposure(color) if exposure is None else exposure).view(-1, 1, 1, 1)
-    layers = [pu_forward(_clip(color * scale, 0, _MOST))]
-    if albedo is not None:
-        layers.append(_clip(albedo, 0, 1))
-    if normal is not None:
-        layers.append(_clip(normal, -1, 1) * 0.5 + 0.5)
-    return pu_inverse(_run(trunk, layers).clamp_min(0)) / scale
+    given = [("color", color), ("albedo", albedo), ("normal", normal)]
+    ways: dict[str, Callable[[Tensor], Tensor]] = {
+        "color": lambda x: pu_forward(_clip(x * scale, 0, _MOST)),
+        "albedo": lambda x: _clip(x, 0, 1),
+        "normal": lambda x: _clip(x, -1, 1) * 0.5 + 0.5,
+    }
+    layers = [(layer, ways[name]) for name, layer in given if layer is not None]
+    return _run(trunk, layers, lambda x: pu_inverse(x.clamp_min(0)) / scale)
 
 
 @torch.inference_mode()
@@ -567,7 +569,7 @@ def denoise_albedo(trunk: Trunk, albedo: Tensor) -> Tensor:
     Tensor
         The same, without noise.
     """
-    return srgb_inverse(_run(trunk, [srgb_forward(_clip(albedo, 0, 1))]).clamp(0, 1))
+    return _run(trunk, [(albedo, lambda x: srgb_forward(_clip(x, 0, 1)))], lambda x: srgb_inverse(x.clamp(0, 1)))
 
 
 @torch.inference_mode()
@@ -586,17 +588,28 @@ def denoise_normal(trunk: Trunk, normal: Tensor) -> Tensor:
     Tensor
         The same, without noise.
     """
-    return _run(trunk, [_clip(normal, -1, 1) * 0.5 + 0.5]).clamp(0, 1) * 2 - 1
+    return _run(trunk, [(normal, lambda x: _clip(x, -1, 1) * 0.5 + 0.5)], lambda x: x.clamp(0, 1) * 2 - 1)
 
 
-def _run(trunk: Trunk, layers: list[Tensor]) -> Tensor:
-    """The trunk on these layers together, of any size; float32."""
-    x = torch.cat(layers, 1)
-    if x.shape[1] != trunk.config.inputs:
-        raise ValueError(f"inputs: expected {trunk.config.inputs} channels as the weights are for, got {x.shape[1]}")
-    height, width = x.shape[2:]
-    padded = functional.pad(x, (0, -width % trunk.multiple, 0, -height % trunk.multiple))
-    return cast(Tensor, trunk(padded))[..., :height, :width].float()
+def _run(
+    trunk: Trunk, layers: Sequence[tuple[Tensor, Callable[[Tensor], Tensor]]], back: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The trunk on layers of any size, each brought to [0, 1], together, and its picture brought back; float32."""
+    channels = sum(layer.shape[1] for layer, _ in layers)
+    if channels != trunk.config.inputs:
+        raise ValueError(f"inputs: expected {trunk.config.inputs} channels as the weights are for, got {channels}")
+    height, width = layers[0][0].shape[2:]
+    right, below = -width % trunk.multiple, -height % trunk.multiple
+
+    def enter(*given: Tensor) -> list[Tensor]:
+        parts = [to_unit(layer) for layer, (_, to_unit) in zip(given, layers, strict=True)]
+        return [functional.pad(torch.cat(parts, 1), (0, right))]
+
+    # Some rows at a time: what is made on the way is then small, and in the caches.
+    (x,) = in_strips(enter, 0, *(layer for layer, _ in layers))
+    picture = cast(Tensor, trunk(functional.pad(x, (0, 0, 0, below))))[..., :height, :width]
+    (result,) = in_strips(lambda rows: [back(rows.float())], 0, picture)
+    return result
 
 
 def _clip(x: Tensor, low: float, high: float) -> Tensor:
@@ -622,8 +635,8 @@ def autoexposure(color: Tensor) -> Tensor:
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above 1e-8 of bins of at most 16×16 pixels.
     """
     # float64: a sum over a bin may exceed float32 where no pixel does.
-    color = _clip(color, 0, _MOST).double()
-    luminance = torch.einsum("nchw,c->nhw", color, color.new_tensor([0.212671, 0.715160, 0.072169]))
+    weights = torch.tensor([0.212671, 0.715160, 0.072169], dtype=torch.float64, device=color.device)
+    (luminance,) = in_strips(lambda x: [torch.einsum("nchw,c->nhw", _clip(x, 0, _MOST).double(), weights)], 0, color)
     for axis in (1, 2):
         length = luminance.shape[axis]
         bins = -(-length // 16)
