@@ -24,7 +24,7 @@ from torch.nn import functional
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.cpu_time import measure
-from hybrid.memory import keep_freed_memory
+from hybrid.heap import keep_freed_memory
 from network.blocks import RobustAverage, outermost_first, ravg
 from network.kernels import apply_kernels, predict_kernel, threshold_kernel
 from network.losses import relmse

@@ -25,7 +25,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.files.frames import open_shot
-from hybrid.memory import keep_freed_memory
+from hybrid.heap import keep_freed_memory
 from hybrid.oidn import denoise_oidn
 from network.trunk import denoise_picture, load_oidn, round_trunk
 

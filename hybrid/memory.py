@@ -1,4 +1,4 @@
-"""How much of a frame may be worked on at a time, for a given amount of memory; and keeping what is freed without one.
+"""How much of a frame may be worked on at a time, for a given amount of memory.
 
 The frames of a window are held as a whole; what is made of them while they are aligned and filtered, which is several
 times as much, only for some rows. So memory has a lower bound, and what is asked for below it is refused.
@@ -6,9 +6,7 @@ times as much, only for some rows. So memory has a lower bound, and what is aske
 
 from __future__ import annotations
 
-import ctypes
 import re
-import sys
 from collections.abc import Collection
 
 from hybrid.alignment.align import MARGIN, Estimates
@@ -26,25 +24,7 @@ SHARE = 0.92
 PREPARING, FILTERING = 14, 40
 # And while TV-L1 solves for a flow.
 REFINING = 45
-# Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process. What is greater
-# comes once a frame, as OIDN's own 400 MiB, and seldom fits into what is free: peak memory grew with every frame.
-# Features of 64 rows of five frames, which come and go twenty times, are no greater.
-M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1
-KEPT = 3 * 2**26
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-
-
-def keep_freed_memory() -> None:
-    """Let this process keep the memory it frees, where its C library is glibc; elsewhere do nothing.
-
-    glibc gives blocks above 32 MiB back to the kernel at once, which hands out zeroed pages one by one when the next is
-    written: a sixth of the CPU time of `denoise` at 1280×720 and at 1920×1080. Peak memory grows, by a tenth and a
-    quarter there, as what is free is in pieces (`benchmarks/bench_memory.py --limits 1T` compares).
-    """
-    adjust = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if adjust is not None:
-        for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
-            adjust(parameter, KEPT)
 
 
 def parse_size(words: str) -> int:
@@ -153,7 +133,8 @@ def _planes_prepared(layers: Layers) -> float:
     """Count the float32 planes that a `PreparedFrame` of these layers holds, with its light."""
     given = (layers.albedo, layers.normal, layers.variance)
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
-    single = (layers.depth is not None) + (layers.alpha is not None)
+    one_way = layers.motion_convention is not None and not layers.motion_convention.pair
+    single = (layers.depth is not None and one_way) + (layers.alpha is not None)
     aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.tints.values()))
     return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
 

@@ -397,7 +397,7 @@ def denoise_window(
             frames, still, average = lay_out_rows(rows[:, 0].numpy())
             return [model.meet(frames), still, average]
 
-        features, still, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None])
+        features, still, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None], of_frames=True)
         seen, keep = model.finish(features, still)
         del features, still
     (top, _), (left, _) = borders

@@ -248,7 +248,9 @@ class Convolutions(nn.Sequential):
         return x
 
 
-def in_strips(run: Callable[..., Sequence[Tensor]], reach: int, *layers: Tensor) -> list[Tensor]:
+def in_strips(
+    run: Callable[..., Sequence[Tensor]], reach: int, *layers: Tensor, of_frames: bool = False
+) -> list[Tensor]:
     """Run what sees a few rows around each on one strip of rows after the other; with gradients on all at once.
 
     A strip's features fit the caches of a processor, where a frame's do not: convolutions of 32 channels take 0.6 of
@@ -262,6 +264,8 @@ def in_strips(run: Callable[..., Sequence[Tensor]], reach: int, *layers: Tensor)
         How many rows around each it sees, of the finest layer.
     *layers : Tensor
         ``(..., H, W)``; of coarser ones H is half as much, a quarter, ...
+    of_frames : bool
+        Whether features of all frames are there at once: then strips are half as high.
 
     Returns
     -------
@@ -269,12 +273,13 @@ def in_strips(run: Callable[..., Sequence[Tensor]], reach: int, *layers: Tensor)
         What it gives of all rows.
     """
     height = max(layer.shape[-2] for layer in layers)
-    if torch.is_grad_enabled() or height <= ROWS:
+    rows = ROWS // 2 if of_frames else ROWS
+    if torch.is_grad_enabled() or height <= rows:
         return list(run(*layers))
     reach += reach % 2  # where the strip of a layer of half the size begins as well
     whole: list[Tensor] = []
-    for top in range(0, height, ROWS):
-        stop = min(top + ROWS, height)
+    for top in range(0, height, rows):
+        stop = min(top + rows, height)
         first, last = max(top - reach, 0), min(stop + reach, height)
         parts = run(*(_rows(layer, first, last, height) for layer in layers))
         if not whole:

@@ -56,7 +56,7 @@ class PreparedFrame:
     motion : Motion or None
         The renderer's vectors in our convention.
     depth : (H, W) array or None
-        Distance; only its order is used.
+        Distance; only its order is used, and only where vectors go one way.
     variance : (H, W, 3) array or None
         Of the irradiance, where the renderer gave one of the color.
     alpha : (H, W, 1) array or None
@@ -182,6 +182,8 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         color = demodulate(color, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
         aovs = {name: layer if name in frame.tints else demodulate(layer, albedo) for name, layer in aovs.items()}
+    motion = frame.flows()
+    one_way = motion is not None and (motion.to_previous is None or motion.to_next is None)
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
@@ -189,8 +191,8 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         normal=normal,
         valid=~bad,
         repaired=int(np.count_nonzero(repaired)),
-        motion=frame.flows(),
-        depth=frame.depth,
+        motion=motion,
+        depth=frame.depth if one_way else None,
         variance=None if variance is None else np.maximum(variance, 0),
         alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,

@@ -267,7 +267,7 @@ def denoise(
     from rich.table import Table
 
     from hybrid.breakdown import Breakdown, write_breakdown
-    from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
+    from hybrid.estimates import MODE_OF, OIDN_MODES, EstimateSource, choose_estimate
     from hybrid.pipeline import reach_of
     from hybrid.timing import Timings
 
@@ -304,10 +304,10 @@ def denoise(
         add_layers=give_way == "beauty",
         timings=timings,
     )
+    mode = "oidn-clean" if weights is not None else MODE_OF.get(chosen, "oidn-clean")
     if denoiser.takes_estimate:
         # From the noisy frames alone, such a network works beside our own.
         wanted = "nlm" if estimate == "none" else estimate
-        mode = "oidn-clean" if weights is not None else MODE_OF[chosen]
         ahead = reach_of(None, denoiser.radius, rules) * (passes - 1)  # what the first pass makes
         choose = partial(
             choose_estimate,
@@ -328,6 +328,7 @@ def denoise(
     inputs = {"weights": path, "profile": profile}
     sources = [source, *(theirs for _, theirs in beside)]
     _spare_inputs(opened, output, sources, inputs, preview=preview, contact=contact, breakdown=breakdown)
+    bundled = neural.bundled_preset(OIDN_MODES[mode]["quality"])
     settings = {
         "layer": layer,
         "profile": profile,
@@ -340,7 +341,7 @@ def denoise(
         "breakdown": breakdown is not None,
         "precision": denoiser.precision,
         "weights": _digest(path),
-        **({"bundled": _digest(neural.shipped_weights("fast"))} if source.name == "bundled" else {}),
+        **({"bundled": _digest(neural.shipped_weights(bundled))} if source.name == "bundled" else {}),
         "device": {"network": denoiser.device, **({"oidn": source.device} if source.device else {})},
     }
     job = Job(
@@ -594,7 +595,8 @@ def _denoise(job: Job, record: Record) -> None:
     from rich.table import Table
 
     from hybrid.files.layers import summarize_layers
-    from hybrid.memory import keep_freed_memory, parse_size, plan_rows
+    from hybrid.heap import keep_freed_memory
+    from hybrid.memory import parse_size, plan_rows
     from hybrid.pipeline import Failed, denoise_frames, describe_run
     from hybrid.plan import NEURAL_STAGES, Plan, merge
 

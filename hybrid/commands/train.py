@@ -174,7 +174,7 @@ def prepare(
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
     from hybrid.files.frames import open_shot
-    from hybrid.memory import keep_freed_memory
+    from hybrid.heap import keep_freed_memory
     from hybrid.plan import plan_shot
 
     if window not in (1, 3, 5, 7):

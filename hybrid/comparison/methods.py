@@ -142,7 +142,8 @@ def _aligner(
         runs = flip in _plan(seen).stages
         rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
     refine = partial(refine_flow, **(solver or {}))
-    chosen = choose_estimate(source, shot, bundled=_small_network() if source == "bundled" else None)
+    bundled = _small_network() if source == "bundled" else None
+    chosen = choose_estimate(source, shot, mode=MODE_OF["fast"], bundled=bundled)
     return Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Frame, Shot
-from hybrid.memory import keep_freed_memory
+from hybrid.heap import keep_freed_memory
 from hybrid.threads import let_waiting_threads_sleep, limit_threads
 from hybrid.timing import peak_memory
 

@@ -188,7 +188,7 @@ class Denoiser:
         if aligned.picture is not None:
             facts["gain"] = gain_of(aligned).to(self._device)
         # Where no tile lies, nobody looks.
-        irradiance, filtered = own.copy(), np.empty_like(others[centre])
+        irradiance, filtered = np.zeros_like(own), np.empty_like(others[centre])
         # A picture that is black, as far as numbers go, is left as it is.
         dark = aligned.picture is not None and measure_exposure(aligned.picture) == 1 > aligned.picture.max()
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)

@@ -99,17 +99,22 @@ def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced")
     return found
 
 
+def bundled_preset(quality: Quality) -> str:
+    """The preset whose trunk stands for OIDN of this quality where it is not installed."""
+    return "fast" if quality == "fast" else "balanced"
+
+
 def denoise_bundled(
-    color: Array, albedo: Array | None = None, normal: Array | None = None, **settings: object
+    color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
-    """Denoise one frame with the trunk of the preset `fast`, which needs nothing installed beside torch.
+    """Denoise one frame with a trunk of the final stage, which needs nothing installed beside torch.
 
     Parameters
     ----------
     color, albedo, normal : array
         As for `hybrid.oidn.denoise_oidn`.
-    **settings : object
-        Of OIDN: they have no meaning here.
+    quality : str
+        Which trunk: that of `bundled_preset`.
 
     Returns
     -------
@@ -125,12 +130,12 @@ def denoise_bundled(
     def run(trunk: Trunk, *parts: Tensor) -> Tensor:
         return denoise_picture(trunk, *parts, exposure=exposure)
 
-    return image_of(_tiled(run, _bundled(), tensors))
+    return image_of(_tiled(run, _bundled(bundled_preset(quality)), tensors))
 
 
 @lru_cache
-def _bundled() -> Trunk:
-    return _for_running(cast(RobustUNet, load_model(shipped_weights("fast"))).trunk)
+def _bundled(preset: str) -> Trunk:
+    return _for_running(cast(RobustUNet, load_model(shipped_weights(preset))).trunk)
 
 
 def _for_running(trunk: Trunk) -> Trunk:

@@ -427,7 +427,7 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
 
 FAULTS = """
 import resource
-from hybrid.memory import keep_freed_memory
+from hybrid.heap import keep_freed_memory
 
 def page_faults() -> int:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
