@@ -16,7 +16,6 @@ from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.window import AlignedWindow
-from hybrid.heap import return_freed_memory
 from nlm.average import average
 from nlm.fireflies import RECURS
 from nlm.gather import restore_mean
@@ -147,7 +146,6 @@ class Pictures:
         outliers = 0
         for band in self._bands():
             aligned = self.aligner.align(number, band)
-            return_freed_memory()  # of other sizes than what the network asks for
             part = self.denoise(aligned)
             outliers += aligned.outliers
             facts = self.aligner.frames.facts_of(self.aligner.frames.around(number, self.aligner.radius))

@@ -23,7 +23,6 @@ from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
 from hybrid.alignment.window import AlignedWindow, clean_guide, warp_layer, warp_residuals
 from hybrid.files.frames import Frame, Frames, Shot
-from hybrid.heap import return_freed_memory
 from hybrid.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
@@ -141,7 +140,6 @@ class Aligner:
             self.load(numbers)
         else:
             self.source.make(self, numbers)
-        return_freed_memory()  # of other sizes than the layers of a window
         self.flows.forget_chains(numbers)
         aligned = self._assemble(number, numbers, rows, given=self.source is not None)
         if rows is None:
@@ -232,6 +230,9 @@ class Aligner:
         flows = [None if (link := self._link(number, n)) is None else link[0][0][outer] for n in numbers]
         frames = [self.frames.get(n) for n in numbers]
         window_of = partial(warp_layer, {**guides, "irradiance": own}, frames, flows, outer)
+        # Before the estimates, whose place in memory the guide of all frames has until then.
+        with self.timings.stage("confidence"):
+            clean = clean_guide("albedo", guides, window_of, confidence, stages) if "albedo" in guides else None
         estimates, beyond = None, None
         if given:
             estimates = self._gather_estimates(number, numbers, seen, outer, self.estimates)
@@ -241,7 +242,7 @@ class Aligner:
             beyond = partial(warp_residuals, there, flows, outer)
         with self.timings.stage("confidence"):
             aligned = self._finish(
-                centre, own, window, guides, window_of, estimates, beyond, confidence, seen, inner, stages
+                centre, own, window, guides, clean, window_of, estimates, beyond, confidence, seen, inner, stages
             )
             if estimates is not None and "drift" in stages:
                 confidence = aligned.confidence
@@ -357,6 +358,7 @@ class Aligner:
         own: Array,
         window: dict[str, Array],
         guides: dict[str, Array],
+        clean: Array | None,
         window_of: Callable[[str], Array],
         estimates: Array | None,
         beyond: Callable[[], Array] | None,
@@ -386,7 +388,6 @@ class Aligner:
             color, rejected = reject_outliers(color, confidence)
             own, outliers = color[middle], int(np.count_nonzero(rejected[:, inner]))
         trust = confidence
-        clean = clean_guide("albedo", guides, window_of, trust, stages) if "albedo" in guides else None
         modulation = np.ones_like(own)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)

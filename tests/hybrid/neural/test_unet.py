@@ -17,7 +17,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, open_shot
 from hybrid.neural import denoiser, unet
-from hybrid.neural.unet import denoise_unet
+from hybrid.neural.unet import denoise_bundled, denoise_unet
 from network.trunk import OIDN_WEIGHTS, Trunk, TrunkConfig
 from tests.scenes import Scene
 
@@ -45,6 +45,17 @@ def test_is_the_picture_of_oidn(frame, mode, guides) -> None:
     assert result.shape == expected.shape
     # Another network's picture is 35 to 45 dB away; 60 was measured here.
     assert psnr(result, expected) > 52
+
+
+def test_what_comes_with_ravg_stands_for_each_quality_of_oidn(frame) -> None:
+    """Its weights begin as OIDN's: of another size the picture is another one."""
+    found, expected = (
+        {quality: run(frame.color, frame.albedo, frame.normal, quality=quality) for quality in ("fast", "high")}
+        for run in (denoise_bundled, denoise_unet)
+    )
+    for quality, other in (("fast", "high"), ("high", "fast")):
+        assert psnr(found[quality], expected[quality]) > 55
+        assert psnr(found[quality], expected[other]) < 50
 
 
 def test_clean_guides_are_declared_so(frame) -> None:
