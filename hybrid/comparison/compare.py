@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from hybrid.comparison.judging import Judge, error_of, find_static_pixels, store_flows, store_reference
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.results import Comparison, MethodResult, Statistic
-from hybrid.comparison.running import Progress, Run, run_apart, summarize_runs, time_methods
+from hybrid.comparison.running import ENOUGH, Progress, Run, run_apart, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
@@ -252,10 +252,10 @@ def _facts_of_frames(judge: Judge) -> dict[str, str]:
 def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:
     return {
         "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
-        "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, in a "
-        "process of its own, after a first frame that is not counted, as reading files is not. Median, and the "
-        "range of the runs. Peak memory as the operating system counted it. Threads that wait sleep "
-        "(OMP_WAIT_POLICY=PASSIVE).",
+        "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, "
+        f"fewer where that took more than {ENOUGH:g} seconds, in a process of its own, after a first frame that is not "
+        "counted, as reading files is not. Median, and the range of the runs. Peak memory as the operating system "
+        "counted it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
         "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {load:.1f} at the start",
         "Versions": ", ".join(_versions()),
     }

@@ -24,6 +24,10 @@ Progress = Callable[[str, int, int], None]  # what is being done, steps done, st
 P = ParamSpec("P")
 T = TypeVar("T")
 
+#: A method whose runs have taken so long together is not run again, seconds: what meets a short run by chance is
+#: spread over a long one.
+ENOUGH = 20.0
+
 
 @dataclass(frozen=True)
 class Run:
@@ -161,7 +165,7 @@ def time_methods(
     shot : Shot
         What to denoise.
     rounds : int
-        How often each method runs.
+        How often each method runs; fewer times once its runs have taken `ENOUGH`.
     store : FrameStore, optional
         Where the frames of the first round are kept.
     progress : callable, optional
@@ -184,6 +188,8 @@ def time_methods(
             if progress is not None:
                 progress(name, turn * len(names) + done, rounds * len(names))
             if name in absent or (turn and not methods[name].timed):
+                continue
+            if sum(run.seconds for run in runs.get(name, [])) >= ENOUGH:
                 continue
             try:
                 run = run_apart(run_method, methods[name], shot, name, None if turn else store)

@@ -110,6 +110,14 @@ def test_rounds_take_turns_and_what_is_there_already_runs_once(tmp_path: Path) -
     assert store.has("a", 5)
 
 
+def test_what_has_taken_long_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    shot, _ = make_shots()
+    seconds = {"a": 25.0, "b": 11.0, "c": 1.0}
+    monkeypatch.setattr(running, "run_apart", lambda _, method, shot, name, store: Run(1.0, seconds[name], 1.0, 0))
+    runs, _ = time_methods(ways(a=perfect, b=perfect, c=perfect), shot, 4)
+    assert {name: len(series) for name, series in runs.items()} == {"a": 1, "b": 2, "c": 4}
+
+
 def test_non_finite_pixels_of_the_render_are_nobodys_fault(tmp_path: Path) -> None:
     shot, _ = make_shots()
     shot.frames[5].color[3, 3] = np.inf
