@@ -7,7 +7,7 @@ import sys
 
 # Of glibc's malloc.h; blocks up to KEPT, and as much at the end of the heap, stay with the process. What is greater
 # comes once a frame, as OIDN's own 400 MiB, and seldom fits into what is free: peak memory grew with every frame.
-# Features of 64 rows of five frames, which come and go twenty times, are no greater.
+# Features of a strip of all frames, which come and go tens of times, are no greater.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_ARENA_MAX = -3, -1, -8
 KEPT = 3 * 2**26
 

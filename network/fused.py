@@ -21,6 +21,7 @@ from loops.cores import on_all_cores
 HIDDEN = 16
 _PIXELS = 64  # at a time: all their features fit the fastest cache
 _VALUES = 512  # likewise, where the weight is the same in all pixels
+_ALIKE = (5, 7)  # frames of windows for which that is done by itself
 _MOST = 15  # frames of a window, as a network may have (`network.checkpoint.BOUNDS`)
 
 
@@ -83,7 +84,7 @@ def blend_pixels(
     arguments = np.asarray(order), np.asarray(kept), *parameters, bias, last
     bits = torch.uint16 if x.dtype == torch.bfloat16 else torch.uint32
     images = [values.view(bits).numpy().reshape(-1, batch * height, width, channels) for values in (given, result)]
-    if last[:HIDDEN].any():
+    if frames not in _ALIKE or last[:HIDDEN].any():
         on_all_cores(_blend, batch * height, *images, *arguments)
     else:  # before any training the weight is the same in all pixels, and no value depends on another
         rows = (image.reshape(len(image), batch * height, -1) for image in images)
@@ -199,30 +200,6 @@ def _blend_six(x: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, share: An
         x[p] += share * (np.float32(0.25) * total - x[p])
 
 
-@njit(nogil=True)
-def _start(a: Any, b: Any, low: Any, high: Any, total: Any) -> None:
-    for p in range(len(a)):
-        low[p], high[p], total[p] = min(a[p], b[p]), max(a[p], b[p]), 0
-
-
-@njit(nogil=True)
-def _join(value: Any, low: Any, high: Any, total: Any) -> None:
-    for p in range(len(value)):
-        total[p] += max(low[p], min(value[p], high[p]))
-        low[p], high[p] = min(low[p], value[p]), max(high[p], value[p])
-
-
-@njit(nogil=True)
-def _blend_many(state: Any, others: Any, i: Any, share: Any, working: Any) -> None:
-    x, (low, high, total), count = state[i], (working[0], working[1], working[2]), len(others)
-    _start(state[others[0]], state[others[1]], low, high, total)
-    for t in others[2:]:
-        _join(state[t], low, high, total)
-    for p in range(len(x)):
-        mean = total[p] / np.float32(count - 2) if count > 2 else np.float32(0.5) * (low[p] + high[p])
-        x[p] += share * (mean - x[p])
-
-
 @njit(cache=True, nogil=True)
 def _blend_alike(
     first: int, stop: int, given: NDArray[Any], result: NDArray[Any], order: NDArray[Any], kept: NDArray[Any],
@@ -230,7 +207,7 @@ def _blend_alike(
 ) -> None:  # fmt: skip
     T, _, row = given.shape
     low = np.uint32(32 - 8 * given.itemsize)
-    bits, working = np.zeros((T, _VALUES), np.uint32), np.zeros((3, _VALUES), np.float32)
+    bits = np.zeros((T, _VALUES), np.uint32)
     state = bits.view(np.float32)
     for y in range(first, stop):
         for start in range(0, row, _VALUES):
@@ -241,11 +218,9 @@ def _blend_alike(
                 o = np.array([t for t in range(T) if t != i])
                 if T == 5:
                     _blend_four(state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], share)
-                elif T == 7:
+                else:
                     _blend_six(
                         state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], state[o[4]], state[o[5]], share
                     )
-                else:
-                    _blend_many(state, o, i, share, working)
             for n in range(len(kept)):
                 _narrow(result[n, y][part], bits[kept[n]], low)

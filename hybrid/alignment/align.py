@@ -142,8 +142,8 @@ class Aligner:
             self.source.make(self, numbers)
         self.flows.forget_chains(numbers)
         aligned = self._assemble(number, numbers, rows, given=self.source is not None)
-        if rows is None:
-            # Made again for the windows that they serve, for a tenth of a second at 1920×1080 and 70 to 250 MiB.
+        if rows is None or rows.stop == self.shot.shape[0]:
+            # After the last rows: made again for the windows that they serve, and not kept while this one is denoised.
             self.flows.forget_chains(())
         return aligned
 

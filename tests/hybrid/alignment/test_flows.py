@@ -33,6 +33,15 @@ def fast_folder(tmp_path_factory):
     return FAST.write(tmp_path_factory.mktemp("fast"), edit=wrong_by_a_pixel)
 
 
+def test_flows_over_several_frames_are_kept_for_a_window_and_no_longer(tmp_path):
+    """They are a fifth of what a window of seven frames holds while it is denoised."""
+    scene = Scene(frames=5, height=48)
+    aligner = Aligner(open_shot(scene.write(tmp_path)), STAGES)
+    for rows, kept in ((slice(0, 24), 4), (slice(24, 48), 0), (slice(0, 48), 0), (None, 0)):
+        aligner.align(scene.first + 2, rows)
+        assert len(aligner.flows._chains) == kept
+
+
 def test_refinement_starts_from_the_vectors_and_its_result_is_used(fast_folder):
     assert flow_error(fast_folder, STAGES) == pytest.approx(1.5, abs=0.01)  # as they were written
     # The bound that the project sets itself for perturbed vectors.
