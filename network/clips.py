@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +26,14 @@ from network.losses import ImageLoss
 from network.train_config import SamplerConfig
 
 FORMAT = "ravg-clips"
-VERSION = "3"
+VERSION = "4"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
 #: (fireflies only) becomes this.
 HALF_MAX = 65504.0
 #: The fields of a clip that are one number for each level.
 FIGURES = ("exposure", "gain")
+#: Kinds of targets that are renders, whose noise is independent of the input's.
+RENDERS = ("noisy", "rendered")
 #: Bytes after which a shard is full: small enough to copy about, large enough that files are few.
 SHARD_BYTES = 1 << 28
 
@@ -62,10 +64,17 @@ class Clip:
         ``(L,)``, of the windows of whole frames: what the network is told when it runs.
     gain : Tensor
         ``(L,)``, OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
+    to_next : Tensor
+        ``(L, 2, H, W)``, pixels: from each pixel of the centre to where it is in the next frame; 0 where unknown.
+    linked : Tensor
+        ``(L,)``: 1 where the next clip is the same place of the next frame, else 0.
     pseudo_reference : Tensor, optional
         ``(L, 3, H, W)`` radiance of the centre, as estimated from the level's own window. There where no reference is.
     reference : Tensor, optional
         ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
+    rendered : Tensor, optional
+        ``(L, 3, H, W)`` radiance of the centre in an independent render of more samples: a second target beside
+        a reference that was estimated from that render's window.
 
     Raises
     ------
@@ -85,8 +94,11 @@ class Clip:
     noisy: Tensor
     exposure: Tensor
     gain: Tensor
+    to_next: Tensor
+    linked: Tensor
     pseudo_reference: Tensor | None = None
     reference: Tensor | None = None
+    rendered: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.color.shape)
@@ -99,8 +111,9 @@ class Clip:
             **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), shape),
             **dict.fromkeys(("modulation", "clean_albedo", "clean_normal", "noisy", "pseudo_reference"), image),
             "confidence": (*shape[:2], 1, *shape[3:]),
-            **dict.fromkeys(FIGURES, shape[:1]),
-            "reference": image,
+            **dict.fromkeys((*FIGURES, "linked"), shape[:1]),
+            **dict.fromkeys(("reference", "rendered"), image),
+            "to_next": (shape[0], 2, *shape[3:]),
         }
         for name, value in _values(self).items():
             wanted = expected[name]
@@ -122,10 +135,12 @@ class Clip:
         Returns
         -------
         Clip
-            With the exposures of the whole frame.
+            With the exposures of the whole frame. It is linked to no other, as the next frame's tiles lie elsewhere.
         """
         here = np.s_[..., y : y + size, x : x + size]
-        return Clip(**{n: v if n in FIGURES else v[here] for n, v in _values(self).items()})
+        whole = (*FIGURES, "linked")
+        cut = Clip(**{n: v if n in whole else v[here] for n, v in _values(self).items()})
+        return replace(cut, linked=torch.zeros_like(self.linked))
 
 
 def _values(clip: Clip) -> dict[str, Tensor]:
@@ -310,7 +325,7 @@ def _pack(clip: Clip) -> dict[str, Tensor]:
     scale = clip.exposure[-1]
     packed = {"exposure": (clip.exposure / scale).float(), "gain": (clip.gain * scale).float()}
     for name, value in _values(clip).items():
-        if name in ("color", "estimate", "residual", "noisy", "pseudo_reference", "reference"):
+        if name in ("color", "estimate", "residual", "noisy", "pseudo_reference", "reference", "rendered"):
             value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
         if name not in FIGURES:
             packed[name] = value.to(torch.float16).contiguous()
@@ -325,7 +340,8 @@ class _Shard:
     shot: str
     samples: tuple[float, ...]
     shape: tuple[int, ...]  # of color: clips, levels, frames, 3, height, width
-    clean: bool  # whether it has references
+    targets: tuple[str, ...]  # references, and renders beside them: none where levels are trained towards each other
+    linked: tuple[bool, ...]  # of each clip, whether the next is the same place of the next frame
 
 
 class Clips:
@@ -335,10 +351,22 @@ class Clips:
     ----------
     shards : sequence
         From `open_clips`.
+    frames : int, optional
+        Length of the windows, odd: the middle frames of those that are stored. All without.
+
+    Raises
+    ------
+    ValueError
+        If the length is even, or more than is stored.
     """
 
-    def __init__(self, shards: Sequence[_Shard]) -> None:
+    def __init__(self, shards: Sequence[_Shard], frames: int | None = None) -> None:
         self._shards = list(shards)
+        stored = shards[0].shape[2] if shards else 1
+        #: Length of the windows, T.
+        self.frames = stored if frames is None else frames
+        if not 0 < self.frames <= stored or self.frames % 2 == 0:
+            raise ValueError(f"window: expected an odd number of frames up to the clips' {stored}, got {self.frames}")
         self._starts = np.cumsum([0, *(shard.shape[0] for shard in shards)])
 
     def __len__(self) -> int:
@@ -348,11 +376,6 @@ class Clips:
     def shots(self) -> list[str]:
         """Names of the shots, sorted."""
         return sorted({shard.shot for shard in self._shards})
-
-    @property
-    def frames(self) -> int:
-        """Length of the windows, T."""
-        return self._shards[0].shape[2]
 
     @property
     def size(self) -> int:
@@ -372,7 +395,8 @@ class Clips:
         Clips
             In the order they have here.
         """
-        return Clips([shard for shard in self._shards if shard.shot in shots])
+        found = [shard for shard in self._shards if shard.shot in shots]
+        return Clips(found, self.frames if found else None)
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
         """What each noise level of a clip may be trained towards.
@@ -385,12 +409,33 @@ class Clips:
         Returns
         -------
         list of list of (int, str)
-            For each level its targets: the reference where there is one, else its `noise_pairs`.
+            For each level its targets: the reference where there is one, and a render beside it, else its
+            `noise_pairs`.
         """
         shard = self._find(index)[0]
-        if shard.clean:
-            return [[(level, "reference")] for level in range(len(shard.samples))]
+        if shard.targets:
+            return [[(level, kind) for kind in shard.targets] for level in range(len(shard.samples))]
         return noise_pairs(shard.samples)
+
+    def neighbours(self, index: int) -> tuple[int, int] | None:
+        """Two clips of successive frames at the same place, the one given among them.
+
+        Parameters
+        ----------
+        index : int
+            Of the clip.
+
+        Returns
+        -------
+        (int, int) or None
+            The earlier first; None where there is no such other.
+        """
+        for first in (index, index - 1):
+            if first >= 0:
+                shard, number = self._find(first)
+                if shard.linked[number]:
+                    return first, first + 1
+        return None
 
     def read(self, index: int, level: int, target: tuple[int, str]) -> dict[str, Tensor]:
         """Read one level of a clip with a target.
@@ -416,11 +461,14 @@ class Clips:
             If the file is cut short.
         """
         shard, number = self._find(index)
-        layers = ("color", "albedo", "normal", "estimate", "residual", "confidence", "modulation")
-        names = (*layers, "clean_albedo", "clean_normal", *FIGURES)
+        windows = ("color", "albedo", "normal", "estimate", "residual", "confidence")
+        names = ("modulation", "clean_albedo", "clean_normal", "to_next", *FIGURES)
+        outer = (shard.shape[2] - self.frames) // 2
+        middle = slice(outer, outer + self.frames)
         try:
             with safe_open(shard.path, framework="pt") as file:
-                values = {name: file.get_slice(name)[number, level] for name in names}
+                values = {name: file.get_slice(name)[number, level, middle] for name in windows}
+                values |= {name: file.get_slice(name)[number, level] for name in names}
                 values["target"] = file.get_slice(target[1])[number, target[0]]
         except (SafetensorError, OSError) as error:
             raise ValueError(f"clips {os.fspath(shard.path)!r}: cut short ({error})") from error
@@ -431,13 +479,15 @@ class Clips:
         return self._shards[shard], index - int(self._starts[shard])
 
 
-def open_clips(folder: str | os.PathLike[str]) -> Clips:
+def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Clips:
     """Open all shards of a folder and of those in it.
 
     Parameters
     ----------
     folder : path
         Where `write_shards` has written.
+    frames : int, optional
+        Length of the windows, as for `Clips`.
 
     Returns
     -------
@@ -449,7 +499,7 @@ def open_clips(folder: str | os.PathLike[str]) -> Clips:
     FileNotFoundError
         If there are none.
     ValueError
-        If one is no shard of clips, or of another version, or their windows differ in length.
+        If one is no shard of clips, or of another version, or their windows differ in length, or are shorter.
     """
     paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:
@@ -462,17 +512,17 @@ def open_clips(folder: str | os.PathLike[str]) -> Clips:
                 metadata = file.metadata() or {}
                 names = set(file.keys())
                 shape = tuple(file.get_slice("color").get_shape()) if "color" in names else ()
+                linked = tuple((file.get_tensor("linked")[:, 0] > 0).tolist()) if "linked" in names else ()
         except SafetensorError as error:
             raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
         for key, wanted in (("format", FORMAT), ("version", VERSION)):
             if metadata.get(key) != wanted:
                 raise ValueError(f"{where}: expected {key} {wanted!r}, got {metadata.get(key)!r}")
-        shards.append(
-            _Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape, "reference" in names)
-        )
+        targets = tuple(name for name in ("reference", "rendered") if name in names)
+        shards.append(_Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape, targets, linked))
         if shards[-1].shape[2] != shards[0].shape[2]:
             raise ValueError(f"{where}: expected windows of {shards[0].shape[2]} frames, got {shards[-1].shape[2]}")
-    return Clips(shards)
+    return Clips(shards, frames)
 
 
 def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
@@ -520,11 +570,13 @@ class Samples(Dataset[dict[str, Tensor]]):
         Of everything random.
     loss : ImageLoss
         What ``error`` is measured with.
+    neighbours : bool
+        Whether each sample is two: of successive frames, at the same place and varied alike.
 
     Raises
     ------
     ValueError
-        If there are no clips, or one is too small.
+        If there are no clips, one is too small, or neighbours are asked for and one has none.
 
     Notes
     -----
@@ -532,11 +584,19 @@ class Samples(Dataset[dict[str, Tensor]]):
     order, at a noise level and towards a target drawn from `noise_pairs`; after the last set the first comes again.
 
     Variations: flips, transposition (with flips: quarter turns), permutations of the color channels, signed
-    permutations of the normal's axes (normals may be in any fixed space, so none is turned with the image; what is
-    stored has been aligned, so there are no flows to turn), and those of `SamplerConfig`.
+    permutations of the normal's axes (normals may be in any fixed space, so none is turned with the image), and those
+    of `SamplerConfig`.
     """
 
-    def __init__(self, clips: Clips, config: SamplerConfig, seed: int, loss: ImageLoss = losses.relmse) -> None:
+    def __init__(
+        self,
+        clips: Clips,
+        config: SamplerConfig,
+        seed: int,
+        loss: ImageLoss = losses.relmse,
+        *,
+        neighbours: bool = False,
+    ) -> None:
         if len(clips) == 0:
             raise ValueError("clips: expected at least one, got none")
         if clips.size < config.crop:
@@ -545,6 +605,12 @@ class Samples(Dataset[dict[str, Tensor]]):
         order = np.random.default_rng((seed, 0)).permutation(len(clips))
         self._sets = [order[first :: config.sets] for first in range(config.sets)]
         self._cycle: tuple[int, np.ndarray] | None = None
+        self.neighbours = neighbours
+        if neighbours and (alone := [index for index in range(len(clips)) if clips.neighbours(index) is None]):
+            raise ValueError(
+                f"clips: expected neighbouring frames of each, as whole frames have (ravg prepare --tile 0), "
+                f"got {len(alone)} of {len(clips)} without"
+            )
 
     def clip_of(self, number: int) -> int:
         """The clip that a sample is made of.
@@ -572,50 +638,69 @@ class Samples(Dataset[dict[str, Tensor]]):
         -------
         dict of Tensor
             float32: ``color``, ``albedo``, ``normal``, ``estimate``, ``residual`` ``(T, 3, H, W)``, ``confidence``
-            ``(T, 1, H, W)``, ``modulation``, ``clean_albedo``, ``clean_normal``, ``target`` ``(3, H, W)``,
-            ``exposure``, ``gain`` and ``error`` ``()`` (the loss of the clip's best input). A
-            `torch.utils.data.DataLoader` stacks them.
+            ``(T, 1, H, W)``, ``modulation``, ``clean_albedo``, ``clean_normal``, ``target`` ``(3, H, W)``, ``to_next``
+            ``(2, H, W)``, ``exposure``, ``gain`` and ``error`` ``()`` (the loss of the clip's best input). With
+            neighbours there is a 2 in front of each shape. A `torch.utils.data.DataLoader` stacks them.
         """
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
         level = int(rng.integers(len(pairs)))
-        values = self.clips.read(index, level, pairs[level][rng.integers(len(pairs[level]))])
-        error = input_error({name: value[None].float() for name, value in values.items()}, self.loss)[0]
-        exposure, gain = (values.pop(name).float() for name in FIGURES)
-        frames = len(values["color"])
-        centre = frames // 2
-        y, x = self._place(values, rng)
-        flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
-        transpose = rng.random() < 0.5
+        target = self._target(pairs[level], rng)
+        members = self.clips.neighbours(index) if self.neighbours else (index,)
+        assert members is not None  # as was looked at in the beginning
+        clips = [self.clips.read(member, level, target) for member in members]
+        frames = len(clips[0]["color"])
+        y, x = self._place(clips[0], rng)
+        across, down, transpose = rng.random(3) < 0.5
         channels = torch.from_numpy(rng.permutation(3))
         axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
-        sample = {}
-        for name, value in values.items():
-            value = value[..., y : y + config.crop, x : x + config.crop].float().flip(flips)
-            value = value.transpose(-2, -1) if transpose else value
-            if name in ("normal", "clean_normal"):
-                value = value[..., axes, :, :] * signs
-            elif name != "confidence":
-                value = value[..., channels, :, :]
-            sample[name] = value.contiguous()
+        stops = rng.uniform(-config.exposure_stops, config.exposure_stops)
+
+        def vary(values: dict[str, Tensor]) -> dict[str, Tensor]:
+            """Crop and turn what was read, the same way for both clips."""
+            whole = {name: value[None].float() for name, value in values.items()}
+            sample = {"error": input_error(whole, self.loss)[0]}
+            for name, value in values.items():
+                if name in FIGURES:
+                    sample[name] = value.float() * 2 ** (stops if name == "exposure" else -stops)
+                    continue
+                value = value[..., y : y + config.crop, x : x + config.crop].float()
+                value = value.flip([axis for axis, flipped in ((-1, across), (-2, down)) if flipped])
+                value = value.transpose(-2, -1) if transpose else value
+                if name in ("normal", "clean_normal"):
+                    value = value[..., axes, :, :] * signs
+                elif name == "to_next":
+                    value = value * torch.tensor([-1.0 if across else 1.0, -1.0 if down else 1.0])[:, None, None]
+                    value = value.flip(0) if transpose else value
+                elif name != "confidence":
+                    value = value[..., channels, :, :]
+                sample[name] = value.contiguous()
+            return sample
+
+        samples = [vary(values) for values in clips]
         if frames > 1 and rng.random() < config.drop_frames:
             dropped = torch.from_numpy(rng.random(frames) < 0.5)
-            dropped[centre] = False
-            for name in ("color", "albedo", "normal", "estimate", "residual"):
-                sample[name][dropped] = sample[name][centre].clone()
-            sample["confidence"][dropped] = 0
+            dropped[frames // 2] = False
+            for sample in samples:
+                for name in ("color", "albedo", "normal", "estimate", "residual"):
+                    sample[name][dropped] = sample[name][frames // 2].clone()
+                sample["confidence"][dropped] = 0
         if rng.random() < config.fireflies:
             count = rng.integers(1, 9)
             rows, columns = rng.integers(config.crop, size=(2, count))
             # Not black where it was black: a firefly comes from a path, not from the pixel it lands in.
-            burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * exposure
+            burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * clips[0]["exposure"].float()
             frame = rng.integers(frames)
             for name in ("color", "residual"):
-                sample[name][frame, :, rows, columns] += burst
-        stops = rng.uniform(-config.exposure_stops, config.exposure_stops)
-        sample["exposure"], sample["gain"] = exposure * 2**stops, gain / 2**stops
-        sample["error"] = error
-        return sample
+                samples[0][name][frame, :, rows, columns] += burst
+        return {n: torch.stack([s[n] for s in samples]) for n in samples[0]} if self.neighbours else samples[0]
+
+    def _target(self, targets: list[tuple[int, str]], rng: np.random.Generator) -> tuple[int, str]:
+        """One of the targets of a level: a render or a pseudo-reference first, then whose."""
+        renders = [target for target in targets if target[1] in RENDERS]
+        estimated = [target for target in targets if target[1] not in RENDERS]
+        kind = estimated if not renders or (estimated and rng.random() < self.config.pseudo) else renders
+        return kind[rng.integers(len(kind))]
 
     def _place(self, values: dict[str, Tensor], rng: np.random.Generator) -> tuple[int, int]:
         """Corner of the crop: the clip's own if that is as large, else drawn by importance."""

@@ -134,8 +134,14 @@ def relmse(
     return _mean(inside * (2 * size - inside), weight)
 
 
-def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Squared error of what is seen: ``mean (T(d) − T(r))²``, ``T(x) = x / (x + s)``; for clean targets.
+def display(
+    prediction: Tensor,
+    target: Tensor,
+    scale: Tensor,
+    weight: Tensor | None = None,
+    limit: float = 0.5,
+) -> Tensor:
+    """Squared error of what is seen, ``T(x) = x / (x + s)``, to first order: ``mean (T'(d) (d − r))²``.
 
     Parameters
     ----------
@@ -145,6 +151,8 @@ def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | 
         ``(N,)`` of the radiance.
     weight : Tensor, optional
         ``(N, C, H, W)`` factors of the errors.
+    limit : float
+        Error, of the range of T, beyond which the square goes on as a straight line, as of `relmse`.
 
     Returns
     -------
@@ -153,14 +161,17 @@ def display(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | 
 
     Notes
     -----
-    The square of `tone_mapped_psnr` at the exposure of the picture. Noisy targets would darken by it, as T is concave.
-    Towards references it is better than `relmse`, which counts dark pixels by what they are relative to themselves: a
-    network trained so averaged more over time than the eye, or PSNR, would have it.
+    About the square of `tone_mapped_psnr` at the exposure of the picture. Its weights, ``T'(d) = s / (d + s)²``, are of
+    the prediction and carry no gradient, so that the noise of targets, which would darken a difference of T, leaves
+    the mean alone but for what is beyond the limit. Towards references it is better than `relmse`, which counts dark
+    pixels by what they are relative to themselves: a network trained so averaged more over time than the eye, or PSNR,
+    would have it.
     """
     level = scale.view(-1, 1, 1, 1)
-    # 1 − s / (x + s), and not x / …: it cannot overflow; negative radiance counts as 0.
-    shown = [1 - level / (functional.relu(image) + level) for image in (prediction, target)]
-    return _mean((shown[0] - shown[1]).square(), weight)
+    slope = level / (functional.relu(prediction.detach()) + level).square()
+    size = ((prediction - target) * slope).abs()
+    inside = size.clamp(max=limit)
+    return _mean(inside * (2 * size - inside), weight)
 
 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
@@ -349,6 +360,56 @@ def picture_loss(
     """
     sides = None if slope == 1 else asymmetry(image * modulation, target, noisy * modulation, slope)
     return loss(image * modulation, target, _scale_of_radiance(scale, modulation), sides)
+
+
+def difference_loss(
+    loss: ImageLoss,
+    images: Tensor,
+    targets: Tensor,
+    modulation: Tensor,
+    scale: Tensor,
+    to_next: Tensor,
+    trust: Tensor,
+) -> Tensor:
+    """Loss of what changes between two successive pictures and does not between their targets: of what flickers.
+
+    Parameters
+    ----------
+    loss : ImageLoss
+        Image loss.
+    images : Tensor
+        ``(N, 2, C, H, W)`` irradiance, the earlier frame first.
+    targets, modulation : Tensor
+        ``(N, 2, C, H, W)``, as for `temporal_loss`.
+    scale : Tensor
+        ``(N, 2)`` exposure of the irradiance.
+    to_next : Tensor
+        ``(N, 2, H, W)``, pixels: from each pixel of the first to where it is in the second.
+    trust : Tensor
+        ``(N, 1, H, W)`` in [0, 1]: how far that is the same light.
+
+    Returns
+    -------
+    Tensor
+        ``(N,)``.
+
+    Notes
+    -----
+    With ``e_i = d_i − r_i`` and W the warp along the motion it is ``loss(d_1, r_1 + W e_2)``, weighted by trust, and by
+    0 where the motion leaves the crop: the error of the motion-compensated difference of the pictures, which is what
+    temporal PSNR measures. Independent noise in the targets adds to it and does not move where it is least.
+    """
+    error = (images[:, 1] * modulation[:, 1]) - targets[:, 1]
+    height, width = to_next.shape[-2:]
+    rows, columns = (torch.arange(size, device=to_next.device, dtype=to_next.dtype) for size in (height, width))
+    at_x, at_y = to_next[:, 0] + columns, to_next[:, 1] + rows[:, None]
+    # grid_sample wants −1 and 1 at the outer edges of the outer pixels.
+    grid = torch.stack([(2 * at_x + 1) / width - 1, (2 * at_y + 1) / height - 1], -1)
+    moved = functional.grid_sample(error, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    inside = (at_x >= 0) & (at_x <= width - 1) & (at_y >= 0) & (at_y <= height - 1)
+    seen = (trust * inside[:, None]).expand_as(error)
+    radiance = _scale_of_radiance(scale[:, 0], modulation[:, 0])
+    return loss(images[:, 0] * modulation[:, 0], targets[:, 0] + moved, radiance, seen)
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:

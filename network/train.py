@@ -32,7 +32,7 @@ from network.devices import find_device, has_bfloat16
 from network.kernels import Filtered, mean_of
 from network.models import Model, centre_of, channels_last, filter_window
 from network.perceptual import Perceptual, load_vgg19
-from network.robust_unet import Picture, RobustUNet
+from network.robust_unet import MIRRORED, Picture, RobustUNet
 from network.train_config import TrainConfig
 
 
@@ -60,7 +60,7 @@ def predict(
     if isinstance(model, RobustUNet) and model.config.clean_guides:
         batch = batch | {name: batch[f"clean_{name}"][:, None] for name in ("albedo", "normal")}
     with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
-        return filter_window(model, batch, run=run)
+        return filter_window(model, batch, run=run, borders=((MIRRORED, MIRRORED),) * 2)
 
 
 def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
@@ -103,9 +103,9 @@ def batch_loss(
     model : Model
         Any.
     batch : dict of Tensor
-        As from `network.clips.Samples`, with N in front.
+        As from `network.clips.Samples`, with N in front; of neighbours where their differences count.
     config : TrainConfig
-        Terms, slope and precision.
+        Terms, slope, differences and precision.
     loss : ImageLoss
         Of images.
     run : callable, optional
@@ -125,6 +125,8 @@ def batch_loss(
     where it should not. The logarithm is for the few crops that are twenty times worse than their clip: one of them
     would undo what a hundred others have taught.
     """
+    if neighbours := config.differences > 0:
+        batch = {name: pair.flatten(0, 1) for name, pair in batch.items()}
     filtered = predict(model, batch, config.bfloat16, run)
     color, facts = batch["color"], (batch["target"], batch["modulation"], batch["exposure"])
     if isinstance(filtered, Picture):
@@ -132,7 +134,17 @@ def batch_loss(
     else:
         terms = loss_terms(config, color.shape[1])
         value = losses.temporal_loss(loss, filtered, color, *facts, terms, config.slope)
-    return torch.log1p(value / batch["error"]).mean()
+    value = value / batch["error"]
+    if neighbours:
+        image = filtered.irradiance if isinstance(filtered, Picture) else filtered.image(centre_of(color))
+        image, target, modulation, exposure, error = (
+            pair.unflatten(0, (-1, 2)) for pair in (image, *facts, batch["error"])
+        )
+        after = color.shape[1] // 2 + 1
+        trust = batch["confidence"][::2, min(after, color.shape[1] - 1)]
+        flicker = losses.difference_loss(loss, image, target, modulation, exposure, batch["to_next"][::2], trust)
+        value = value.unflatten(0, (-1, 2)).mean(1) + config.differences * flicker / error.mean(1)
+    return torch.log1p(value).mean()
 
 
 @torch.no_grad()
@@ -255,7 +267,8 @@ def train(
     run: nn.Module = DistributedDataParallel(model) if world > 1 else model
     if config.compile:
         run = cast(nn.Module, torch.compile(run))
-    batches = _batches(Samples(training, config.sampler, config.seed, loss_of_image), config, step, rank, world)
+    samples = Samples(training, config.sampler, config.seed, loss_of_image, neighbours=config.differences > 0)
+    batches = _batches(samples, config, step, rank, world)
 
     start = time.monotonic() - before
     checkpointed = validated = before

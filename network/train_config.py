@@ -17,13 +17,14 @@ class SamplerConfig:
     sets: int = 10  # disjoint sets of clips, one for each epoch; the paper's ten
     drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
+    pseudo: float = 0.5  # a target is a pseudo-reference, where there are renders of as many samples too
     exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
 
     def __post_init__(self) -> None:
         for name in ("crop", "sets"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("drop_frames", "fireflies"):
+        for name in ("drop_frames", "fireflies", "pseudo"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a probability, got {getattr(self, name)}")
 
@@ -45,6 +46,7 @@ class TrainConfig:
     vgg: str | None = None  # weights of VGG19 in torchvision's format, or hub; for perceptual
     terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
     whole: float = 1.0  # weight of the whole window's term beside the temporal ones
+    differences: float = 0.0  # weight of what the errors of two neighbouring pictures differ by, along the motion
     slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
     bfloat16: bool = True  # for the convolutions, where the device has it; kernels and losses are float32
     compile: bool = False  # torch.compile the network: a minute at the start, pays on a GPU
@@ -71,5 +73,6 @@ class TrainConfig:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
         if (self.loss == "perceptual") != (self.vgg is not None):
             raise ValueError("vgg: expected weights with the perceptual loss, and only with it")
-        if self.whole < 0 or self.slope < 1:
-            raise ValueError(f"whole, slope: expected whole >= 0 and slope >= 1, got {self.whole} and {self.slope}")
+        for name, least in (("whole", 0), ("differences", 0), ("slope", 1)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")

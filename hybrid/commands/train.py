@@ -269,6 +269,10 @@ def train(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    window: Annotated[
+        int | None,
+        typer.Option(help="frames of a window: the middle ones, where clips have more", rich_help_panel=INPUT),
+    ] = None,
     validation: Annotated[
         list[str] | None,
         typer.Option(help="shots kept out of training; again or with commas for more", rich_help_panel=INPUT),
@@ -308,6 +312,17 @@ def train(
     whole: Annotated[
         float, typer.Option(help="weight of the whole window's term beside the temporal ones", rich_help_panel=TRAINING)
     ] = DEFAULTS.whole,
+    differences: Annotated[
+        float,
+        typer.Option(
+            help="weight of the error of what changes from frame to frame; wants clips of whole frames",
+            rich_help_panel=TRAINING,
+        ),
+    ] = DEFAULTS.differences,
+    pseudo: Annotated[
+        float,
+        typer.Option(help="chance of a pseudo-reference as target, beside renders", rich_help_panel=TRAINING),
+    ] = DEFAULTS.sampler.pseudo,
     slope: Annotated[
         float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail", rich_help_panel=TRAINING)
     ] = DEFAULTS.slope,
@@ -366,6 +381,7 @@ def train(
             vgg=vgg,
             terms=terms,
             whole=whole,
+            differences=differences,
             slope=slope,
             bfloat16=not float32,
             compile=compile,
@@ -374,7 +390,7 @@ def train(
             seed=seed,
             checkpoint_minutes=validate_minutes,
             validate_minutes=validate_minutes,
-            sampler=SamplerConfig(crop=crop, sets=sets, drop_frames=drop_frames),
+            sampler=SamplerConfig(crop=crop, sets=sets, drop_frames=drop_frames, pseudo=pseudo),
         )
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
     read += [(what, Path(path)) for what, path in (("init", init), ("vgg", vgg)) if path and Path(path).is_file()]
@@ -408,6 +424,7 @@ def train(
         config,
         preset=preset,
         init=init,
+        window=window,
         validation=[name for item in validation or () for name in item.split(",")],
         threads=threads,
         resume=resume,

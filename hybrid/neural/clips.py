@@ -60,7 +60,8 @@ def write_clips(
     reference : Shot, optional
         The same frames clean, or some of them: clips are made of these alone, and trained towards them.
     target : Shot, optional
-        A further render of the same frames, of more samples: clips are trained towards its pseudo-references.
+        A further render of the same frames, of more samples: clips are trained towards its pseudo-references, or
+        towards itself.
     seed : int
         Of the places.
     advance : callable
@@ -97,19 +98,24 @@ def write_clips(
     # Beside estimates by OIDN it is there for a second look as well.
     make_target = gather_and_denoise if all(source.name in OIDN_MODES for source in sources) else gated_average
 
-    def clean(number: int) -> NDArray[np.float32] | None:
-        """The picture that all levels of a frame are trained towards, if there is one."""
+    def towards(number: int) -> dict[str, NDArray[np.float32]]:
+        """The pictures that all levels of a frame are trained towards, if there are any."""
         if reference is not None:
-            return replace_nonfinite(reference.read(number).color)[0]
-        return None if target is None else make_target(aligners[-1].align(number))
+            return {"reference": replace_nonfinite(reference.read(number).color)[0]}
+        if target is None:
+            return {}
+        rendered = replace_nonfinite(target.read(number).color)[0]
+        return {"reference": make_target(aligners[-1].align(number)), "rendered": rendered}
 
     def make() -> Iterator[Clip]:
         rng = np.random.default_rng(seed)
         for number in numbers:
-            found = clean(number)
-            own = make_target if found is None else None
+            found = towards(number)
+            own = None if found else make_target
+            after = number + shots[0].step
             levels_here = zip(shots, aligners, strict=False)
-            whole = _clip([_level(shot, aligner, number, own) for shot, aligner in levels_here], found)
+            parts = [_level(shot, aligner, number, after, own) for shot, aligner in levels_here]
+            whole = _clip(parts, found, linked=after in numbers)
             if tile == 0:
                 yield whole
             else:
@@ -118,7 +124,7 @@ def write_clips(
                     raise ValueError(f"tile: expected at most the frame's {width}×{height} pixels, got {tile}")
                 noisiest = min(range(len(samples)), key=lambda level: samples[level])
                 middle, scale = whole.color.shape[1] // 2, whole.exposure[noisiest]
-                best = cast(torch.Tensor, whole.pseudo_reference if found is None else whole.reference)
+                best = cast(torch.Tensor, whole.reference if found else whole.pseudo_reference)
                 weights = importance(
                     whole.noisy[noisiest] / scale,
                     best[noisiest] / scale,
@@ -133,15 +139,24 @@ def write_clips(
 
 
 def _level(
-    shot: Shot, aligner: Aligner, number: int, make_target: Callable[[AlignedWindow], NDArray[np.float32]] | None
+    shot: Shot,
+    aligner: Aligner,
+    number: int,
+    after: int,
+    make_target: Callable[[AlignedWindow], NDArray[np.float32]] | None,
 ) -> dict[str, torch.Tensor]:
-    """What a clip holds of one noise level, with N = 1 in front; its own target where it needs one."""
+    """What a clip holds of one noise level, with N = 1 in front; its own target where it needs one.
+
+    Without the flow to the frame after, if it has one, there is none of ``to_next``.
+    """
     aligned = aligner.align(number)
     if aligned.estimate is None or aligned.residual is None:
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
     clean = clean_guides(aligned)
+    motion = None if aligner.radius == 0 else aligner.flows.between(number, after)
+    to_next = np.zeros((*noisy.shape[:2], 2), np.float32) if motion is None else motion[0] * motion[1][..., None]
     targets = {} if make_target is None else {"pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0]}
     return targets | {
         "color": tensor_of(color),
@@ -156,12 +171,15 @@ def _level(
         "noisy": tensor_of(noisy[None])[:, 0],
         "exposure": exposure_of(aligned),
         "gain": gain_of(aligned),
+        "to_next": tensor_of(to_next[None])[:, 0],
+        "linked": torch.tensor([float(motion is not None)]),
     }
 
 
-def _clip(levels: list[dict[str, torch.Tensor]], clean: NDArray[np.float32] | None) -> Clip:
-    """A clip of its levels, with the picture that all of them are trained towards."""
+def _clip(levels: list[dict[str, torch.Tensor]], towards: Mapping[str, NDArray[np.float32]], *, linked: bool) -> Clip:
+    """A clip of its levels, with the pictures that all of them are trained towards."""
     values = {name: torch.cat([level[name] for level in levels]) for name in levels[0]}
-    if clean is not None:
-        values["reference"] = tensor_of(clean[None])[:, 0].expand_as(values["noisy"])
+    values["linked"] = values["linked"].min().expand(len(levels)) * linked
+    for name, picture in towards.items():
+        values[name] = tensor_of(picture[None])[:, 0].expand_as(values["noisy"])
     return Clip(**values)

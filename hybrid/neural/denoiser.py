@@ -27,7 +27,7 @@ from hybrid.timing import Timings
 from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
-from network.robust_unet import Borders, RobustUNet
+from network.robust_unet import MIRRORED, Borders, RobustUNet
 from nlm.average import average
 from nlm.parts import add_light, adds_up, is_part, split_light
 
@@ -35,9 +35,6 @@ Array = NDArray[np.float32]
 
 # Pixels of context around a tile: what a network sees beyond them changes a picture by less than 1e-5 of its mean.
 HALO = 48
-# Pixels that a picture is mirrored by beyond its borders for a trunk, to which there is else darkness: 0.7 dB within 8
-# pixels of a border, and a flat picture stays flat to 0.4 %, where its rim came out a third too dark.
-MIRRORED = 16
 # Sides of a tile: what predicts kernels, what makes pictures, which needs less memory for a pixel and more around it
 # (1920×1080 is one tile); and where memory is short.
 TILE, TILE_OF_TRUNK, SMALL_TILE = 640, 2048, 384

@@ -24,6 +24,7 @@ def train_network(
     *,
     preset: str,
     init: str | None,
+    window: int | None,
     validation: Sequence[str],
     threads: int | None,
     resume: bool,
@@ -43,6 +44,8 @@ def train_network(
         Of `network.models.PRESETS`; not looked at with init.
     init : str, optional
         Weights to start from: a file, a preset that ships, or "oidn": the preset's, on OIDN's trunk.
+    window : int, optional
+        Frames of a window, the middle ones of those that the clips have; all without.
     validation : sequence of str
         Shots kept out of training.
     threads : int, optional
@@ -68,7 +71,7 @@ def train_network(
     """
     if threads is not None:
         limit_threads(threads)
-    training, kept_out = split_by_shot(open_clips(clips), validation)
+    training, kept_out = split_by_shot(open_clips(clips, window), validation)
     if init is None or init == "oidn":
         if preset not in PRESETS:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(PRESETS)}")

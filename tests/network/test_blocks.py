@@ -64,7 +64,7 @@ def test_ravg_gradient(count: int) -> None:
     assert torch.autograd.gradcheck(lambda *x: ravg(x), frames)
 
 
-@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("count", [3, 4, 5, 6])
 def test_ravg_gradient_of_equal_values_is_a_subgradient(count: int) -> None:
     """Adding the same to all frames adds it to the mean, so the gradients sum to 1 even where values tie."""
     values = torch.tensor([[0.0, 1.0, 0.0, 2.0], [0.0, 1.0, 1.0, 2.0], [0.0, 0.0, 1.0, 1.0]], dtype=torch.float64)

@@ -56,6 +56,8 @@ def make_clip(seed: int = 0, size: tuple[int, int] = (16, 16), frames: int = 3) 
         pseudo_reference=uniform(3, 3) + 0.1,
         exposure=torch.tensor([0.5, 1.0, 2.0]),
         gain=torch.tensor([0.4, 0.2, 0.1]),
+        to_next=uniform(3, 2) * 4 - 2,
+        linked=torch.zeros(3),
     )
 
 
@@ -149,6 +151,27 @@ def test_fireflies_beyond_a_half_are_stored_as_its_largest(tmp_path: Path) -> No
     write_shards(tmp_path, "s", SPP, [clip])
     values = open_clips(tmp_path).read(0, 0, (1, "noisy"))
     assert float(values["color"].max()) == 65504
+
+
+def test_of_longer_windows_the_middle_is_taken(tmp_path: Path) -> None:
+    write_shards(tmp_path, "s", SPP, [make_clip(frames=5)])
+    whole, middle = (open_clips(tmp_path, frames).read(0, 1, (0, "noisy")) for frames in (None, 3))
+    assert open_clips(tmp_path, 3).of(["s"]).frames == 3
+    for name in ("color", "albedo", "normal", "estimate", "residual", "confidence"):
+        assert torch.equal(middle[name], whole[name][1:4])
+    assert torch.equal(middle["target"], whole["target"])
+    for frames in (7, 2):
+        with pytest.raises(ValueError, match=f"expected an odd number of frames up to the clips' 5, got {frames}"):
+            open_clips(tmp_path, frames)
+
+
+def test_clips_know_their_neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("network.clips.SHARD_BYTES", 1)  # a shard each: neighbours are found across them
+    clips = [replace(make_clip(i), linked=torch.full((3,), float(i < 2))) for i in range(4)]
+    write_shards(tmp_path, "s", SPP, clips)
+    found = open_clips(tmp_path)
+    assert [found.neighbours(i) for i in range(4)] == [(0, 1), (1, 2), (1, 2), None]
+    assert not bool(make_clip(size=(32, 32)).crop(0, 8, 16).linked.any())
 
 
 def test_an_interrupted_shot_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,7 +321,7 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
     image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)) + 0.1
     window = image.expand(1, 3, 3, 16, 16).clone()
     centre, one = window[:, 1], torch.ones(1)
-    clip = Clip(*[window] * 5, window[:, :, :1], *[centre] * 4, one, one, pseudo_reference=centre)
+    clip = Clip(*[window] * 5, window[:, :, :1], *[centre] * 4, one, one, centre[:, :2], one, pseudo_reference=centre)
     write_shards(tmp_path, "s", [4], [clip])
     samples = Samples(open_clips(tmp_path), PLAIN, 0)
     seen = set()
@@ -346,6 +369,51 @@ def test_variations_do_what_they_say(tmp_path: Path) -> None:
     assert float(bright.max()) > 2  # without, below 1.1 / 2
     away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n]["exposure"]) for n in range(20)]
     assert 0.25 * 0.25 <= min(away) < max(away) <= 4
+
+
+def test_a_target_is_a_pseudo_reference_as_often_as_is_asked_for(tmp_path: Path) -> None:
+    clip = make_clip()
+    targets = {"reference": torch.full_like(clip.noisy, 4.0), "rendered": torch.full_like(clip.noisy, 8.0)}
+    write_shards(tmp_path, "s", SPP, [replace(clip, pseudo_reference=None, **targets)])
+    clips = open_clips(tmp_path)
+    assert clips.pairs(0)[1] == [(1, "reference"), (1, "rendered")]
+    for pseudo, wanted in ((1.0, 2.0), (0.0, 4.0)):  # over the last level's exposure, 2
+        drawn = [Samples(clips, replace(PLAIN, pseudo=pseudo), 0)[n]["target"] for n in range(10)]
+        assert all(bool((target == wanted).all()) for target in drawn)
+    drawn = [float(Samples(clips, replace(PLAIN, pseudo=0.25), 0)[n]["target"].mean()) for n in range(400)]
+    assert np.mean([value == 2 for value in drawn]) == pytest.approx(0.25, abs=0.09)  # four standard deviations
+
+
+def test_neighbours_are_varied_alike_and_their_motion_with_them(tmp_path: Path) -> None:
+    """A picture that moves by (3, −2) pixels: along the turned vectors the second sample is the first."""
+    scene = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0)) + 0.1
+    first, second = scene[:, 10:42, 10:42], scene[:, 12:44, 7:39]
+    clips = []
+    for picture in (first, second):
+        image = picture.expand(1, 3, -1, -1)
+        window = image[:, None].expand(1, 3, 3, -1, -1)
+        confidence, one = torch.ones_like(window[:, :, :1]), torch.ones(1)
+        to_next = torch.tensor([3.0, -2.0])[None, :, None, None].expand(1, 2, 32, 32)
+        clips.append(
+            Clip(*[window] * 5, confidence, *[image] * 4, one, one, to_next, one, pseudo_reference=image.clone())
+        )
+    clips[1] = replace(clips[1], linked=torch.zeros(1))
+    write_shards(tmp_path, "s", [4], clips)
+    samples = Samples(open_clips(tmp_path), PLAIN, 0, neighbours=True)
+    ways = set()
+    for number in range(30):
+        sample = samples[number]
+        assert sample["color"].shape == (2, 3, 3, 16, 16)
+        x, y = (int(value) for value in sample["to_next"][0, :, 0, 0])
+        here, there = sample["target"]
+        rows, columns = (slice(max(0, -d), 16 - max(0, d)) for d in (y, x))
+        moved = there[:, rows.start + y : rows.stop + y, columns.start + x : columns.stop + x]
+        torch.testing.assert_close(here[:, rows, columns], moved)
+        ways.add((x, y))
+    assert len(ways) == 8
+    alone = folder_of(tmp_path / "alone", {"a": 2})
+    with pytest.raises(ValueError, match=r"expected neighbouring frames of each, .* got 2 of 2 without"):
+        Samples(alone, PLAIN, 0, neighbours=True)
 
 
 def test_clips_that_cannot_be_sampled_are_an_error(tmp_path: Path) -> None:

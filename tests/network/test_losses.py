@@ -14,6 +14,7 @@ from network.kernels import Filtered, apply_kernels, mean_of, predict_kernel
 from network.losses import (
     SUBSET_EPSILON,
     asymmetry,
+    difference_loss,
     display,
     frame_pairs,
     l1,
@@ -47,7 +48,8 @@ def by_loops(name: str, d: torch.Tensor, r: torch.Tensor, s: float) -> float:
                 elif name == "smape":
                     values.append(abs(a - b) / (abs(a) + abs(b) + 0.01 * s))
                 elif name == "display":
-                    values.append((a / (a + s) - b / (b + s)) ** 2)
+                    e = abs(a - b) * s / (a + s) ** 2
+                    values.append(e**2 if e <= 0.5 else 0.5**2 + 2 * 0.5 * (e - 0.5))
                 else:
                     e = abs(a - b) / math.sqrt(level**2 + 0.1 * s**2)
                     values.append(e**2 if e <= 4 else 4**2 + 2 * 4 * (e - 4))
@@ -57,7 +59,7 @@ def by_loops(name: str, d: torch.Tensor, r: torch.Tensor, s: float) -> float:
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_against_loops(loss) -> None:  # type: ignore[no-untyped-def]
     prediction, target = uniform(2, 3, 4, 5), uniform(2, 3, 4, 5, seed=1)
-    target[1, :, 2, 2] = 40  # beyond relmse's limit
+    target[1, :, 2, 2] = 40  # beyond the limits of relmse and display
     scale = torch.tensor([0.5, 2.0], dtype=torch.float64)
     expected = [by_loops(loss.__name__, prediction[i], target[i], float(scale[i])) for i in range(2)]
     torch.testing.assert_close(loss(prediction, target, scale), torch.tensor(expected, dtype=torch.float64))
@@ -80,10 +82,11 @@ def test_losses_of_equal_and_of_black_images_are_zero(loss) -> None:  # type: ig
 def test_gradients_of_losses(loss) -> None:  # type: ignore[no-untyped-def]
     prediction, target = uniform(1, 3, 2, 2).requires_grad_(), uniform(1, 3, 2, 2, seed=1)
     scale = torch.ones(1, dtype=torch.float64)
-    if loss is relmse:  # its denominator is meant to have none
-        (gradient,) = torch.autograd.grad(relmse(prediction, target, scale).sum(), prediction)
+    if loss in (relmse, display):  # their denominators are meant to have none
+        (gradient,) = torch.autograd.grad(loss(prediction, target, scale).sum(), prediction)
         level = prediction.detach().mean(1, keepdim=True)
-        expected = 2 * (prediction - target) / (level**2 + 0.1) / prediction.numel()
+        below = level**2 + 0.1 if loss is relmse else (prediction + 1) ** 4
+        expected = 2 * (prediction - target) / below / prediction.numel()
         torch.testing.assert_close(gradient, expected.detach())
     else:
         assert torch.autograd.gradcheck(lambda x: loss(x, target, scale), prediction)
@@ -103,16 +106,71 @@ def pull_at_the_mean(loss) -> float:  # type: ignore[no-untyped-def]
     return float(gradient.sum() / gradient.abs().sum())
 
 
-def test_relmse_does_not_bias_the_mean_and_the_others_darken_it() -> None:
+def test_squares_do_not_bias_the_mean_and_the_others_darken_it() -> None:
     # Exactly zero but for rounding: the sample's own mean is 1.
-    assert abs(pull_at_the_mean(lambda *a: relmse(*a, limit=math.inf))) < 1e-9
+    for square in (relmse, display):
+        assert abs(pull_at_the_mean(lambda *a, of=square: of(*a, limit=math.inf))) < 1e-9
     # 59 % of such targets are below their mean; L1 counts heads: 0.59 − 0.41.
     assert pull_at_the_mean(l1) == pytest.approx(0.19, abs=0.02)
     assert pull_at_the_mean(smape) > 0.1
-    # Concave: the mean of T over the noise is below T of the mean.
-    assert pull_at_the_mean(display) > 0.1
-    # Values beyond four times the mean are 0.3 % here: the limit costs next to nothing.
+    # Values beyond four times, and three times, the mean are 0.3 and 1.7 % here: the limits cost next to nothing.
     assert 0 <= pull_at_the_mean(relmse) < 0.01
+    assert 0 <= pull_at_the_mean(display) < 0.03
+
+
+def test_display_is_the_squared_difference_of_what_is_seen_to_first_order() -> None:
+    target, scale = 3 * uniform(1, 3, 8, 8), torch.full((1,), 0.7, dtype=torch.float64)
+    prediction = target * (1 + 1e-4 * uniform(1, 3, 8, 8, seed=1))
+    seen = ((prediction / (prediction + 0.7)) - (target / (target + 0.7))).square().mean()
+    torch.testing.assert_close(display(prediction, target, scale)[0], seen, rtol=1e-3, atol=0)
+
+
+def a_pair(size: int = 8) -> dict[str, torch.Tensor]:
+    """Two pictures of a motion by (2, −1) pixels whose errors do not move with it, and the same of the targets."""
+    targets = uniform(1, 2, 3, size, size) + 1
+    to_next = torch.tensor([2.0, -1.0], dtype=torch.float64)[None, :, None, None].expand(1, 2, size, size)
+    return {
+        "images": targets + 0.1 * uniform(1, 2, 3, size, size, seed=1),
+        "targets": targets,
+        "modulation": torch.ones_like(targets),
+        "scale": torch.ones(1, 2, dtype=torch.float64),
+        "to_next": to_next,
+        "trust": torch.ones(1, 1, size, size, dtype=torch.float64),
+    }
+
+
+def test_the_loss_of_differences_is_that_of_errors_compared_along_the_motion() -> None:
+    pair = a_pair()
+    pair["trust"][..., 3, 3] = 0
+    error = pair["images"] - pair["targets"]
+    total = 0.0
+    for y in range(8):
+        for x in range(8):
+            v, u = y - 1, x + 2
+            if 0 <= v < 8 and 0 <= u < 8 and (y, x) != (3, 3):
+                total += float((error[0, 0, :, y, x] - error[0, 1, :, v, u]).abs().sum())
+    assert float(difference_loss(l1, **pair)) == pytest.approx(total / error[0, 0].numel(), rel=1e-9)
+
+
+def test_an_error_that_stays_with_the_motion_does_not_flicker() -> None:
+    pair = a_pair()
+    error = uniform(1, 3, 8, 8, seed=2)
+    # What is at (y, x) in the first frame is at (y − 1, x + 2) in the second.
+    moved = error.roll((-1, 2), (-2, -1))
+    pair["images"] = pair["targets"] + torch.stack([error, moved], 1)
+    assert float(difference_loss(display, **pair)) < 1e-20
+    pair["to_next"] = torch.zeros_like(pair["to_next"])
+    assert float(difference_loss(display, **pair)) > 1e-4
+
+
+def test_vectors_that_point_nowhere_leave_the_loss_of_differences_finite() -> None:
+    pair = a_pair()
+    pair["to_next"] = torch.full_like(pair["to_next"], 60000.0)
+    images = pair.pop("images").requires_grad_()
+    value = difference_loss(display, images, **pair)
+    (gradient,) = torch.autograd.grad(value.sum(), images)
+    assert value.tolist() == [0]
+    assert bool(torch.isfinite(gradient).all())
 
 
 def test_the_limit_bounds_what_one_firefly_does() -> None:

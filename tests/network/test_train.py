@@ -21,7 +21,7 @@ from network import losses
 from network.checkpoint import load_model, load_notes
 from network.clips import Clip, Clips, Samples, open_clips, split_by_shot, whole_frames, write_shards
 from network.models import Model
-from network.robust_unet import RobustUNet, RobustUNetConfig
+from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
 from network.train import batch_loss, image_loss, predict, train, validate
 from network.train_config import LOSSES, SamplerConfig, TrainConfig
 from tests.network.small import MODELS, make_model, make_robust
@@ -51,6 +51,8 @@ def make_clip(seed: int, clean_target: bool = False, size: int = 40) -> Clip:
         "pseudo_reference": clean * rng.gamma(8, 0.125, (2, 1, size, size)),
         "exposure": noisy.mean((1, 2, 3, 4)),
         "gain": 0.18 / noisy.mean((1, 2, 3, 4)),
+        "to_next": np.zeros((2, 2, size, size)),
+        "linked": np.zeros(2),
     }
     return Clip(**{name: torch.from_numpy(np.array(image, np.float32)) for name, image in images.items()})
 
@@ -101,7 +103,46 @@ def test_a_network_that_relies_on_its_guides_is_trained_with_those_without_noise
 
     predict(model, batch, run=spy)
     wanted = batch["clean_albedo"] if clean else batch["albedo"][:, 1]  # ones and zeros
-    torch.testing.assert_close(seen[0][:, 3:6], wanted)
+    torch.testing.assert_close(seen[0][:, 3:6, MIRRORED:-MIRRORED, MIRRORED:-MIRRORED], wanted)
+
+
+def test_crops_are_mirrored_in_training_as_frames_are_in_running(clips: Clips) -> None:
+    """Without, a third of a crop of 80 pixels is spoilt by the darkness that a trunk sees beyond its borders."""
+    batch, model, seen = a_batch(clips, CONFIG, 1), make_robust(), []
+
+    def spy(frames: torch.Tensor, still: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(known)
+        return model(frames, still, known)
+
+    picture = predict(model, batch, run=spy)
+    assert picture.irradiance.shape == batch["target"].shape
+    assert seen[0].shape[-2:] == (16 + 2 * MIRRORED,) * 2
+    inner = seen[0][..., MIRRORED : MIRRORED + 5, :]
+    torch.testing.assert_close(seen[0][..., MIRRORED - 4 : MIRRORED + 1, :].flip(-2), inner)
+
+
+def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> None:
+    """Pictures that are off by the same amount do not flicker; the same errors with another sign in each do."""
+    config = replace(CONFIG, differences=1.0, loss="l1")
+    one = make_clip(0)
+    clip = replace(one, color=one.estimate, residual=0 * one.residual)
+    values = []
+    for sign in (1, -1):
+        folder = tmp_path / str(sign)
+        folder.mkdir()
+        targets = [one.estimate[:, 1] * (1 + 0.1 * factor) for factor in (1, sign)]
+        pair = [replace(clip, reference=target, linked=torch.ones(2)) for target in targets]
+        pair[1] = replace(pair[1], linked=torch.zeros(2))
+        write_shards(folder, "s", (4, 4), pair)
+        sampler = replace(config.sampler, fireflies=0, drop_frames=0, exposure_stops=0)
+        samples = Samples(open_clips(folder), sampler, 0, image_loss(config), neighbours=True)
+        batch = torch.utils.data.default_collate([samples[0]])
+        plain = {name: pair.flatten(0, 1) for name, pair in batch.items()}
+        plain_loss = batch_loss(make_model(), plain, replace(config, differences=0), image_loss(config))
+        values.append((batch_loss(make_model(), batch, config, image_loss(config)) - plain_loss).item())
+    # An image that is nearly the estimate is off by a tenth, its input too: twice that from one frame to the next.
+    assert values[0] < 0.1
+    assert values[1] > 0.5
 
 
 # Training
@@ -124,6 +165,18 @@ def test_training_on_noisy_targets_approaches_the_clean_image(
     after = validate(load_model(tmp_path / "w.safetensors"), clean)
     assert after["denoised"] > before["denoised"] + 3
     assert after["denoised"] > after["noisy"] + 5
+
+
+def test_a_training_on_neighbours_asks_for_them(clips: Clips, tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=1, differences=1.0)
+    with pytest.raises(ValueError, match="expected neighbouring frames of each"):
+        train(clips, clips.of([]), make_model(), config, tmp_path / "w.safetensors")
+    pair = [replace(make_clip(seed), linked=torch.full((2,), float(seed == 0))) for seed in range(2)]
+    (tmp_path / "pair").mkdir()
+    write_shards(tmp_path / "pair", "s", (4, 4), pair)
+    found = open_clips(tmp_path / "pair")
+    (loss,) = train(found, found.of([]), make_robust(), config, tmp_path / "w.safetensors")
+    assert np.isfinite(loss)
 
 
 def test_a_training_is_determined_by_its_seed(sets: tuple[Clips, Clips], tmp_path: Path) -> None:
@@ -175,6 +228,7 @@ def test_every_model_learns_with_all_of_its_weights(
     if isinstance(model, RobustUNet):  # as after some steps: what starts as a constant hides what is before it
         for layer in (*(block.weight for block in model.average.values()), model.keep):
             torch.nn.init.normal_(layer.weight)
+        torch.nn.init.constant_(model.trunk.last.bias, 0.5)  # by chance all is black, where nothing follows a gradient
     before = [p.clone() for p in model.parameters()]
     config = replace(CONFIG, steps=2, terms=terms, slope=2.0)
     losses = train(sets[0], sets[0].of([]), model, config, tmp_path / "w.safetensors")

@@ -25,7 +25,8 @@ CONFIG = TrainConfig(steps=6)
         ({"terms": "all"}, "terms: expected one of"),
         ({"device": "tpu"}, "device: expected one of"),
         ({"loss": "perceptual"}, "vgg: expected weights with the perceptual loss"),
-        ({"slope": 0.5}, "whole, slope: expected"),
+        ({"slope": 0.5}, "slope: expected at least 1"),
+        ({"differences": -1.0}, "differences: expected at least 0"),
     ],
 )
 def test_configurations_say_what_is_wrong(change: dict[str, object], message: str) -> None:

@@ -117,7 +117,8 @@ def test_clips_are_prepared_towards_the_pseudo_references_of_a_level_where_asked
     assert run("prepare", *options, *levels, "--target", "b", "--reference") == 2
     assert run("prepare", *options, *levels, "--target", "b", "--frames", SCENE.first + 1) == 0
     clips = open_clips(tmp_path / "clips")
-    assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]  # b is none of them
+    both = [[(level, kind) for kind in ("reference", "rendered")] for level in range(2)]
+    assert clips.pairs(0) == both  # b is none of them
 
 
 def test_one_sequence_is_prepared_towards_the_reference_beside_it(shot, tmp_path):
@@ -203,6 +204,7 @@ OPTIONS = {
     "vgg": (["--vgg", "vgg.pth"], "vgg.pth"),
     "terms": (["--terms", "power"], "power"),
     "whole": (["--whole", 0.25], 0.25),
+    "differences": (["--differences", 0.75], 0.75),
     "slope": (["--slope", 2], 2.0),
     "bfloat16": (["--float32"], False),
     "compile": (["--compile"], True),
@@ -211,7 +213,10 @@ OPTIONS = {
     "seed": (["--seed", 5], 5),
     "checkpoint_minutes": ([], 3.0),  # as often as it is validated
     "validate_minutes": (["--validate-minutes", 3], 3.0),
-    "sampler": (["--crop", 64, "--sets", 4, "--drop-frames", 0.3], SamplerConfig(crop=64, sets=4, drop_frames=0.3)),
+    "sampler": (
+        ["--crop", 64, "--sets", 4, "--drop-frames", 0.3, "--pseudo", 0.25],
+        SamplerConfig(crop=64, sets=4, drop_frames=0.3, pseudo=0.25),
+    ),
 }
 NOT_OFFERED = {"weight_decay"}
 
@@ -230,12 +235,14 @@ def test_what_is_not_said_is_as_the_configuration_has_it(asked):
     assert (str(clips), str(output)) == ("clips", "w.safetensors")
     assert config == TrainConfig(steps=7)
     del more["log"]
-    assert more == {"preset": "fast", "init": None, "validation": [], "threads": None, "resume": False}
+    assert more == {
+        "preset": "fast", "init": None, "window": None, "validation": [], "threads": None, "resume": False,
+    }  # fmt: skip
 
 
 def test_every_option_arrives_where_it_belongs(asked):
     words = [word for option, _ in OPTIONS.values() for word in option]
-    more = ["--preset", "quality", "--init", "balanced", "--threads", 2, "--resume"]
+    more = ["--preset", "quality", "--init", "balanced", "--window", 7, "--threads", 2, "--resume"]
     assert run("train", "clips", "-o", "w.safetensors", *words, *more, "--validation", "a,b", "--validation", "c") == 0
     (((_, _, config), settings),) = asked
     assert set(OPTIONS) | NOT_OFFERED == {field.name for field in fields(TrainConfig)}
@@ -245,7 +252,7 @@ def test_every_option_arrives_where_it_belongs(asked):
         assert getattr(plain, name) != value, f"{name}: the same without the option"
     del settings["log"]
     assert settings == {
-        "preset": "quality", "init": "balanced", "validation": ["a", "b", "c"], "threads": 2, "resume": True,
+        "preset": "quality", "init": "balanced", "window": 7, "validation": ["a", "b", "c"], "threads": 2, "resume": True,
     }  # fmt: skip
 
 

@@ -135,8 +135,21 @@ def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, 
     assert clip.pseudo_reference is None
     assert len(clip.reference) == len(clip.noisy) == 1
     np.testing.assert_array_equal(clip.reference[0].permute(1, 2, 0).numpy(), gated_average(window))
+    np.testing.assert_array_equal(clip.rendered[0].permute(1, 2, 0).numpy(), target.read(MIDDLE).color)
     with pytest.raises(ValueError, match="target: expected none beside a reference"):
         prepare(shot, monkeypatch, tmp_path, target=target, reference=target)
+
+
+def test_clips_of_whole_frames_know_the_way_to_the_next(tmp_path, monkeypatch):
+    shot = open_shot(SCENE.write(tmp_path / "noisy"))
+    found = prepare(shot, monkeypatch, tmp_path)
+    assert [float(clip.linked) for clip in found] == [1, 1, 1, 1, 0]
+    aligner = Aligner(shot, Rules(), estimates=OfWindows(FINAL))
+    aligner.align(MIDDLE)
+    flow, valid = aligner.flows.between(MIDDLE, MIDDLE + 1)
+    np.testing.assert_array_equal(found[2].to_next[0].permute(1, 2, 0).numpy(), flow * valid[..., None])
+    assert float(np.abs(flow[valid]).max()) > 0.5
+    assert not bool(found[4].to_next.any())
 
 
 def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
