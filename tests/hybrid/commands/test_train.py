@@ -252,7 +252,8 @@ def test_every_option_arrives_where_it_belongs(asked):
         assert getattr(plain, name) != value, f"{name}: the same without the option"
     del settings["log"]
     assert settings == {
-        "preset": "quality", "init": "balanced", "window": 7, "validation": ["a", "b", "c"], "threads": 2, "resume": True,
+        "preset": "quality", "init": "balanced", "window": 7,
+        "validation": ["a", "b", "c"], "threads": 2, "resume": True,
     }  # fmt: skip
 
 
