@@ -7,7 +7,6 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,7 +18,7 @@ from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
 
-VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn", "flip-evaluator")
+VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
 
 
 def compare_shot(
@@ -185,16 +184,18 @@ def _judge_methods(
     judge: Judge, methods: Mapping[str, Method], progress: Progress | None
 ) -> dict[str, dict[str, Statistic]]:
     """Measures of each method; what only varies a setting is judged without FLIP."""
-    statistics = {}
-    for done, (name, method) in enumerate(methods.items()):
+
+    def tell(what: str, done: int) -> None:
         if progress is not None:
-            progress(f"measure {name}", done, len(methods))
-        statistics[name] = judge.measure(name, flip=_has_flip() and not method.sweep, change=not method.sweep)
+            progress(what, done, len(methods) + 1)
+
+    tell("FLIP of all methods", 0)
+    judge.map_flip([name for name, method in methods.items() if not method.sweep])
+    statistics = {}
+    for done, (name, method) in enumerate(methods.items(), start=1):
+        tell(f"measure {name}", done)
+        statistics[name] = judge.measure(name, flip=not method.sweep, change=not method.sweep)
     return statistics
-
-
-def _has_flip() -> bool:
-    return find_spec("flip_evaluator") is not None
 
 
 def _result(
@@ -237,16 +238,10 @@ def _store_maps(method: Method, shot: Shot, numbers: Sequence[int], name: str, s
 
 def _facts_of_frames(judge: Judge) -> dict[str, str]:
     height, width = judge.static.shape
-    facts = {
+    return {
         "Frames": f"{_span(judge.numbers)}, {width} × {height} pixels",
         "Pixels that stand still": f"{judge.static.mean():.1%}",
     }
-    if not _has_flip():
-        facts["FLIP"] = "absent: flip-evaluator is not installed"
-    elif len(judge.seen_by_flip) < len(judge.numbers):
-        seen = ", ".join(map(str, judge.seen_by_flip))
-        facts["FLIP"] = f"of the frames {seen} alone: a frame of this size takes it longer than most methods"
-    return facts
 
 
 def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from flow.motion import Vectors, forward_backward_error, invert_flow
 from flow.warp import warp
+from hybrid.comparison.flip import flip_maps
 from hybrid.comparison.metrics import (
     Reference,
-    flip_map,
     mean_bias,
     psnr,
     relmse,
@@ -42,11 +42,7 @@ def _whole(reference: Reference) -> NDArray[np.floating]:
     return (reference[0] + reference[1]) / 2 if isinstance(reference, tuple) else reference
 
 
-# Of frames with more pixels than this FLIP judges every third, from the first: at 1920×1080 it takes 22 CPU seconds of
-# each, and of each method.
-FLIP_PIXELS, FLIP_EVERY = 2**20, 3
-# Frames that are measured side by side: each of 1920×1080 takes half a gigabyte, in double precision. FLIP has threads
-# of its own.
+# Frames that are measured side by side: each of 1920×1080 takes half a gigabyte, in double precision.
 AT_ONCE = min(os.cpu_count() or 1, 4)
 # What is measured on a frame by itself, beside FLIP and the measures over time.
 MEASURES: dict[str, Measure] = {
@@ -88,20 +84,33 @@ class Judge:
     exposure: float
     static: NDArray[np.bool_]
 
-    @property
-    def seen_by_flip(self) -> Sequence[int]:
-        """The frames that are judged by FLIP: all, or of large ones, each of which takes longer than a method, some."""
-        return self.numbers[:: FLIP_EVERY if self.static.size > FLIP_PIXELS else 1]
+    def map_flip(self, names: Sequence[str]) -> None:
+        """Keep the maps of FLIP of several methods: what the reference looks like is found out once for all.
+
+        Parameters
+        ----------
+        names : sequence of str
+            The methods'.
+
+        Raises
+        ------
+        ValueError
+            If one has left a frame out.
+        """
+        for name in names:
+            self._check_frames(name)
+        with ThreadPoolExecutor(AT_ONCE) as threads:
+            list(threads.map(partial(self._map_flip, names), self.numbers))
 
     def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
-        """Measure the frames of a method, a frame and a pair of frames at a time.
+        """Measure the frames of a method, and pairs of them, side by side.
 
         Parameters
         ----------
         name : str
             The method's.
         flip : bool
-            Whether by FLIP too, which takes longer than many a method: the frames `seen_by_flip`. Its maps are kept.
+            Whether by FLIP too, whose maps `map_flip` has made.
         change : bool
             Whether the map of what changes between frames is kept too.
 
@@ -115,43 +124,54 @@ class Judge:
         ValueError
             If the method has left a frame out.
         """
-        missing = [number for number in self.numbers if not self.store.has(name, number)]
-        if missing:
-            raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(self.numbers)}")
+        self._check_frames(name)
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
         with ThreadPoolExecutor(AT_ONCE) as threads:
             for measured in threads.map(partial(self._measure_frame, name), self.numbers):
                 for key, value in measured.items():
                     values[key].append(value)
             values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
-        for number in self.seen_by_flip if flip else ():
-            image, truth = self.store.load(name, number), _whole(self.store.load_reference(number))
-            errors = flip_map(image * np.float32(self.exposure), truth * np.float32(self.exposure))
-            self.store.save(name, number, errors, FLIP_MAP)
-            values["flip"].append(float(errors.mean(dtype=np.float64)))
-        if change and self.pairs:
-            for number in self.numbers:
-                self.store.save(name, number, self._map_change(name, number), CHANGE_MAP)
+            if change and self.pairs:
+                list(threads.map(partial(self._map_change, name), self.numbers))
+        if flip:
+            maps = (self.store.load(name, number, FLIP_MAP) for number in self.numbers)
+            values["flip"] += [float(errors.mean(dtype=np.float64)) for errors in maps]
         if self.static.any():
             frames = (self.store.load(name, number) for number in self.numbers)
             values["static_std"] = list(static_std(frames, self.static, exposure=self.exposure))
         return {key: summarize(series) for key, series in values.items() if series}
 
-    def _map_change(self, name: str, number: int) -> Array:
-        """What a frame changes along the motion, amplified, on the tone curve: 0.5 is still, (H, W) in [0, 1].
+    def _check_frames(self, name: str) -> None:
+        missing = [number for number in self.numbers if not self.store.has(name, number)]
+        if missing:
+            raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(self.numbers)}")
+
+    def _map_flip(self, names: Sequence[str], number: int) -> None:
+        """Keep the methods' maps of FLIP of a frame."""
+
+        def shown(radiance: Array) -> Array:
+            return radiance * np.float32(self.exposure)
+
+        images = [lambda name=name: shown(self.store.load(name, number)) for name in names]
+        for name, errors in zip(names, flip_maps(images, shown(self.store.load(REFERENCE, number))), strict=True):
+            self.store.save(name, number, errors, FLIP_MAP)
+
+    def _map_change(self, name: str, number: int) -> None:
+        """Keep what a frame changes along the motion, amplified, on the tone curve: 0.5 is still, (H, W) in [0, 1].
 
         With W the warp of the frame before, it is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5 where
         no motion leads to a pixel. Unlike temporal PSNR it also shows what changes in truth: light, what mirrors show.
         """
         current = tone_map(self.store.load(name, number), self.exposure)
         before = next((pair[0] for pair in self.pairs if pair[1] == number), None)
-        if before is None:
-            return np.full(current.shape[:2], 0.5, np.float32)
-        motion = self.store.load(REFERENCE, number, FLOW)
-        earlier = tone_map(self.store.load(name, before), self.exposure).astype(np.float32)
-        change = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
-        change = np.where((motion[..., 2] > 0) & np.isfinite(change), change, 0)
-        return np.clip(0.5 + AMPLIFIED * change, 0, 1).astype(np.float32)
+        shown = np.full(current.shape[:2], 0.5, np.float32)
+        if before is not None:
+            motion = self.store.load(REFERENCE, number, FLOW)
+            earlier = tone_map(self.store.load(name, before), self.exposure).astype(np.float32)
+            change = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
+            known = (motion[..., 2] > 0) & np.isfinite(change)
+            shown[known] = np.clip(0.5 + AMPLIFIED * change[known], 0, 1)
+        self.store.save(name, number, shown, CHANGE_MAP)
 
     def _measure_frame(self, name: str, number: int) -> dict[str, float]:
         image, truth = self.store.load(name, number), self.store.load_reference(number)

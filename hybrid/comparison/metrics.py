@@ -14,9 +14,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skimage.metrics import structural_similarity
 
 from flow.warp import warp
 
@@ -26,6 +26,7 @@ Reference = Array | tuple[Array, Array]
 EPSILON = 1e-2  # keeps black from dividing by zero, and assumes radiance around 1 after the exposure
 LEVEL = 0.95  # coverage of intervals
 RESAMPLES = 2000
+SSIM_REACH = 5  # of its Gaussian
 
 
 def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
@@ -66,8 +67,8 @@ def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
         −10 log₁₀ mean (T(x) − T(r))², with peak 1. Infinite where the error is zero or, with a reference in
         halves, where it cannot be told from zero. NaN if the image is not finite everywhere.
     """
-    x, a, b = (tone_map(v, exposure) for v in _checked(image, reference))
-    return _decibels(np.mean((x - a) * (x - b)))
+    errors = _tone_errors(image, reference, exposure)
+    return _decibels(np.mean(errors[0] * errors[-1]))
 
 
 def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
@@ -87,15 +88,23 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     Notes
     -----
     As in the paper: Gaussian window with σ = 1.5 (11 × 11), K = (0.01, 0.03), population covariance,
-    mean over the channels. Computed by scikit-image.
+    mean over the channels and over the windows that lie wholly inside. The Gaussian is separable.
 
     References
     ----------
     Wang et al. 2004, doi:10.1109/TIP.2003.819861
     """
-    x, r, _ = (tone_map(v, exposure) for v in _checked(image, reference))
-    settings = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    return float(structural_similarity(r, x, channel_axis=-1, **settings))
+    x, r = (tone_map(v, exposure) for v in _checked(image, reference)[:2])
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        blurred = cv2.GaussianBlur(values, (2 * SSIM_REACH + 1,) * 2, 1.5)
+        return np.asarray(blurred[SSIM_REACH:-SSIM_REACH, SSIM_REACH:-SSIM_REACH], np.float64)
+
+    mean_x, mean_r = mean(x), mean(r)
+    both, squares = mean_x * mean_r, mean_x**2 + mean_r**2
+    covariance, variances = mean(x * r) - both, mean(x**2 + r**2) - squares
+    c1, c2 = 0.01**2, 0.03**2
+    return float(np.mean((2 * both + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))))
 
 
 def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: float = 1.0) -> float:
@@ -124,8 +133,9 @@ def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: f
     """
     if not 0.0 <= trim < 1.0:
         raise ValueError(f"trim must be in [0, 1), is {trim}")
-    x, a, b = (v * exposure for v in _checked(image, reference))
-    errors = np.mean((x - a) * (x - b) / ((a + b) ** 2 / 4 + EPSILON), axis=-1).ravel()
+    x, a, b = _checked(image, reference, exposure)
+    truth = a if b is a else (a + b) / 2
+    errors = np.mean((x - a) * (x - b) / (truth**2 + EPSILON), axis=-1).ravel()
     kept = errors.size - int(trim * errors.size)
     return float(np.mean(np.partition(errors, kept - 1)[:kept]))
 
@@ -144,7 +154,7 @@ def smape(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     -------
     float
     """
-    x, r, _ = (v * exposure for v in _checked(image, reference))
+    x, r, _ = _checked(image, reference, exposure)
     return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + EPSILON)))
 
 
@@ -162,46 +172,6 @@ def mean_bias(image: Array, reference: Array) -> float:
     """
     x, r, _ = _checked(image, reference)
     return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
-
-
-def flip_map(image: Array, reference: Array) -> NDArray[np.float32]:
-    """HDR-FLIP error of each pixel, 0 at best and 1 at worst, by the authors' own code.
-
-    Parameters
-    ----------
-    image, reference : (H, W, 3) array
-        Linear radiance in sRGB primaries; negative values count as 0.
-
-    Returns
-    -------
-    (H, W) array of float32
-        NaN everywhere if the image is not finite everywhere.
-
-    Raises
-    ------
-    ImportError
-        If flip-evaluator is not installed.
-
-    Notes
-    -----
-    The range of exposures is derived from the reference frame, the viewing distance is the default of
-    67 pixels per degree.
-
-    References
-    ----------
-    Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images,
-    doi:10.2312/egs.20211015
-    """
-    try:
-        import flip_evaluator  # an optional peer, only for comparisons
-    except ImportError as error:
-        message = "FLIP needs the package flip-evaluator: install the extra ravg[compare]"
-        raise ImportError(message) from error
-    x, r, _ = _checked(image, reference)
-    if np.isnan(x).any():
-        return np.full(x.shape[:2], np.nan, np.float32)
-    linear = (np.ascontiguousarray(np.maximum(v, 0.0), np.float32) for v in (r, x))
-    return np.asarray(flip_evaluator.evaluate(*linear, "HDR", applyMagma=False)[0][..., 0], np.float32)
 
 
 def temporal_psnr(
@@ -249,12 +219,15 @@ def temporal_psnr(
     series = zip(frames, references, strict=True)
     values = []
     for ((previous, r0), (current, r1)), flow, mask in zip(pairwise(series), flows, valid, strict=True):
-        before, after = _tone_errors(previous, r0, exposure), _tone_errors(current, r1, exposure)
+        before, after = (
+            [error.astype(np.float32) for error in _tone_errors(frame, truth, exposure)]
+            for frame, truth in ((previous, r0), (current, r1))
+        )
         if mask.shape != current.shape[:2]:
             raise ValueError(f"valid must have the shape {current.shape[:2]} of the frames, is {mask.shape}")
         # W is linear: the difference of the differences is the change of the error.
         change = [e1 - warp(e0, flow)[0] for e0, e1 in zip(before, after, strict=True)]
-        product = np.multiply(*change, dtype=np.float64)[mask]
+        product = np.multiply(change[0], change[-1], dtype=np.float64)[mask]
         values.append(_decibels(np.mean(product)) if product.size else float("nan"))
     return np.array(values)
 
@@ -376,24 +349,37 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
-def _checked(image: Array, reference: Reference) -> tuple[NDArray[np.float64], ...]:
-    """The image, all NaN if any of it is not finite, and the halves of the reference; a whole one is both."""
-    halves = reference if isinstance(reference, tuple) else (reference, reference)
-    for half in halves:
+def check_images(image: Array, reference: Reference) -> None:
+    """Refuse what cannot be compared.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or the reference is not finite.
+    """
+    for half in reference if isinstance(reference, tuple) else (reference,):
         if half.shape != image.shape or image.ndim != 3:
             raise ValueError(f"image and reference must be (H, W, C) alike: {image.shape}, {half.shape}")
         lost = half.size - int(np.isfinite(half).sum())
         if lost:
             raise ValueError(f"reference must be finite, {lost} of its {half.size} values are not")
+
+
+def _checked(image: Array, reference: Reference, scale: float = 1.0) -> tuple[NDArray[np.float64], ...]:
+    """The image, all NaN if any of it is not finite, and the halves of the reference; a whole one is both."""
+    check_images(image, reference)
     if not np.isfinite(image).all():
         image = np.full(image.shape, np.nan)
-    return tuple(np.asarray(x, np.float64) for x in (image, *halves))
+    halves = reference if isinstance(reference, tuple) else (reference,)
+    x, *truths = (np.multiply(v, scale, dtype=np.float64) for v in (image, *halves))
+    return x, truths[0], truths[-1]
 
 
-def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[NDArray[np.float32]]:
-    """The tone-mapped errors against the two halves, whose product is the squared error."""
-    x, a, b = (tone_map(v, exposure) for v in _checked(image, reference))
-    return [(x - half).astype(np.float32) for half in (a, b)]
+def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[NDArray[np.float64]]:
+    """The tone-mapped error against a whole reference, or against each half, whose product is the squared one."""
+    x, a, b = _checked(image, reference)
+    tone = tone_map(x, exposure)
+    return [tone - tone_map(half, exposure) for half in ((a,) if b is a else (a, b))]
 
 
 def _decibels(mse: np.floating) -> float:

@@ -12,6 +12,7 @@ import pytest
 from flow.motion import CYCLES, MotionConvention
 from hybrid.comparison import judging
 from hybrid.comparison.compare import compare_shot
+from hybrid.comparison.flip import flip_map
 from hybrid.comparison.judging import motion_between
 from hybrid.comparison.methods import external
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FrameStore
@@ -76,23 +77,16 @@ def test_what_changes_between_frames_is_kept_as_a_map(tmp_path: Path) -> None:
         np.testing.assert_allclose(maps[number][4:-4, 4:-4], value, atol=1e-3)
 
 
-def test_of_large_frames_flip_judges_some_and_the_page_says_which(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("flip_evaluator")
-    shot, reference = make_shots((1, 2, 4, 5, 6))
-    every = compare_shot(shot, reference, NOISY, folder=tmp_path / "every")
-    monkeypatch.setattr(judging, "FLIP_PIXELS", SIZE[0] * SIZE[1])  # as many are none too many
-    assert compare_shot(shot, reference, NOISY).results[0].metrics["flip"] == every.results[0].metrics["flip"]
-    monkeypatch.setattr(judging, "FLIP_PIXELS", SIZE[0] * SIZE[1] - 1)
-    some = compare_shot(shot, reference, NOISY, folder=tmp_path / "some")
-    for comparison, frames in ((every, (1, 2, 4, 5, 6)), (some, (1, 5))):
-        store = FrameStore(tmp_path / ("every" if comparison is every else "some"))
-        flip = comparison.results[0].metrics["flip"].values
-        assert list(flip) == pytest.approx([float(store.load("noisy", n, FLIP_MAP).mean()) for n in frames], rel=1e-5)
-        assert len(comparison.results[0].metrics["psnr"].values) == 5
-    assert "FLIP" not in every.facts
-    assert "1, 5 alone" in some.facts["FLIP"]
+def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
+    """At the exposure of the comparison, of every frame."""
+    shot, reference = make_shots((1, 2, 4))
+    methods = NOISY | ways(perfect=perfect)
+    results = compare_shot(shot, reference, methods, exposure=2.0, folder=tmp_path).results
+    expected = [flip_map(2 * shot.read(n).color, 2 * reference.read(n).color).mean() for n in shot.numbers]
+    assert results[0].metrics["flip"].values == pytest.approx(expected, rel=1e-5)  # means of float32
+    assert results[1].metrics["flip"].mean == 0
+    store = FrameStore(tmp_path)
+    assert [float(store.load("noisy", n, FLIP_MAP).mean()) for n in shot.numbers] == pytest.approx(expected, rel=1e-5)
 
 
 def test_frames_are_measured_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:

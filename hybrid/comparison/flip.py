@@ -1,0 +1,227 @@
+"""HDR-FLIP: how different two pictures look to who flips between them, at every exposure that shows something.
+
+Written from the papers, with separable filters of OpenCV and with the reference's part made once for all methods: the
+authors' own code (the package flip-evaluator, which tests compare with) takes 18 CPU seconds of a picture of 1920×1080.
+
+References
+----------
+Andersson et al. 2020, FLIP: A Difference Evaluator for Alternating Images, doi:10.1145/3406183
+Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images, doi:10.2312/egs.20211015
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.comparison.metrics import check_images
+
+Array = NDArray[np.float32]
+
+PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180  # 0.7 m from a display 0.7 m and 3840 pixels wide
+# The curve of ACES, (k0 x² + k1 x + k2) / (k3 x² + k4 x + k5), after the 0.6 that it is usually given before.
+ACES = (0.9036, 0.018, 0.0, 0.8748, 0.354, 0.14)
+TOP = 0.85  # of the curve: the least exposure brings the brightest pixel there, the greatest the median
+# Linear sRGB to XYZ; rows sum to the white of D65.
+XYZ = np.array(
+    [
+        [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
+        [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
+        [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
+    ]
+)
+RELATIVE = XYZ / XYZ.sum(axis=1, keepdims=True)  # to XYZ over that of white
+OPPONENT = np.array([[0, 116, 0], [500, -500, 0], [0, 200, -200]])  # YCxCz of that, where Y has 16 taken off
+# Contrast sensitivity to Y, Cx and Cz: sums of Gaussians a·√(π/b)·exp(−π²x²/b), x in degrees.
+SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+FEATURE = 0.082  # degrees: how wide edges and points are
+COLOR_POWER, FEATURE_POWER = 0.7, 0.5
+KNEE, BELOW = 0.4, 0.95  # color errors up to KNEE of the greatest are spread over [0, BELOW]
+BORDER = cv2.BORDER_REPLICATE
+BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes radiance around 1
+
+
+def flip_map(image: Array, reference: Array) -> Array:
+    """HDR-FLIP error of each pixel, 0 at best and 1 at worst.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) array
+        Linear radiance in sRGB primaries; negative values count as 0. They are not alike: the exposures are those of
+        the reference.
+
+    Returns
+    -------
+    (H, W) array of float32
+        NaN everywhere if the image is not finite everywhere.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or the reference is not finite.
+    """
+    return flip_maps([lambda: image], reference)[0]
+
+
+def flip_maps(images: Sequence[Callable[[], Array]], reference: Array) -> list[Array]:
+    """`flip_map` of several pictures of one frame; what the reference looks like is found out once.
+
+    Parameters
+    ----------
+    images : sequence of callable
+        Each gives (H, W, 3) linear radiance whenever it is asked: only one is held at a time.
+    reference : (H, W, 3) array
+        The same.
+
+    Returns
+    -------
+    list of (H, W) array of float32
+        One for each picture: the greatest error of all exposures.
+    """
+    worst = []
+    for image in images:
+        first = image()
+        check_images(first, reference)
+        worst.append(np.full(first.shape[:2], 0 if np.isfinite(first).all() else np.nan, np.float32))
+    reference = np.maximum(reference, 0, dtype=np.float32)
+    for exposure in find_exposures(reference):
+        truth = _see(reference, exposure)
+        for image, errors in zip(images, worst, strict=True):
+            if not np.isnan(errors[0, 0]):
+                np.maximum(errors, _difference(_see(image(), exposure), truth), out=errors)
+    return worst
+
+
+def find_exposures(reference: Array) -> NDArray[np.float64]:
+    """Choose the exposures at which pictures are compared.
+
+    Parameters
+    ----------
+    reference : (H, W, 3) array
+        Linear radiance in sRGB primaries, not negative.
+
+    Returns
+    -------
+    (N ≥ 2,) array
+        Stops, evenly spaced: from the brightest pixel at `TOP` of the tone curve to the (upper) median there, at most
+        one apart.
+    """
+    light = _mix(reference, np.array([[0.2126, 0.7152, 0.0722]])).ravel()
+    median = np.partition(light, light.size // 2)[light.size // 2]
+    a, b, c = (ACES[i] - TOP * ACES[i + 3] for i in range(3))
+    level = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
+    first, last = (np.log2(level / max(float(y), BLACK)) for y in (light.max(), median))
+    return np.linspace(first, last, max(2, int(np.ceil(last - first))))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A picture as it is seen: (H, W, 3) color in L*a*b* after Hunt, and strength of edges and points, (H, W) each."""
+
+    color: Array
+    edges: Array
+    points: Array
+
+
+def _see(image: Array, exposure: float) -> _Seen:
+    """What the eye makes of a picture on a display."""
+    scaled = np.maximum(image, 0, dtype=np.float32) * np.float32(2**exposure)
+    k = [np.float32(value) for value in ACES]
+    shown = np.minimum(((k[0] * scaled + k[1]) * scaled + k[2]) / ((k[3] * scaled + k[4]) * scaled + k[5]), 1)
+    # The 16 that Y lacks cancel: filters of color preserve constants, and those of edges and points remove them.
+    opponent = _mix(shown, OPPONENT @ RELATIVE)
+    seen = np.dstack([_blur(opponent[..., i], gaussians) for i, gaussians in enumerate(SENSITIVITY)])
+    light = np.clip(_mix(seen, np.linalg.inv(OPPONENT @ RELATIVE)), 0, 1)
+    wide, edge, point = _feature_filters()
+    gray = opponent[..., 0] * np.float32(1 / 116)
+    return _Seen(_hunt(light), _strength(gray, edge, wide), _strength(gray, point, wide))
+
+
+def _difference(one: _Seen, other: _Seen) -> Array:
+    """Error of each pixel at one exposure: ΔC^(1 − ΔF), with the errors of color and of features in [0, 1]."""
+    most = _greatest_color_error()
+    color = _power(_hyab(one.color, other.color), COLOR_POWER)
+    below = color * np.float32(BELOW / (KNEE * most))
+    above = BELOW + (color - np.float32(KNEE * most)) * np.float32((1 - BELOW) / (most - KNEE * most))
+    color = np.where(color < KNEE * most, below, above)
+    features = cv2.max(cv2.absdiff(one.edges, other.edges), cv2.absdiff(one.points, other.points))
+    features = _power(features * np.float32(1 / np.sqrt(2)), FEATURE_POWER)
+    # The logarithm of 0 is a number in OpenCV, and its power is 0.
+    return np.asarray(cv2.exp(cv2.log(color) * (1 - features)), np.float32)
+
+
+def _mix(image: Array, matrix: NDArray[np.float64]) -> Array:
+    """The channels of each pixel, times a matrix."""
+    return np.asarray(cv2.transform(image, matrix), np.float32)
+
+
+def _length(x: NDArray[Any], y: NDArray[Any]) -> Array:
+    # That of OpenCV differs in the last bit from call to call.
+    return np.asarray(np.sqrt(x * x + y * y), np.float32)
+
+
+def _power(x: Array, power: float) -> Array:
+    return np.asarray(cv2.pow(x, power), np.float32)
+
+
+def _hyab(one: Array, other: Array) -> Array:
+    """The distance of large color differences: that in lightness, and that in a* and b*, added."""
+    apart = one - other
+    return np.asarray(np.abs(apart[..., 0]) + _length(apart[..., 1], apart[..., 2]), np.float32)
+
+
+def _hunt(light: Array) -> Array:
+    """L*a*b* of linear sRGB, chroma scaled with the lightness: dark colors look alike."""
+    xyz = _mix(light, RELATIVE)
+    edge = 6 / 29
+    low = xyz * np.float32(1 / (3 * edge**2)) + np.float32(4 / 29)
+    x, y, z = np.moveaxis(np.where(xyz > edge**3, _power(xyz, 1 / 3), low), -1, 0)
+    lightness = 116 * y - 16
+    return np.dstack([lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)])
+
+
+@lru_cache(maxsize=1)
+def _greatest_color_error() -> float:
+    """That between green and blue, to the power of color errors."""
+    green, blue = (_hunt(np.array([[color]], np.float32)) for color in ((0, 1, 0), (0, 0, 1)))
+    return float(_hyab(green, blue)[0, 0] ** COLOR_POWER)
+
+
+def _blur(plane: Array, gaussians: Sequence[tuple[float, float]]) -> Array:
+    """Filter by a sum of Gaussians, whose weights sum to one together."""
+    widest = max(b for sums in SENSITIVITY for _, b in sums)
+    reach = int(np.ceil(3 * np.sqrt(widest / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
+    degrees = np.arange(-reach, reach + 1) / PIXELS_PER_DEGREE
+    rows = [np.exp(-(np.pi**2) / b * degrees**2) for _, b in gaussians]
+    heights = [a * np.sqrt(np.pi / b) for a, b in gaussians]
+    total = sum(height * row.sum() ** 2 for height, row in zip(heights, rows, strict=True))
+    parts = [
+        cv2.sepFilter2D(plane, -1, height / total * row, row, borderType=BORDER)
+        for height, row in zip(heights, rows, strict=True)
+    ]
+    return np.asarray(sum(parts), np.float32)
+
+
+def _strength(gray: Array, across: NDArray[np.float64], along: NDArray[np.float64]) -> Array:
+    """Length of what a filter finds horizontally and vertically."""
+    x = cv2.sepFilter2D(gray, -1, across, along, borderType=BORDER)
+    y = cv2.sepFilter2D(gray, -1, along, across, borderType=BORDER)
+    return _length(x, y)
+
+
+@lru_cache(maxsize=1)
+def _feature_filters() -> tuple[NDArray[np.float64], ...]:
+    """A Gaussian, its first and its second derivative; what is positive sums to 1, what is negative to −1."""
+    sigma = 0.5 * FEATURE * PIXELS_PER_DEGREE
+    reach = int(np.ceil(3 * sigma))
+    x = np.arange(-reach, reach + 1)
+    wide = np.exp(-(x**2) / (2 * sigma**2))
+    derived = (-x * wide, (x**2 / sigma**2 - 1) * wide)
+    sides = [np.where(d > 0, d / d[d > 0].sum(), -d / d[d < 0].sum()) for d in derived]
+    return wide / wide.sum(), *sides
