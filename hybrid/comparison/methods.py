@@ -24,7 +24,7 @@ from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality
-from hybrid.plan import Plan, Rules, plan_shot
+from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise
 from hybrid.steady import Pictures
 from nlm.average import average, replace_nonfinite, robust_average
@@ -116,31 +116,24 @@ def external(other: Shot) -> Method:
 # Ours, on aligned windows
 
 
-@lru_cache(maxsize=1)
-def _plan(shot: Shot | MappedShot) -> Plan:
-    """The shot's plan, made once, whoever asks: which way round a stage is."""
-    return plan_shot(shot)
-
-
 def _aligner(
     shot: Shot,
     *,
     radius: int = 2,
     source: str = "none",
-    flip: str = "",
+    rules: Rules | None = None,
     vectors: bool = True,
     solver: Mapping[str, Any] | None = None,
 ) -> Aligner:
     """What aligns windows with the stages that they call for.
 
-    `source` is that of the estimates (`hybrid.estimates`), `flip` a stage to be the other way round; without
-    `vectors` those of the renderer are not looked at; `solver` has settings of TV-L1, and has it run.
+    `source` is that of the estimates (`hybrid.estimates`), `rules` have stages forced; without `vectors` those of the
+    renderer are not looked at; `solver` has settings of TV-L1, and has it run.
     """
     seen = shot if vectors else _blind(shot)
-    rules = Rules(on=frozenset({"refine"} if solver else ()))
-    if flip:
-        runs = flip in _plan(seen).stages
-        rules = replace(rules, **{"off" if runs else "on": frozenset({flip})})
+    rules = rules or Rules()
+    if solver:
+        rules = replace(rules, on=rules.on | {"refine"})
     refine = partial(refine_flow, **(solver or {}))
     bundled = _small_network() if source == "bundled" else None
     chosen = choose_estimate(source, shot, mode=MODE_OF["fast"], bundled=bundled)
@@ -274,7 +267,7 @@ def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[in
     (int, dict of str to (H, W) array)
         Number and `window_maps` of each frame.
     """
-    denoiser = _denoiser(preset, 640, "float32", None)  # the difference of two runs must not be rounding
+    denoiser = _denoiser(preset, None, "float32", None)  # the difference of two runs must not be rounding
     for aligned in _windows(shot, radius=denoiser.radius, **window):
         yield aligned.number, window_maps(aligned, lambda seen: denoiser(seen).color)
 
@@ -398,7 +391,6 @@ def _finite(image: Array) -> Array:
     return replace_nonfinite(image)[0]
 
 
-@lru_cache(maxsize=1)
 def _blind(shot: Shot) -> MappedShot:
     """The shot without its vectors."""
     return MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))

@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any
 
 from hybrid.comparison.methods import METHODS, Method
-from hybrid.plan import Plan
+from hybrid.plan import Plan, Rules
 from hybrid.pseudo_reference import STANDARD, filter_window
 
 # What is varied around: the middle of the classical presets, and the network.
@@ -47,14 +47,15 @@ def _variant(sweep: str, base: str, settings: Mapping[str, object], **options: A
 
 def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
     for decision in plan.decisions:
-        settings = {decision.stage: "off" if decision.on else "on"}
+        turned = "off" if decision.on else "on"
+        settings, rules = {decision.stage: turned}, Rules(**{turned: frozenset({decision.stage})})
         if decision.stage == "dense-flow":
             if not decision.on:  # there are vectors; without them this is what has to be run
                 yield _variant("Stages", CLASSICAL, settings, vectors=False)
         elif decision.stage == "skip":  # tiles are the network's
-            yield _variant("Stages", NETWORK, settings, flip="skip")
+            yield _variant("Stages", NETWORK, settings, rules=rules)
         elif decision.stage != "alpha":  # which has no part in the color
-            yield _variant("Stages", CLASSICAL, settings, flip=decision.stage)
+            yield _variant("Stages", CLASSICAL, settings, rules=rules)
     without = {"guided filter": replace(STANDARD, guided_radius=0), "NLM": replace(STANDARD, nlm_radius=0)}
     for stage, preset in without.items():
         yield _variant("Stages", CLASSICAL, {stage: "off"}, denoise=partial(filter_window, preset=preset))
