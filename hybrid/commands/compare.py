@@ -133,6 +133,7 @@ def compare(
     from hybrid.comparison.samples import samples_of
     from hybrid.comparison.store import FrameStore
     from hybrid.comparison.tables import markdown_table, result_table
+    from hybrid.heap import keep_freed_memory
     from hybrid.plan import plan_shot
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
@@ -166,6 +167,7 @@ def compare(
     noisy = alike["shot"]
     clean = [_open_beside(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
+    LOG.info("plan: measure every frame")
     plan = run_apart(plan_shot, noisy)
     said += [finding.message for finding in say_cuts(plan, (), strict=strict)]
     if sweep:
@@ -181,10 +183,12 @@ def compare(
 
     def show(what: str, done: float, total: float) -> None:
         nonlocal bar
-        if bar is None or total != bar.total or done < bar.done:
-            bar = Progress("compare", total, "methods")
-        bar.advance(done - bar.done, what)
+        if bar is None:
+            bar = Progress(what, total, "steps")
+        else:
+            bar.advance(done - bar.done, what)
 
+    keep_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         comparison = compare_shot(
             noisy,
@@ -204,6 +208,7 @@ def compare(
         if output is not None:
             from hybrid.comparison.report import report_images, write_report
 
+            LOG.info("page: pack the pictures")
             judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
             images, truth = report_images(FrameStore(Path(folder)), comparison, judged)
             page = write_report(

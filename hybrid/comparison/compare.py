@@ -6,6 +6,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +14,7 @@ from tempfile import TemporaryDirectory
 from hybrid.comparison.judging import Judge, error_of, find_static_pixels, store_flows, store_reference
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.results import Comparison, MethodResult, Statistic
-from hybrid.comparison.running import ENOUGH, Progress, Run, run_apart, summarize_runs, time_methods
+from hybrid.comparison.running import ENOUGH, WARM_UP, Progress, Run, run_apart, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
@@ -67,7 +68,7 @@ def compare_shot(
         A new one, or an empty one. It keeps the frames and maps of every method, and the reference, for a `FrameStore`.
         Without it they are removed in the end.
     progress : callable, optional
-        Is told what is being done.
+        Is told what is being done, and how many steps of all are done; those that turn out not to be needed are jumped.
 
     Returns
     -------
@@ -85,6 +86,15 @@ def compare_shot(
     halves = reference if isinstance(reference, tuple) else (reference,)
     numbers = _common_frames(shot, halves)
     _check_levels(numbers, methods, samples, levels)
+    mapped = [name for name, method in methods.items() if maps and method.maps is not None]
+    run_steps = rounds * len(methods)  # after a first step; FLIP is one more
+    total = 1 + run_steps + 1 + len(methods) + len(mapped)
+
+    def tell(what: str, done: int, _: int = 0, *, before: int = 0) -> None:
+        if progress is not None:
+            progress(what, before + done, total)
+
+    tell("read the reference, and what moves", 0)
     run_apart(_check_sizes, shot, _what_is_given(numbers, halves, methods, levels))
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         store = FrameStore(Path(kept))
@@ -92,8 +102,9 @@ def compare_shot(
         pairs = run_apart(store_flows, store, shot, numbers)
         judge = Judge(store, numbers, pairs, exposure, find_static_pixels(store, numbers, pairs, exposure))
         load = os.getloadavg()[0]
-        runs, absent = time_methods(methods, shot, rounds, store, progress)
-        statistics = _judge_methods(judge, {name: methods[name] for name in runs}, progress)
+        runs, absent = time_methods(methods, shot, rounds, store, partial(tell, before=1))
+        chosen = {name: methods[name] for name in runs}
+        statistics = _judge_methods(judge, chosen, partial(tell, before=1 + run_steps))
         law, facts = None, _facts_of_frames(judge)
         if "noisy" in statistics:
             law, facts["Reference"] = judge.find_noise_law(
@@ -108,9 +119,11 @@ def compare_shot(
         ]
         if said:
             facts["Layers"] = "; ".join(said)
-        if maps:
-            for name in runs:
+        for done, name in enumerate(mapped):
+            if name in runs:
+                tell(f"maps of {name}", done, before=total - len(mapped))
                 run_apart(_store_maps, methods[name], shot, numbers, name, store)
+        tell("done", total)
     return Comparison(title, tuple(results), facts | _facts_of_runs(exposure, rounds, load))
 
 
@@ -180,20 +193,13 @@ def _span(numbers: Sequence[int]) -> str:
 # What is made of the runs
 
 
-def _judge_methods(
-    judge: Judge, methods: Mapping[str, Method], progress: Progress | None
-) -> dict[str, dict[str, Statistic]]:
+def _judge_methods(judge: Judge, methods: Mapping[str, Method], progress: Progress) -> dict[str, dict[str, Statistic]]:
     """Measures of each method; what only varies a setting is judged without FLIP."""
-
-    def tell(what: str, done: int) -> None:
-        if progress is not None:
-            progress(what, done, len(methods) + 1)
-
-    tell("FLIP of all methods", 0)
+    progress("FLIP of all methods", 0, len(methods) + 1)
     judge.map_flip([name for name, method in methods.items() if not method.sweep])
     statistics = {}
     for done, (name, method) in enumerate(methods.items(), start=1):
-        tell(f"measure {name}", done)
+        progress(f"measure {name}", done, len(methods) + 1)
         statistics[name] = judge.measure(name, flip=not method.sweep, change=not method.sweep)
     return statistics
 
@@ -248,9 +254,10 @@ def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:
     return {
         "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
         "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, "
-        f"fewer where that took more than {ENOUGH:g} seconds, in a process of its own, after a first frame that is not "
-        "counted, as reading files is not. Median, and the range of the runs. Peak memory as the operating system "
-        "counted it. Threads that wait sleep (OMP_WAIT_POLICY=PASSIVE).",
+        f"fewer where that took more than {ENOUGH:g} seconds, in a process of its own, warmed up with the middle of a "
+        f"frame, up to {WARM_UP} pixels on a side. Compilation, weights and reading files are not counted. Median, and "
+        "the range of the runs. Peak memory as the operating system counted it. Threads that wait sleep "
+        "(OMP_WAIT_POLICY=PASSIVE).",
         "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {load:.1f} at the start",
         "Versions": ", ".join(_versions()),
     }

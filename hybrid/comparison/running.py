@@ -7,15 +7,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import ParamSpec, Self, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.heap import keep_freed_memory
 from hybrid.threads import let_waiting_threads_sleep, limit_threads
 from hybrid.timing import peak_memory
@@ -26,7 +27,9 @@ T = TypeVar("T")
 
 #: A method whose runs have taken so long together is not run again, seconds: what meets a short run by chance is
 #: spread over a long one.
-ENOUGH = 20.0
+ENOUGH = 10.0
+# Pixels on a side of what methods warm up with: enough for every loop to run, and for none to take long.
+WARM_UP = 256
 
 
 @dataclass(frozen=True)
@@ -110,10 +113,30 @@ def _clock_reading(shot: Shot) -> Iterator[_Clock]:
         del shot.read
 
 
+def _middle_of(shot: Shot) -> Shot:
+    """The middle of every frame, at most `WARM_UP` pixels on a side, as a shot for a method to warm up with."""
+    height, width = (min(size, WARM_UP) for size in shot.shape)
+
+    def cut(frame: Frame) -> Frame:
+        whole = frame.color.shape[:2]
+        top, left = (whole[0] - height) // 2, (whole[1] - width) // 2
+
+        def part(array: NDArray[Any]) -> NDArray[Any]:
+            return np.ascontiguousarray(array[top : top + height, left : left + width])
+
+        cuts: dict[str, Any] = {
+            name: part(value) for name, value in vars(frame).items() if isinstance(value, np.ndarray)
+        }
+        cuts |= {name: {key: part(a) for key, a in getattr(frame, name).items()} for name in ("aovs", "tints")}
+        return replace(frame, **cuts, resolution=frame.resolution or whole)
+
+    return cast("Shot", MappedShot(shot, cut, shape=(height, width)))  # of a shot methods ask for frames alone
+
+
 def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | None = None) -> Run:
     """Run a method over a shot in this process.
 
-    The first frame is made once before the clock starts: compilation, weights and the plan are paid for there.
+    The middle of the first frame is made before the clock starts: compilation and weights are paid for there.
 
     Parameters
     ----------
@@ -133,7 +156,7 @@ def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | N
     """
     if method.threads:
         limit_threads(method.threads)
-    next(method.run(shot), None)
+    next(method.run(_middle_of(shot)), None)
     clock, pixels = _Clock(), 0
     with _clock_reading(shot) as reading:
         frames = method.run(shot)
@@ -186,7 +209,7 @@ def time_methods(
         start = turn * len(names) // rounds
         for done, name in enumerate(names[start:] + names[:start]):
             if progress is not None:
-                progress(name, turn * len(names) + done, rounds * len(names))
+                progress(f"run {name}", turn * len(names) + done, rounds * len(names))
             if name in absent or (turn and not methods[name].timed):
                 continue
             if sum(run.seconds for run in runs.get(name, [])) >= ENOUGH:

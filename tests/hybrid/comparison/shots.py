@@ -32,6 +32,11 @@ class MemoryShot:
 
     step = 1
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        height, width = next(iter(self.frames.values())).color.shape[:2]
+        return height, width
+
     def read(self, number: int) -> Frame:
         return self.frames[number]
 

@@ -72,6 +72,26 @@ def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
     assert store.load("mapped", 5, "Confidence").shape == SIZE
 
 
+def test_progress_says_what_is_being_done() -> None:
+    shot, reference = make_shots()
+    told: list[str] = []
+    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps), "gone": Method(not_installed, "Tests", with_maps)}
+    compare_shot(
+        shot, reference, methods, maps=True, progress=lambda what, done, total: told.append(f"{done}/{total} {what}")
+    )
+    assert told == [
+        "0/10 read the reference, and what moves",
+        "1/10 run noisy",
+        "2/10 run mapped",
+        "3/10 run gone",
+        "4/10 FLIP of all methods",
+        "5/10 measure noisy",
+        "6/10 measure mapped",
+        "8/10 maps of mapped",  # what is not there is not measured, and has no maps
+        "10/10 done",
+    ]
+
+
 def test_wrong_input_is_an_error() -> None:
     shot, reference = make_shots()
     with pytest.raises(ValueError, match="none in common"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -87,6 +88,29 @@ def test_reading_and_warming_up_are_not_counted(monkeypatch: pytest.MonkeyPatch)
     assert run.megapixels == pytest.approx(3 * SIZE[0] * SIZE[1] / 1e6)
 
 
+def test_methods_warm_up_with_the_middle_of_large_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "WARM_UP", 10)
+    shot, _ = make_shots()
+    frames = {n: replace(f, aovs={"fog": f.color[..., :1].copy()}) for n, f in shot.frames.items()}
+    seen: list[Frame] = []
+
+    def method(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
+        for number in shot.numbers:
+            seen.append(shot.read(number))
+            assert seen[-1].color.shape[:2] == tuple(shot.shape)
+            yield number, seen[-1].color
+
+    run = run_method(Method(method, "Tests"), MemoryShot(frames))
+    first, *rest = seen
+    middle = np.s_[7:17, 11:21]
+    for name in ("color", "albedo", "normal", "motion"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(frames[4], name)[middle])
+    np.testing.assert_array_equal(first.aovs["fog"], frames[4].aovs["fog"][middle])
+    assert first.resolution == SIZE  # which motion may be a fraction of
+    assert [f.color.shape for f in rest] == [(*SIZE, 3)] * 3
+    assert run.megapixels == pytest.approx(3 * SIZE[0] * SIZE[1] / 1e6)
+
+
 def test_times_are_medians_with_their_range() -> None:
     runs = [Run(0.5, seconds, seconds / 2, 0) for seconds in (1.0, 40.0, 2.0)]  # one met something else
     assert summarize_runs(runs) == Seconds(median=4.0, least=2.0, most=80.0, cpu=2.0)
@@ -104,7 +128,7 @@ def test_rounds_take_turns_and_what_is_there_already_runs_once(tmp_path: Path) -
     runs, absent = time_methods(methods, shot, 2, store, progress)
     # The second round starts half-way through.
     order = ["noisy", "a", "gone", "dead", "gone", "dead", "noisy", "a"]
-    assert asked == [f"{name} {done}/8" for done, name in enumerate(order)]
+    assert asked == [f"run {name} {done}/8" for done, name in enumerate(order)]
     assert {name: len(series) for name, series in runs.items()} == {"noisy": 1, "a": 2}
     assert absent == {"gone": "needs the package unheard-of", "dead": "its process died, out of memory perhaps"}
     assert store.has("a", 5)
@@ -112,7 +136,7 @@ def test_rounds_take_turns_and_what_is_there_already_runs_once(tmp_path: Path) -
 
 def test_what_has_taken_long_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
     shot, _ = make_shots()
-    seconds = {"a": 25.0, "b": 11.0, "c": 1.0}
+    seconds = {"a": 12.0, "b": 6.0, "c": 1.0}
     monkeypatch.setattr(running, "run_apart", lambda _, method, shot, name, store: Run(1.0, seconds[name], 1.0, 0))
     runs, _ = time_methods(ways(a=perfect, b=perfect, c=perfect), shot, 4)
     assert {name: len(series) for name, series in runs.items()} == {"a": 1, "b": 2, "c": 4}
