@@ -11,7 +11,7 @@ Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -44,6 +44,9 @@ FEATURE = 0.082  # degrees: how wide edges and points are
 COLOR_POWER, FEATURE_POWER = 0.7, 0.5
 KNEE, BELOW = 0.4, 0.95  # color errors up to KNEE of the greatest are spread over [0, BELOW]
 BORDER = cv2.BORDER_REPLICATE
+ROWS = 128  # that are worked on at a time: what they take stays in the processor's cache from filter to filter
+# Of the widest Gaussian, three deviations, pixels; the filters of features are narrower.
+_REACH = int(np.ceil(3 * np.sqrt(0.04 / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
 BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes radiance around 1
 
 
@@ -66,36 +69,45 @@ def flip_map(image: Array, reference: Array) -> Array:
     ValueError
         If shapes differ, or the reference is not finite.
     """
-    return flip_maps([lambda: image], reference)[0]
+    return flip_maps([image], reference)[0]
 
 
-def flip_maps(images: Sequence[Callable[[], Array]], reference: Array) -> list[Array]:
+def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> list[Array]:
     """`flip_map` of several pictures of one frame; what the reference looks like is found out once.
 
     Parameters
     ----------
-    images : sequence of callable
-        Each gives (H, W, 3) linear radiance whenever it is asked: only one is held at a time.
+    images : sequence of (H, W, 3) array
+        Linear radiance. They may lie in files: `ROWS` at a time are looked at.
     reference : (H, W, 3) array
         The same.
+    scale : float
+        Factor on all of them.
 
     Returns
     -------
     list of (H, W) array of float32
         One for each picture: the greatest error of all exposures.
     """
-    worst = []
     for image in images:
-        first = image()
-        check_images(first, reference)
-        worst.append(np.full(first.shape[:2], 0 if np.isfinite(first).all() else np.nan, np.float32))
-    reference = np.maximum(reference, 0, dtype=np.float32)
-    for exposure in find_exposures(reference):
-        truth = _see(reference, exposure)
-        for image, errors in zip(images, worst, strict=True):
-            if not np.isnan(errors[0, 0]):
-                np.maximum(errors, _difference(_see(image(), exposure), truth), out=errors)
-    return worst
+        check_images(image, reference)
+    reference = np.maximum(reference * np.float32(scale), 0)
+    exposures = find_exposures(reference)
+    errors = [np.zeros(reference.shape[:2], np.float32) for _ in images]
+    height = reference.shape[0]
+    for top in range(0, height, ROWS):
+        rows = slice(max(top - _REACH, 0), min(top + ROWS + _REACH, height))
+        inner = slice(top - rows.start, top - rows.start + ROWS)
+        strips = [np.maximum(image[rows] * np.float32(scale), 0) for image in images]
+        for exposure in exposures:
+            truth = _see(reference[rows], exposure)
+            for strip, worst in zip(strips, errors, strict=True):
+                part = worst[top : top + ROWS]
+                np.maximum(part, _difference(_see(strip, exposure), truth)[inner], out=part)
+    return [
+        worst if np.isfinite(image).all() else np.full_like(worst, np.nan)
+        for image, worst in zip(images, errors, strict=True)
+    ]
 
 
 def find_exposures(reference: Array) -> NDArray[np.float64]:
@@ -130,8 +142,8 @@ class _Seen:
 
 
 def _see(image: Array, exposure: float) -> _Seen:
-    """What the eye makes of a picture on a display."""
-    scaled = np.maximum(image, 0, dtype=np.float32) * np.float32(2**exposure)
+    """What the eye makes of a picture, not negative, on a display."""
+    scaled = image * np.float32(2**exposure)
     k = [np.float32(value) for value in ACES]
     shown = np.minimum(((k[0] * scaled + k[1]) * scaled + k[2]) / ((k[3] * scaled + k[4]) * scaled + k[5]), 1)
     # The 16 that Y lacks cancel: filters of color preserve constants, and those of edges and points remove them.
@@ -195,9 +207,7 @@ def _greatest_color_error() -> float:
 
 def _blur(plane: Array, gaussians: Sequence[tuple[float, float]]) -> Array:
     """Filter by a sum of Gaussians, whose weights sum to one together."""
-    widest = max(b for sums in SENSITIVITY for _, b in sums)
-    reach = int(np.ceil(3 * np.sqrt(widest / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
-    degrees = np.arange(-reach, reach + 1) / PIXELS_PER_DEGREE
+    degrees = np.arange(-_REACH, _REACH + 1) / PIXELS_PER_DEGREE
     rows = [np.exp(-(np.pi**2) / b * degrees**2) for _, b in gaussians]
     heights = [a * np.sqrt(np.pi / b) for a, b in gaussians]
     total = sum(height * row.sum() ** 2 for height, row in zip(heights, rows, strict=True))

@@ -148,12 +148,9 @@ class Judge:
 
     def _map_flip(self, names: Sequence[str], number: int) -> None:
         """Keep the methods' maps of FLIP of a frame."""
-
-        def shown(radiance: Array) -> Array:
-            return radiance * np.float32(self.exposure)
-
-        images = [lambda name=name: shown(self.store.load(name, number)) for name in names]
-        for name, errors in zip(names, flip_maps(images, shown(self.store.load(REFERENCE, number))), strict=True):
+        images = [self.store.load(name, number, lazily=True) for name in names]
+        maps = flip_maps(images, self.store.load(REFERENCE, number), self.exposure)
+        for name, errors in zip(names, maps, strict=True):
             self.store.save(name, number, errors, FLIP_MAP)
 
     def _map_change(self, name: str, number: int) -> None:

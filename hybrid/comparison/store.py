@@ -54,9 +54,9 @@ class FrameStore:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, image)
 
-    def load(self, owner: str, number: int, title: str = "color") -> Array:
-        """Read what `save` has kept."""
-        image: Array = np.load(self._path(owner, number, title))
+    def load(self, owner: str, number: int, title: str = "color", *, lazily: bool = False) -> Array:
+        """Read what `save` has kept: at once, or each part where it is looked at."""
+        image: Array = np.load(self._path(owner, number, title), mmap_mode="r" if lazily else None)
         return image
 
     def has(self, owner: str, number: int, title: str = "color") -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hybrid.comparison import flip
 from hybrid.comparison.flip import find_exposures, flip_map, flip_maps
 
 Array = NDArray[np.float32]
@@ -50,11 +51,18 @@ def test_pictures_share_the_reference_and_nothing_else(pictures: tuple[Array, Ar
     lost = image.copy()
     lost[5, 5, 1] = np.nan
     given = [image, lost, reference, image * np.float32(0.5)]
-    together = flip_maps([lambda picture=picture: picture for picture in given], reference)
+    together = flip_maps(given, reference)
     for picture, errors in zip(given, together, strict=True):
         np.testing.assert_array_equal(errors, flip_map(picture, reference))
     assert np.isnan(together[1]).all()
     assert not together[2].any()
+
+
+def test_strips_leave_no_seam(pictures: tuple[Array, Array], monkeypatch: pytest.MonkeyPatch) -> None:
+    image, reference = pictures
+    whole = flip_map(image, reference)
+    monkeypatch.setattr(flip, "ROWS", 7)
+    np.testing.assert_allclose(flip_map(image, reference), whole, atol=1e-6)  # of float32
 
 
 @pytest.mark.parametrize("light", [0.0, 0.5])
