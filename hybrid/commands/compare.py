@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -167,14 +168,13 @@ def compare(
     noisy = alike["shot"]
     clean = [_open_beside(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
-    LOG.info("plan: measure every frame")
-    plan = run_apart(plan_shot, noisy)
-    said += [finding.message for finding in say_cuts(plan, (), strict=strict)]
+    plan = cache(partial(run_apart, plan_shot, noisy))
     if sweep:
         from hybrid.comparison.methods import METHODS
         from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 
-        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan)}
+        LOG.info("plan the shot")
+        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan())}
     pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
     levels = [
         (open_input(pattern, frames, layer, profile=profile), _number(count, "--level")) for pattern, count in pairs
@@ -201,6 +201,7 @@ def compare(
             reference_samples=samples_of(clean[0]),
             levels=levels,
             said=said,
+            look=lambda: [finding.message for finding in say_cuts(plan(), (), strict=strict)],
             maps=output is not None,
             folder=Path(folder),
             progress=show,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from functools import partial
 from importlib import metadata
@@ -34,6 +35,7 @@ def compare_shot(
     reference_samples: float | None = None,
     levels: Sequence[tuple[Shot, float]] = (),
     said: Sequence[str] = (),
+    look: Callable[[], Sequence[str]] | None = None,
     maps: bool = False,
     folder: Path | None = None,
     progress: Progress | None = None,
@@ -62,6 +64,9 @@ def compare_shot(
         Further renders of the shot with their samples per pixel, to measure how the noisy error falls.
     said : sequence of str
         What there is to say of the shot's layers.
+    look : callable, optional
+        Looks what else there is to say, while reference and motion are read. What it raises ends the comparison before
+        any method runs.
     maps : bool
         Whether the methods' own maps are made too.
     folder : Path, optional
@@ -94,13 +99,16 @@ def compare_shot(
         if progress is not None:
             progress(what, before + done, total)
 
-    tell("read the reference, and what moves", 0)
-    run_apart(_check_sizes, shot, _what_is_given(numbers, halves, methods, levels))
+    tell("look at the shot, its motion and the reference", 0)
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         store = FrameStore(Path(kept))
-        store_reference(store, halves, numbers)
-        pairs = run_apart(store_flows, store, shot, numbers)
-        judge = Judge(store, numbers, pairs, exposure, find_static_pixels(store, numbers, pairs, exposure))
+        with ThreadPoolExecutor(1) as beside:
+            found = None if look is None else beside.submit(look)
+            run_apart(_check_sizes, shot, _what_is_given(numbers, halves, methods, levels))
+            store_reference(store, halves, numbers)
+            pairs = run_apart(store_flows, store, shot, numbers)
+            judge = Judge(store, numbers, pairs, exposure, find_static_pixels(store, numbers, pairs, exposure))
+        said = [*said, *(found.result() if found is not None else ())]
         load = os.getloadavg()[0]
         runs, absent = time_methods(methods, shot, rounds, store, partial(tell, before=1))
         chosen = {name: methods[name] for name in runs}

@@ -80,7 +80,7 @@ def test_progress_says_what_is_being_done() -> None:
         shot, reference, methods, maps=True, progress=lambda what, done, total: told.append(f"{done}/{total} {what}")
     )
     assert told == [
-        "0/10 read the reference, and what moves",
+        "0/10 look at the shot, its motion and the reference",
         "1/10 run noisy",
         "2/10 run mapped",
         "3/10 run gone",
@@ -90,6 +90,12 @@ def test_progress_says_what_is_being_done() -> None:
         "8/10 maps of mapped",  # what is not there is not measured, and has no maps
         "10/10 done",
     ]
+
+
+def test_what_is_seen_meanwhile_is_a_fact() -> None:
+    shot, reference = make_shots()
+    facts = compare_shot(shot, reference, NOISY, said=["no depth"], look=lambda: ["a cut"]).facts
+    assert facts["Layers"] == "no depth; a cut"
 
 
 def test_wrong_input_is_an_error() -> None:
@@ -115,6 +121,11 @@ def test_wrong_input_is_found_before_any_method_runs(monkeypatch: pytest.MonkeyP
     refuses("frame 4 of reference is 31x24, expected 32x24", reference=(reference, small))
     refuses("'theirs' gave no frame 5, expected all of 4–6", NOISY | {"theirs": external(short)})
     refuses("frame 4 of method 'theirs' is 31x24, expected 32x24", NOISY | {"theirs": external(small)})
+
+    def look() -> list[str]:
+        raise ValueError("this shot is cut")
+
+    refuses("this shot is cut", look=look)
     refuses("levels need the samples per pixel of the shot", levels=[(shot, 4)])
     refuses("expected the method 'noisy'", ways(perfect=perfect), samples=8, levels=[(shot, 4)])
     refuses("expected some of 4–6", samples=8, levels=[(make_shots((8, 9))[0], 4)])
