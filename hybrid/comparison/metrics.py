@@ -352,6 +352,13 @@ def bootstrap_interval(
 def check_images(image: Array, reference: Reference) -> None:
     """Refuse what cannot be compared.
 
+    Parameters
+    ----------
+    image : (H, W, C) array
+        What is judged, finite or not.
+    reference : (H, W, C) array or two of them
+        What it is judged against.
+
     Raises
     ------
     ValueError
