@@ -571,12 +571,13 @@ class Samples(Dataset[dict[str, Tensor]]):
     loss : ImageLoss
         What ``error`` is measured with.
     neighbours : bool
-        Whether each sample is two: of successive frames, at the same place and varied alike.
+        Whether each sample is two: of successive frames, at the same place and varied alike. Of clips that have none,
+        as beyond a cut, no samples are made.
 
     Raises
     ------
     ValueError
-        If there are no clips, one is too small, or neighbours are asked for and one has none.
+        If there are no clips, one is too small, or neighbours are asked for and none has one.
 
     Notes
     -----
@@ -602,15 +603,15 @@ class Samples(Dataset[dict[str, Tensor]]):
         if clips.size < config.crop:
             raise ValueError(f"clips: expected at least {config.crop} pixels each way, got {clips.size}")
         self.clips, self.config, self.seed, self.loss = clips, config, seed, loss
-        order = np.random.default_rng((seed, 0)).permutation(len(clips))
+        self.neighbours = neighbours
+        usable = [index for index in range(len(clips)) if not neighbours or clips.neighbours(index) is not None]
+        if not usable:
+            raise ValueError(
+                "clips: expected neighbouring frames, as whole frames have (ravg prepare --tile 0), got none"
+            )
+        order = np.random.default_rng((seed, 0)).permutation(usable)
         self._sets = [order[first :: config.sets] for first in range(config.sets)]
         self._cycle: tuple[int, np.ndarray] | None = None
-        self.neighbours = neighbours
-        if neighbours and (alone := [index for index in range(len(clips)) if clips.neighbours(index) is None]):
-            raise ValueError(
-                f"clips: expected neighbouring frames of each, as whole frames have (ravg prepare --tile 0), "
-                f"got {len(alone)} of {len(clips)} without"
-            )
 
     def clip_of(self, number: int) -> int:
         """The clip that a sample is made of.
@@ -625,7 +626,7 @@ class Samples(Dataset[dict[str, Tensor]]):
         int
             Index of the clip.
         """
-        cycle, place = divmod(number, len(self.clips))
+        cycle, place = divmod(number, sum(map(len, self._sets)))
         if self._cycle is None or self._cycle[0] != cycle:
             rng = np.random.default_rng((self.seed, 1, cycle))
             self._cycle = cycle, np.concatenate([rng.permutation(part) for part in self._sets])

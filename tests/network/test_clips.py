@@ -411,9 +411,12 @@ def test_neighbours_are_varied_alike_and_their_motion_with_them(tmp_path: Path) 
         torch.testing.assert_close(here[:, rows, columns], moved)
         ways.add((x, y))
     assert len(ways) == 8
-    alone = folder_of(tmp_path / "alone", {"a": 2})
-    with pytest.raises(ValueError, match=r"expected neighbouring frames of each, .* got 2 of 2 without"):
-        Samples(alone, PLAIN, 0, neighbours=True)
+    # Beyond a cut there is none: such clips are left out, and where all are there is nothing to train on.
+    write_shards(tmp_path, "t", [4], [replace(clips[0], linked=torch.zeros(1))])
+    samples = Samples(open_clips(tmp_path), PLAIN, 0, neighbours=True)
+    assert {samples.clip_of(number) for number in range(20)} == {0, 1}
+    with pytest.raises(ValueError, match="expected neighbouring frames, as whole frames have"):
+        Samples(open_clips(tmp_path).of(["t"]), PLAIN, 0, neighbours=True)
 
 
 def test_clips_that_cannot_be_sampled_are_an_error(tmp_path: Path) -> None:

@@ -169,7 +169,7 @@ def test_training_on_noisy_targets_approaches_the_clean_image(
 
 def test_a_training_on_neighbours_asks_for_them(clips: Clips, tmp_path: Path) -> None:
     config = replace(CONFIG, steps=1, differences=1.0)
-    with pytest.raises(ValueError, match="expected neighbouring frames of each"):
+    with pytest.raises(ValueError, match="expected neighbouring frames, as whole"):
         train(clips, clips.of([]), make_model(), config, tmp_path / "w.safetensors")
     pair = [replace(make_clip(seed), linked=torch.full((2,), float(seed == 0))) for seed in range(2)]
     (tmp_path / "pair").mkdir()
