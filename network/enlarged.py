@@ -6,18 +6,53 @@ are added up before. That leaves four ninths of the work, and nothing is enlarge
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
+
 import torch
-from numba import njit
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from loops.cores import on_all_cores
+from network.convolution import convolve
+
+
+class Taps(NamedTuple):
+    """The weights of a convolution as they fall on features of half the size, and beside them.
+
+    Attributes
+    ----------
+    coarse : Tensor
+        ``(4·O, C, 2, 2)``: of each of the four places in a pixel of half the size.
+    beside : Tensor
+        ``(O, D, 3, 3)``.
+    """
+
+    coarse: Tensor
+    beside: Tensor
+
+
+def add_taps(weight: Tensor, width: int) -> Taps:
+    """Add up the taps that fall on the same pixel of half the size.
+
+    Parameters
+    ----------
+    weight : Tensor
+        ``(O, C + D, 3, 3)``.
+    width : int
+        C, how many channels are enlarged.
+
+    Returns
+    -------
+    Taps
+        Of an even row 2i the three taps fall on rows i − 1, i and i of the features, of an odd one, 2i + 1, on i, i and
+        i + 1; so of columns.
+    """
+    kernels = [half for rows in _halves(weight[:, :width], 2) for half in _halves(rows, 3)]
+    last = torch.channels_last
+    return Taps(torch.cat(kernels).contiguous(memory_format=last), weight[:, width:].contiguous(memory_format=last))
 
 
 def can_enlarge(*layers: Tensor) -> bool:
-    """Whether `convolve_enlarged` takes these layers: in bfloat16 sums of taps are other than those that were trained.
+    """Whether `convolve_enlarged` takes these layers.
 
     Parameters
     ----------
@@ -28,10 +63,11 @@ def can_enlarge(*layers: Tensor) -> bool:
     -------
     bool
     """
-    return all(layer.dtype == torch.float32 and layer.device.type == "cpu" for layer in layers)
+    (dtype, *others) = {layer.dtype for layer in layers}
+    return not others and dtype in (torch.float32, torch.bfloat16) and all(x.device.type == "cpu" for x in layers)
 
 
-def convolve_enlarged(x: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def convolve_enlarged(x: Tensor, skip: Tensor, taps: Taps, bias: Tensor) -> Tensor:
     """Enlarge features, put others beside them, convolve, and apply a ReLU.
 
     Parameters
@@ -40,44 +76,28 @@ def convolve_enlarged(x: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> 
         ``(N, C, H, W)``.
     skip : Tensor
         ``(N, D, 2·H, 2·W)``.
-    weight, bias : Tensor
-        Of the convolution: ``(O, C + D, 3, 3)``, and ``(O,)``.
+    taps : Taps
+        From `add_taps`.
+    bias : Tensor
+        ``(O,)``.
 
     Returns
     -------
     Tensor
         ``(N, O, 2·H, 2·W)``.
-
-    Notes
-    -----
-    Of an even row 2i the three taps fall on rows i − 1, i and i of x, of an odd one, 2i + 1, on i, i and i + 1; so of
-    columns. That is one convolution of 2×2 taps for each of the four places in a pixel of x.
     """
-    last, width = torch.channels_last, x.shape[1]
-    first = weight[:, :width]
-    kernels = [half for rows in _halves(first, 2) for half in _halves(rows, 3)]
-    taps = torch.cat(kernels).contiguous(memory_format=last)
-    parts = functional.conv2d(x, taps, padding=1).permute(0, 2, 3, 1).contiguous()
-    beside = weight[:, width:].contiguous(memory_format=last)
-    whole = functional.conv2d(skip, beside, bias, padding=1).permute(0, 2, 3, 1).contiguous()
-    on_all_cores(_add_parts, whole.shape[0] * whole.shape[1], parts.numpy(), whole.numpy())
-    return whole.permute(0, 3, 1, 2)
+    count, channels, (height, width) = len(x), len(bias), x.shape[2:]
+    parts = functional.conv2d(x, taps.coarse, padding=1).unflatten(1, (2, 2, channels))
+    size = count, channels, 2 * height, 2 * width
+    whole = torch.empty(size, dtype=x.dtype, memory_format=torch.channels_last)
+    for row in range(2):
+        for column in range(2):
+            part = parts[:, row, column, :, row : row + height, column : column + width]
+            whole[:, :, row::2, column::2] = part
+    return convolve(skip, taps.beside, bias, whole)
 
 
 def _halves(weight: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """The taps along an axis as they fall on two: of even places, and of odd ones."""
     before, own, after = weight.unbind(axis)
     return torch.stack([before, own + after], axis), torch.stack([before + own, after], axis)
-
-
-@njit(cache=True, nogil=True)
-def _add_parts(first: int, last: int, parts: NDArray[np.float32], whole: NDArray[np.float32]) -> None:
-    _, height, width, channels = whole.shape
-    zero = np.float32(0)
-    for row in range(first, last):
-        n, y = row // height, row % height
-        for x in range(width):
-            given, out = parts[n, (y + 1) // 2, (x + 1) // 2], whole[n, y, x]
-            start = (2 * (y % 2) + x % 2) * channels
-            for c in range(channels):
-                out[c] = max(out[c] + given[start + c], zero)

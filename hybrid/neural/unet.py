@@ -38,7 +38,7 @@ def denoise_unet(
     prefilter: Quality | None = None,
     clean: bool = False,
 ) -> Array:
-    """Denoise one frame with OIDN's networks; in bfloat16 64 to 66 dB from OIDN's own picture.
+    """Denoise one frame with OIDN's networks; in bfloat16 63 to 66 dB from OIDN's own picture.
 
     Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
 

@@ -15,7 +15,7 @@ pytest.importorskip("torch")
 import torch
 from torch import Tensor, nn
 
-from network import trunk
+from network import convolution, trunk
 from network.trunk import (
     OIDN_WEIGHTS,
     Trunk,
@@ -142,7 +142,7 @@ class TestOidn:
         layers = scene(96, 96)
         wanted, rounded = denoise_picture(exact, *layers), denoise_picture(round_trunk(exact), *layers)
         # Layer by layer, as each rounds what it is given.
-        monkeypatch.setattr(trunk, "_FUSED", frozenset())
+        monkeypatch.setattr(convolution, "_FUSED", frozenset())
         monkeypatch.setattr(trunk, "can_enlarge", lambda *_: False)
         plain = denoise_picture(as_they_are(exact), *layers)
         error, naive = (decibels(compressed(x), compressed(wanted)) for x in (rounded, plain))
@@ -427,10 +427,12 @@ def test_curves_and_their_inverses() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_fused_convolutions_give_the_same(made_up: Trunk, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    if dtype not in trunk._FUSED:
+    if dtype not in convolution._FUSED:
         pytest.skip(f"torch without oneDNN, or a processor without {dtype}")
     picture = torch.rand(1, made_up.config.inputs, 48, 64, generator=torch.Generator().manual_seed(1))
     running = round_trunk(made_up) if dtype == torch.bfloat16 else made_up
+    if dtype == torch.bfloat16:  # where something is added there is one rounding less than apart
+        monkeypatch.setattr(trunk, "can_enlarge", lambda *_: False)
     apart: list[nn.Module] = []
     for layer in running.modules():
         if isinstance(layer, nn.ReLU):
@@ -438,7 +440,7 @@ def test_fused_convolutions_give_the_same(made_up: Trunk, dtype: torch.dtype, mo
     with torch.no_grad():
         fused = running(picture)
         assert not apart
-        monkeypatch.setattr(trunk, "_FUSED", frozenset())
+        monkeypatch.setattr(convolution, "_FUSED", frozenset())
         expected = running(picture)
     assert apart
     if dtype == torch.bfloat16:
