@@ -319,7 +319,7 @@ def invert_flow(
         if array is not None and array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
     flow = np.ascontiguousarray(flow, np.float32)
-    usable = np.all(np.abs(flow) <= ABSURD_LENGTH, axis=-1)
+    usable = (np.abs(flow[..., 0]) <= ABSURD_LENGTH) & (np.abs(flow[..., 1]) <= ABSURD_LENGTH)
     if valid is not None:
         usable &= valid
     # 1 / (1 + speed) orders by speed as a depth does by nearness, with steps of 5 % where speeds differ by that.

@@ -63,7 +63,8 @@ def select_flow(
     shape = guides.centre.shape[:2]
     # One step of 8 bits: the scale on which guides in [0, 1] are seen as different.
     scale = 1 / (guides.noise + np.float32(1 / 255))
-    chance = 3 * (guides.noise * scale).sum(axis=-1)
+    # By planes, which is faster than over so short an axis.
+    chance = np.asarray(3 * sum(guides.noise[..., g] * scale[..., g] for g in range(scale.shape[-1])))
     errors, evidence = [], np.ones(shape, bool) if visible is None else visible.astype(bool)
     for index, candidate in enumerate(candidates):
         if candidate.shape != (*shape, 2):

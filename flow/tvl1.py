@@ -80,8 +80,9 @@ def refine_flow(
     if start.shape != (*shape, 2):
         raise ValueError(f"start has shape {start.shape}, expected {(*shape, 2)}")
     # A vector longer than the frame lands nowhere, and would smear over its neighbours; NaN compares false.
-    usable = np.all(np.abs(start) <= np.array(shape[::-1]), axis=-1, keepdims=True)
-    start = np.where(usable, start, 0).astype(np.float32)
+    usable = (np.abs(start[..., 0]) <= shape[1]) & (np.abs(start[..., 1]) <= shape[0])
+    start = np.array(start, np.float32)
+    start[~usable] = 0
     guides = _blurred(guides)
     base = _smooth_start(start, guides)
     pyramid = _build_pyramid(guides, scales)

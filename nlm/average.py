@@ -162,8 +162,8 @@ def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
     """
     if image.ndim != 3:
         raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
-    with np.errstate(invalid="ignore"):  # inf − inf
-        total = image.sum(dtype=np.float64)  # by far the quickest way to see that nothing is missing
+    with np.errstate(invalid="ignore", over="ignore"):  # inf − inf; where it overflows pixels are looked at
+        total = image.sum()  # by far the quickest way to see that nothing is missing
     if np.isfinite(total):
         return image.astype(np.float32), np.zeros(image.shape[:2], np.bool_)
     mask: Mask = np.any(~np.isfinite(image), axis=-1, keepdims=True)[..., 0]

@@ -110,7 +110,7 @@ def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, floa
     """
     cleaned, replaced = color.copy(), np.zeros(color.shape[:2], bool)
     height, width = color.shape[:2]
-    level = color.mean(axis=-1)
+    level = np.einsum("...c->...", color) / np.float32(color.shape[-1])
     for y, x in places:
         top, left = max(y - 2, 0), max(x - 2, 0)
         block = slice(top, min(y + 3, height)), slice(left, min(x + 3, width))

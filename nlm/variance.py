@@ -184,7 +184,7 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     spatial = variance_from_residual(guides[guides.shape[0] // 2])
     # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
     variance = np.maximum(np.minimum(_fade(temporal, spatial, trust), spatial), np.float32(1e-8))
-    noisy = np.any(variance > _NOISELESS, axis=-1)
+    noisy = np.logical_or.reduce([variance[..., c] > _NOISELESS for c in range(variance.shape[-1])])
     return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0, where=noisy)
 
 

@@ -122,5 +122,5 @@ class Flows:
         # Hidden in the other frame: whatever matches there is another surface.
         visible = None if back is None else forward_backward_error(flow, back[0]) < HIDDEN
         refined = self.refine(guides, flow)
-        self.refined[pair] = float(np.mean((refined != flow).any(axis=-1)))
+        self.refined[pair] = float(np.mean((refined[..., 0] != flow[..., 0]) | (refined[..., 1] != flow[..., 1])))
         return select_flow([flow, refined], guides, visible=visible)[0], valid

@@ -112,7 +112,7 @@ class PreparedFrame:
 
     def _brightness(self, shown: Array) -> Brightness:
         exposure = measure_exposure(shown)
-        gray = compress(shown.mean(axis=-1, keepdims=True), exposure)
+        gray = compress(np.einsum("...c->...", shown)[..., None] / np.float32(shown.shape[-1]), exposure)
         moments = [measure_guide(layer) for layer in (self.albedo, self.normal, gray) if layer is not None]
         return Brightness(exposure, np.concatenate(moments, axis=1))
 
