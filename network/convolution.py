@@ -26,7 +26,9 @@ def can_fuse(x: Tensor) -> bool:
     return x.dtype in _FUSED and not torch.is_grad_enabled() and x.device.type == "cpu"
 
 
-def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None) -> Tensor:
+def convolve(
+    x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None, *, relu: bool = True
+) -> Tensor:
     """Convolve, add, and apply a ReLU.
 
     Parameters
@@ -37,6 +39,8 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | Non
         Of the convolution: ``(O, C, 3, 3)``, and ``(O,)``.
     added : Tensor, optional
         ``(N, O, H, W)``, channels last: what is added to it, and where the result is written.
+    relu : bool
+        Whether there is a ReLU.
 
     Returns
     -------
@@ -45,10 +49,11 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | Non
     """
     if not can_fuse(x):
         found = functional.conv2d(x, weight, bias, padding=1)
-        return torch.relu_(found if added is None else added.add_(found))
-    one, relu = [1, 1], ("relu", list[float](), "")
+        found = found if added is None else added.add_(found)
+        return torch.relu_(found) if relu else found
+    one, name, rest = [1, 1], "relu" if relu else None, (list[float](), "")
     operation = weight, bias, one, one, one, 1  # padding, stride and dilation; groups
     if added is None:
-        return cast(Tensor, torch.ops.mkldnn._convolution_pointwise(x, *operation, *relu))
+        return cast(Tensor, torch.ops.mkldnn._convolution_pointwise(x, *operation, name or "none", *rest))
     x = x.contiguous(memory_format=torch.channels_last)  # as what is added lies
-    return cast(Tensor, torch.ops.mkldnn._convolution_pointwise_.binary(added, x, *operation, "add", 1.0, *relu))
+    return cast(Tensor, torch.ops.mkldnn._convolution_pointwise_.binary(added, x, *operation, "add", 1.0, name, *rest))

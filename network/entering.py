@@ -22,8 +22,9 @@ from network import trunk
 
 #: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
 RESIDUAL_LIMIT = 6.0
-#: Channels of a frame: its picture, the centre's albedo and normal, the gathered average, confidence, samples gathered.
-CHANNELS = 14
+#: Channels of each frame: its picture, and confidence. Of all alike: the centre's albedo and normal, the gathered
+#: average, samples gathered.
+OWN, ALIKE = 4, 10
 _LIMIT = np.float32(RESIDUAL_LIMIT)
 # The transfer curve (`network.trunk.pu_forward`), which a pixel of five frames asks for 21 times: 14 ns for a power or
 # a logarithm, 3 ns for a line between two entries of a table. Of each power of two from 2^-20, below which it is one
@@ -50,7 +51,7 @@ def can_lay_out(*layers: Tensor) -> bool:
 
 def entering(
     window: Mapping[str, Tensor], albedo: Tensor | None, normal: Tensor | None, columns: NDArray[np.int64]
-) -> Callable[[NDArray[np.int64]], tuple[Tensor, Tensor, Tensor]]:
+) -> Callable[[NDArray[np.int64]], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Make what lays out some rows of what enters the network.
 
     Parameters
@@ -65,9 +66,10 @@ def entering(
     Returns
     -------
     callable
-        From the rows of the window that stand in h rows of the picture to three layers:
+        From the rows of the window that stand in h rows of the picture to four layers:
 
-        - the frames, ``(T·N, 14, h, w)``, time first: `CHANNELS`;
+        - the frames, ``(T·N, 4, h, w)``, time first: `OWN`;
+        - what they have alike, ``(N, 10, h, w)``: `ALIKE`;
         - ``(N, 9, h, w)``, the gathered picture, and albedo and normal of the centre in [0, 1];
         - the average of the estimates, irradiance, ``(N, 3, h, w)``.
     """
@@ -77,14 +79,15 @@ def entering(
     layers += [nothing if guide is None else _pixels(guide) for guide in (albedo, normal)]
     exposure, gain = (window[name].numpy() for name in ("exposure", "gain"))
 
-    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         size = len(rows), len(columns)
-        frames = np.empty((count, batch, *size, CHANNELS), np.float32)
-        still, average = (np.empty((batch, *size, channels), np.float32) for channels in (9, 3))
+        frames = np.empty((count, batch, *size, OWN), np.float32)
+        alike, still, average = (np.empty((batch, *size, channels), np.float32) for channels in (ALIKE, 9, 3))
         for n in range(batch):
             given = *(layer[n] for layer in layers), exposure[n], gain[n], rows, columns
-            on_all_cores(_enter, size[0], n, *given, frames, still, average, _curve())
-        return _planes(frames.reshape(count * batch, *size, CHANNELS)), _planes(still), _planes(average)
+            on_all_cores(_enter, size[0], n, *given, frames, alike, still, average, _curve())
+        own = frames.reshape(count * batch, *size, OWN)
+        return _planes(own), _planes(alike), _planes(still), _planes(average)
 
     return lay_out
 
@@ -124,13 +127,12 @@ def _enter(
     first: int, last: int, n: int, estimates: NDArray[np.float32], residuals: NDArray[np.float32],
     confidence: NDArray[np.float32], modulation: NDArray[np.float32], albedo: NDArray[np.float32],
     normal: NDArray[np.float32], exposure: np.float32, gain: np.float32, rows: NDArray[np.int64],
-    columns: NDArray[np.int64], frames: NDArray[np.float32], still: NDArray[np.float32],
-    average: NDArray[np.float32], curve: NDArray[np.float32],
+    columns: NDArray[np.int64], frames: NDArray[np.float32], alike: NDArray[np.float32],
+    still: NDArray[np.float32], average: NDArray[np.float32], curve: NDArray[np.float32],
 ) -> None:  # fmt: skip
     T, zero, one, half = len(estimates), np.float32(0), np.float32(1), np.float32(0.5)
     centre = T // 2
     trust, share, held = np.empty(T, np.float32), np.empty(T, np.float32), np.empty((T, 3), np.float32)
-    guides, seen = np.empty(6, np.float32), np.empty(3, np.float32)
     value = np.empty(1, np.float32)
     bits = value.view(np.uint32)
     for y in range(first, last):
@@ -157,6 +159,7 @@ def _enter(
                 for c in range(3):
                     held[t, c] = residuals[t, row, column, c] * kept
             samples = one / squares / np.float32(T)
+            guides = alike[n, y, x]
             for c in range(3):
                 guides[c] = min(max(albedo[row, column, c], zero), one) if len(albedo) else half
                 guides[3 + c] = min(max(normal[row, column, c], -one), one) * half + half if len(normal) else half
@@ -178,13 +181,9 @@ def _enter(
                 for t in range(T):
                     frames[t, n, y, x, c] += shift
                 still[n, y, x, c] = picture
-                seen[c] = _on_curve(max(light * scale, zero), curve, value, bits)
+                alike[n, y, x, 6 + c] = _on_curve(max(light * scale, zero), curve, value, bits)
             for c in range(6):
                 still[n, y, x, 3 + c] = guides[c]
+            alike[n, y, x, 9] = samples
             for t in range(T):
-                for c in range(6):
-                    frames[t, n, y, x, 3 + c] = guides[c]
-                for c in range(3):
-                    frames[t, n, y, x, 9 + c] = seen[c]
-                frames[t, n, y, x, 12] = trust[t]
-                frames[t, n, y, x, 13] = samples
+                frames[t, n, y, x, 3] = trust[t]

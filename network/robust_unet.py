@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from network.blocks import RobustAverage
+from network.convolution import convolve
 from network.entering import RESIDUAL_LIMIT, can_lay_out, entering
 from network.fused import HIDDEN
 from network.trunk import (
@@ -222,7 +223,7 @@ class RobustUNet(nn.Module):
         still : Tensor
             ``(N, 9, H, W)``: the gathered picture, and albedo and normal of the centre in [0, 1].
         known : Tensor
-            ``(N, T, 5, H, W)``: gathered average, confidence, samples.
+            ``(N, T, 5, H, W)``: gathered average, confidence, samples; all but confidence are those of the window.
 
         Returns
         -------
@@ -240,26 +241,32 @@ class RobustUNet(nn.Module):
         for name, length in zip(("height", "width"), still.shape[2:], strict=True):
             if length == 0 or length % self.multiple:
                 raise ValueError(f"frames: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        return self.finish(self.meet(self.lay_out(frames, still, known)), still)
+        return self.finish(self.meet(*self.lay_out(frames, still, known)), still)
 
     def expect(self, frames: int) -> None:
         """Raise ValueError unless a window of so many frames is the model's."""
         if frames != self.config.frames:
             raise ValueError(f"frames: expected {self.config.frames}, got {frames}")
 
-    def lay_out(self, frames: Tensor, still: Tensor, known: Tensor) -> Tensor:
-        """Lay all that is known of each frame side by side, ``(T·N, 14, H, W)``, time first; as for `forward`."""
-        guides = still[:, None, 3:].expand(-1, self.config.frames, -1, -1, -1)
-        # Rounded before anything is copied.
-        parts = (part.to(self.trunk.first.weight.dtype).transpose(0, 1) for part in (frames, guides, known))
-        return torch.cat(list(parts), 2).flatten(0, 1)
+    def lay_out(self, frames: Tensor, still: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Lay what is known of each frame side by side, and what all have alike; as for `forward`.
 
-    def meet(self, x: Tensor) -> Tensor:
+        Returns
+        -------
+        own : Tensor
+            ``(T·N, 4, H, W)``, time first: picture, confidence.
+        alike : Tensor
+            ``(N, 10, H, W)``: albedo, normal, gathered average, samples.
+        """
+        own = torch.cat([frames, known[:, :, 3:4]], 2).transpose(0, 1).flatten(0, 1)
+        return own, torch.cat([still[:, 3:], known[:, 0, :3], known[:, 0, 4:]], 1)
+
+    def meet(self, own: Tensor, alike: Tensor) -> Tensor:
         """Run the finest scale of the encoder, in whose midst the frames meet. A row depends on two on each side.
 
         Parameters
         ----------
-        x : Tensor
+        own, alike : Tensor
             From `lay_out`, or `network.entering.entering`, of any even height.
 
         Returns
@@ -269,10 +276,15 @@ class RobustUNet(nn.Module):
             frames have met.
         """
         count, last = self.config.frames, max(self.config.ra_scales, default=-1)
-        first = self.trunk.first
-        x = (x if last >= 0 else x.chunk(count)[count // 2]).to(first.weight.dtype, memory_format=torch.channels_last)
-        weight = torch.cat([first.weight, self.known.weight], 1).contiguous(memory_format=torch.channels_last)
-        x = functional.conv2d(x, weight, first.bias, padding=1)
+        first, known, layout = self.trunk.first, self.known.weight, torch.channels_last
+        own = own if last >= 0 else own.chunk(count)[count // 2]
+        own, alike = (part.to(first.weight.dtype, memory_format=layout) for part in (own, alike))
+        of_own = torch.cat([first.weight[:, :3], known[:, 3:4]], 1).contiguous(memory_format=layout)
+        of_alike = torch.cat([first.weight[:, 3:], known[:, :3], known[:, 4:]], 1).contiguous(memory_format=layout)
+        # Convolved once for all frames: of 14 channels that a frame has, ten are those of all.
+        once = functional.conv2d(alike, of_alike, first.bias, padding=1).permute(0, 2, 3, 1)
+        added = once.repeat(len(own) // len(alike), 1, 1, 1).permute(0, 3, 1, 2)
+        x = convolve(own, of_own, None, added, relu=False)
         if "0" in self.average:
             x = self.average["0"](x, count, last == 0)
         return functional.max_pool2d(cast(Convolutions, self.trunk.encoder[0]).after_first(x), 2)
@@ -384,9 +396,9 @@ def denoise_window(
         found = realise(*given, window["exposure"], window["gain"])  # type: ignore[call-arg]
         return found, torch.cat([found.picture, guides], 1)
 
-    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         found, still = realised(rows)
-        return model.lay_out(found.frames, still, _known(found)), still, found.estimate
+        return *model.lay_out(found.frames, still, _known(found)), still, found.estimate
 
     if torch.is_grad_enabled():
         found, still = realised(rows)
@@ -397,8 +409,8 @@ def denoise_window(
         lay_out_rows = entering(window, albedo, normal, columns) if quick else lay_out
 
         def enter(rows: Tensor) -> list[Tensor]:
-            frames, still, average = lay_out_rows(rows[:, 0].numpy())
-            return [model.meet(frames), still, average]
+            own, alike, still, average = lay_out_rows(rows[:, 0].numpy())
+            return [model.meet(own, alike), still, average]
 
         features, still, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None], of_frames=True)
         seen, keep = model.finish(features, still)

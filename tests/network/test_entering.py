@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from network import robust_unet, trunk
-from network.entering import CHANNELS, _curve, _on_curve, can_lay_out, entering
+from network.entering import ALIKE, OWN, _curve, _on_curve, can_lay_out, entering
 from network.robust_unet import KNOWN, RobustUNet, RobustUNetConfig, denoise_window, realise
 
 pytestmark = pytest.mark.neural
@@ -53,14 +53,15 @@ def test_it_is_what_plain_operations_make(frames: int) -> None:
     still = torch.cat([found.picture, *guides], 1)
     model = RobustUNet(RobustUNetConfig(frames, "small"))
     wanted = model.lay_out(found.frames, still, robust_unet._known(found))
-    assert wanted.shape[1] == CHANNELS == 3 + 6 + KNOWN
+    assert [layer.shape[1] for layer in wanted] == [OWN, ALIKE]
+    assert OWN + ALIKE == 3 + 6 + KNOWN
     rows, columns = np.arange(H), np.arange(W)
     layers = entering(window, albedo, normal, columns)(rows)
     # Two libraries' powers and logarithms, and sums in another order: the last bits of numbers up to 1, which the
     # difference between a frame and the mean of all has as well, and of light as bright as the window's.
-    for layer, exact in zip(layers[:2], (wanted, still), strict=True):
+    for layer, exact in zip(layers[:3], (*wanted, still), strict=True):
         torch.testing.assert_close(layer, exact, rtol=0, atol=2e-6)
-    torch.testing.assert_close(layers[2], found.estimate, rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(layers[3], found.estimate, rtol=2e-5, atol=1e-6)
 
 
 def test_rows_and_columns_are_taken_from_where_it_is_said() -> None:
@@ -73,8 +74,8 @@ def test_rows_and_columns_are_taken_from_where_it_is_said() -> None:
 
 def test_without_guides_they_are_the_same_everywhere() -> None:
     window, _, _ = make_window()
-    frames, still, _ = entering(window, None, None, np.arange(W))(np.arange(H))
-    assert bool((frames[:, 3:9] == 0.5).all())
+    _, alike, still, _ = entering(window, None, None, np.arange(W))(np.arange(H))
+    assert bool((alike[:, :6] == 0.5).all())
     assert bool((still[:, 3:] == 0.5).all())
 
 

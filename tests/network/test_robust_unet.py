@@ -9,9 +9,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.nn import functional
+
 from network import trunk
 from network.models import denoise_tile, filter_window, for_inference
-from network.robust_unet import KEEP, KNOWN, RobustUNet, RobustUNetConfig, realise, start_from_oidn
+from network.robust_unet import KEEP, RobustUNet, RobustUNetConfig, realise, start_from_oidn
 from network.trunk import find_library, load_oidn, pu_forward, pu_inverse
 from nlm.gather import gather
 
@@ -189,14 +191,30 @@ def test_what_it_knows_enters_once_it_is_trained() -> None:
 def test_the_network_is_told_what_the_gather_knows() -> None:
     """Average, confidence and samples, in this order: weights are trained for it."""
     window, model = make_window(), small()
-    given: list[torch.Tensor] = []
-    model.meet = lambda x: given.append(x[None]) or torch.zeros(1, 32, 16, 24)  # type: ignore[method-assign]
+    given: list[tuple[torch.Tensor, ...]] = []
+    model.meet = lambda *layers: given.append(layers) or torch.zeros(1, 32, 16, 24)  # type: ignore[method-assign]
     denoise_tile(model, window)
-    known = given[0][:, :, -KNOWN:]
+    ((own, alike),) = given
     found = realised(window)
-    torch.testing.assert_close(known[:, 3, :3], found.average)
-    torch.testing.assert_close(known[:, :, 3:4], found.confidence)
-    torch.testing.assert_close(known[:, 1, 4:], found.samples)
+    torch.testing.assert_close(own[:, 3:], found.confidence[0])
+    torch.testing.assert_close(alike[:, 6:], torch.cat([found.average, found.samples], 1))
+
+
+def test_what_frames_have_alike_is_convolved_once() -> None:
+    """As if each frame had it, with weights that are trained."""
+    model, found = small(), realised(make_window())
+    model.known.weight.data.normal_(generator=torch.Generator().manual_seed(1))
+    known = torch.cat([layer.expand(1, 5, -1, -1, -1) for layer in (found.average[:, None], found.confidence)], 2)
+    known = torch.cat([known, found.samples[:, None].expand(1, 5, -1, -1, -1)], 2)
+    still = torch.cat([found.picture, uniform(1, 6, 32, 48, seed=3)], 1)
+    each = torch.cat([found.frames, still[:, None, 3:].expand(1, 5, -1, -1, -1), known], 2)[0]
+    weight = torch.cat([model.trunk.first.weight, model.known.weight], 1)
+    entered: list[torch.Tensor] = []
+    model.average["0"].register_forward_pre_hook(lambda _, given: entered.append(given[0].clone()))
+    model.meet(*model.lay_out(found.frames, still, known))
+    wanted = functional.conv2d(each, weight, model.trunk.first.bias, padding=1)
+    # Sums of 126 products of about 1, in another order.
+    torch.testing.assert_close(entered[0], wanted, rtol=1e-4, atol=1e-4)
 
 
 def test_strips_and_the_whole_are_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:
