@@ -23,15 +23,17 @@ from network.models import PRESETS as ALL
 from network.robust_unet import start_from_oidn
 
 #: Kind of shot, first seed, how many.
-SHOTS = [("random", 5100, 11), ("hard", 6100, 7)]
-RENDER = ["--frames", "1-5", "--size", "192x128", "--spp", "4-12", "--levels", "target=32,a=n,c=n/e"]
+#: Hard 6315 is left out: its smoke takes as long as ten others.
+SHOTS = [("random", 5300, 70), ("hard", 6300, 15), ("hard", 6316, 31)]
+RENDER = ["--frames", "1-7", "--size", "128x80", "--spp", "8-24", "--levels", "target=32,a=n"]
 #: Of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
-    "fast": ["--steps", 800, "--warmup", 50, "--ema", 0.99],
-    "balanced": ["--steps", 600, "--warmup", 50, "--ema", 0.99],
-    "quality": ["--steps", 250, "--warmup", 30, "--ema", 0.98],
+    "fast": ["--window", 5, "--steps", 2500],
+    "balanced": ["--window", 5, "--steps", 1800],
+    "quality": ["--window", 7, "--steps", 1000],
 }
-TRAIN = ["--init", "oidn", "--loss", "display", "--batch", 4, "--rate", 3e-4, "--trunk-rate", 0.1]
+TRAIN = ["--init", "oidn", "--loss", "display", "--differences", 1, "--pseudo", 0.6, "--batch", 2, "--crop", 80]
+TRAIN += ["--rate", 3e-4, "--trunk-rate", 0.1, "--warmup", 100, "--ema", 0.995, "--sets", 1]
 
 
 def main() -> int:
@@ -67,7 +69,9 @@ def main() -> int:
         "--estimate",
         "oidn-fast",
         "--frames",
-        "2-4",
+        "2-6",
+        "--window",
+        7,
     )
     for preset, schedule in SCHEDULES.items():
         weights = options.out / f"{preset}.safetensors"

@@ -194,17 +194,11 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         motion=motion,
         depth=frame.depth if one_way else None,
         variance=None if variance is None else np.maximum(variance, 0),
-        alpha=None if frame.alpha is None else _coverage(frame.alpha),
+        alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
         tints={name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.tints.items()},
     )
-
-
-def _coverage(alpha: Array) -> Array:
-    """Alpha, finite (H, W, 1); where all is covered, as in most shots, one number in memory."""
-    finite, _ = replace_nonfinite(alpha[..., None])
-    return np.broadcast_to(np.float32(1), finite.shape) if (finite == 1).all() else finite
 
 
 def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:

@@ -271,7 +271,7 @@ def train(
     ] = None,
     window: Annotated[
         int | None,
-        typer.Option(help="frames of a window: the middle ones, where clips have more", rich_help_panel=INPUT),
+        typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT),  # the middle ones of the clips'
     ] = None,
     validation: Annotated[
         list[str] | None,

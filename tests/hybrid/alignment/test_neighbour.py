@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.alignment.neighbour import AGREEING, layers_of, novelty_of, trust_light, warp_layers
 from hybrid.alignment.prepare import prepare
-from hybrid.files.frames import Frame, open_shot
+from hybrid.files.frames import open_shot
 from tests.scenes import Scene
 
 SCENE = Scene(frames=2, step=(0, 0))
@@ -55,13 +55,3 @@ def test_light_decides_where_geometry_does_not_trust_and_nothing_where_nothing_i
     assert trusted[2].max() < 0.01 * AGREEING
     sure = trust_light(np.ones(shape, np.float32), np.ones(shape, np.float32), light, light[1], 1.0, set())
     np.testing.assert_array_equal(sure, 1)  # nobody has asked the gate
-
-
-def test_alpha_that_covers_all_takes_no_memory():
-    color = np.random.default_rng(0).random((6, 7, 3), dtype=np.float32)
-    covered, parted = np.ones((6, 7), np.float32), np.ones((6, 7), np.float32)
-    parted[2, 3] = 0.5
-    opaque, shown = (prepare(Frame(1, color, alpha=alpha)).alpha for alpha in (covered, parted))
-    np.testing.assert_array_equal(opaque, covered[..., None])
-    np.testing.assert_array_equal(shown, parted[..., None])
-    assert opaque.strides == (0, 0, 0)
