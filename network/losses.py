@@ -128,10 +128,7 @@ def relmse(
     """
     level = prediction.detach().mean(1, keepdim=True)
     relative = (prediction - target) * torch.rsqrt(level**2 + RELMSE_FLOOR * scale.view(-1, 1, 1, 1) ** 2)
-    size = relative.abs()
-    # Quadratic inside the limit, tangent outside. The minimum keeps an infinite limit from making inf − inf.
-    inside = size.clamp(max=limit)
-    return _mean(inside * (2 * size - inside), weight)
+    return _mean(_bent_square(relative, limit), weight)
 
 
 def display(
@@ -169,9 +166,7 @@ def display(
     """
     level = scale.view(-1, 1, 1, 1)
     slope = level / (functional.relu(prediction.detach()) + level).square()
-    size = ((prediction - target) * slope).abs()
-    inside = size.clamp(max=limit)
-    return _mean(inside * (2 * size - inside), weight)
+    return _mean(_bent_square((prediction - target) * slope, limit), weight)
 
 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
@@ -428,6 +423,14 @@ def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
     error = functional.relu(prediction) / (1 + functional.relu(prediction))
     error = error - functional.relu(target) / (1 + functional.relu(target))
     return -10 * torch.log10(error.square().mean((1, 2, 3)).clamp_min(1e-12))
+
+
+def _bent_square(errors: Tensor, limit: float) -> Tensor:
+    """Quadratic inside the limit, tangent outside (Huber)."""
+    # The minimum keeps an infinite limit from making inf − inf.
+    size = errors.abs()
+    inside = size.clamp(max=limit)
+    return inside * (2 * size - inside)
 
 
 def _mean(errors: Tensor, weight: Tensor | None) -> Tensor:
