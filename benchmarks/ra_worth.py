@@ -53,7 +53,7 @@ class Joined(nn.Module):
         self.join.weight.data /= frames
 
     def forward(self, x: Tensor, frames: int, centre: bool) -> Tensor:
-        """As `network.blocks.RobustAverage`, of the centre."""
+        """As `network.blocks.ChannelAverage`, of the centre."""
         return self.block(self.join(torch.cat(x.chunk(frames), 1)))
 
 

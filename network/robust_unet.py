@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import RobustAverage
+from network.blocks import ChannelAverage
 from network.convolution import convolve
 from network.entering import RESIDUAL_LIMIT, can_lay_out, entering
-from network.fused import HIDDEN
 from network.trunk import (
     DECODERS,
     ENCODERS,
@@ -188,9 +187,9 @@ class RobustUNet(nn.Module):
     training the network does what it would with frames gathered by hand. The skip connection from the input to the
     last scale of the decoder has the gathered picture.
 
-    Further input channels (`KNOWN`) enter the first convolution with weights of 0. Blocks start as a constant blend
-    (`BLEND`), and the picture as a mixture of the network's and the average of estimates, whose errors are different
-    ones (`KEEP`); both are predicted, pixel by pixel, once they are trained.
+    Further input channels (`KNOWN`) enter the first convolution with weights of 0. Blocks start at a blend of `BLEND`,
+    learned for each channel, and the picture as a mixture of the network's and the average of estimates, whose errors
+    are different ones (`KEEP`), predicted pixel by pixel once it is trained.
     """
 
     def __init__(self, config: RobustUNetConfig) -> None:
@@ -200,7 +199,7 @@ class RobustUNet(nn.Module):
         self.trunk = Trunk(TrunkConfig(9, config.size))
         self.known = nn.Conv2d(KNOWN, ENCODERS[config.size][0][0], 3, padding=1, bias=False)
         self.average = nn.ModuleDict(
-            {str(scale): RobustAverage(widths[scale], 1, HIDDEN, BLEND) for scale in sorted(config.ra_scales)}
+            {str(scale): ChannelAverage(widths[scale], BLEND) for scale in sorted(config.ra_scales)}
         )
         self.keep = nn.Conv2d(DECODERS[config.size][-1][-1], 1, 1)
         nn.init.zeros_(self.known.weight)
@@ -460,5 +459,4 @@ def round_robust(model: RobustUNet) -> RobustUNet:
     """Lay a model out for processors that have bfloat16 (`network.trunk.round_trunk`); the model is changed."""
     model.trunk = round_trunk(model.trunk)
     model.known.weight.data = round_taps(model.known.weight)
-    model.average.bfloat16()
     return model

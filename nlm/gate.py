@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numba import njit
@@ -20,8 +22,13 @@ _AROUND_SIZE = (15, 15)
 SHARE, _FLOOR = 0.3, 0.004
 
 
-def color_gate(estimates: Floats, noisy: Floats, exposure: float, *, share: float = SHARE) -> Floats:
-    """Weigh aligned frames by how well their denoised colours agree with the centre's.
+def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
+    """Weigh aligned frames by how well their denoised colours agree with the centre's: `color_gates` of one share."""
+    return color_gates(estimates, noisy, exposure, (SHARE,))[0]
+
+
+def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Sequence[float]) -> list[Floats]:
+    """Weigh aligned frames by how well their denoised colours agree with the centre's, more or less strictly.
 
     Geometry cannot see a moving shadow, highlight or reflection; the colour of a clean enough estimate can.
 
@@ -34,13 +41,13 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float, *, share: floa
     exposure : float
         The radiance that is mapped to one half; it scales with the frames, so that the gate does not
         depend on their scale.
-    share : float
+    shares : sequence of float
         How much of the centre's noise two estimates may differ by, at least 0: what they have left of it.
 
     Returns
     -------
-    (T, H, W) float32
-        Weights in [0, 1]; 1 at the centre.
+    list of (T, H, W) float32
+        For each share weights in [0, 1]; 1 at the centre. Those of a greater share are nowhere less.
 
     Raises
     ------
@@ -74,16 +81,17 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float, *, share: floa
     on_all_cores(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
     noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
-    rate = 1 / np.square(np.float32(share) * noise + np.float32(_FLOOR))
-    weight = np.empty(estimates.shape[:3], np.float32)
+    rates = [1 / np.square(np.float32(share) * noise + np.float32(_FLOOR)) for share in shares]
+    weights = [np.ones(estimates.shape[:3], np.float32) for _ in shares]
     for t, estimate in enumerate(estimates):
         if t == centre_index:
-            weight[t] = 1
             continue
         on_all_cores(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
-        on_all_cores(_weigh, shape[0], mean, cv2.blur(mean, _AROUND_SIZE), rate, both, weight[t])
-    return weight
+        around = cv2.blur(mean, _AROUND_SIZE)
+        for rate, weight in zip(rates, weights, strict=True):
+            on_all_cores(_weigh, shape[0], mean, around, rate, both, weight[t])
+    return weights
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

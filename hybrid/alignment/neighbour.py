@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from flow.confidence import estimate_confidence
 from flow.warp import warp
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
-from nlm.gate import SHARE, color_gate
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -130,13 +129,10 @@ def novelty_of(flow: Array) -> Array:
 def trust_light(
     confidence: Array,
     seen: Array,
-    light: Array,
-    noisy: Array,
-    exposure: float,
+    gate: Array,
     stages: Collection[str],
     *,
     agreeing: float = AGREEING,
-    share: float = SHARE,
 ) -> Array:
     """Measure how far aligned estimates are to be trusted.
 
@@ -146,24 +142,17 @@ def trust_light(
         By geometry.
     seen : (T, h, W) array
         What it could be at most: 0 where a frame shows nothing.
-    light : (T, h, W, 3) array
-        The estimates, irradiance.
-    noisy : (h, W, 3) array
-        The centre's noisy irradiance.
-    exposure : float
-        Brightness of the centre.
+    gate : (T, h, W) array
+        How far they show the centre's light (`nlm.gate`).
     stages : collection of str
         Without "gate" what geometry trusts is trusted.
     agreeing : float
         What geometry leaves at least to those that show the same light.
-    share : float
-        How much of the noise they may differ by (`nlm.gate.color_gate`).
 
     Returns
     -------
     (T, h, W) array
         Confidence, in [0, 1]: by geometry and by whether they show the same light, or by that alone.
     """
-    gate = color_gate(light, noisy, exposure, share=share)
     floor = np.minimum(seen, agreeing) * gate
     return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)

@@ -26,6 +26,7 @@ from nlm.average import average, reject_outliers, replace_nonfinite, robust_aver
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
+from nlm.relight import relight
 
 EXAMPLES = 40
 anything = settings(
@@ -277,6 +278,17 @@ def test_the_gate_is_between_nought_and_one(drawn, exposure):
     weight = color_gate(estimates, estimates[0], exposure)
     assert ((weight >= 0) & (weight <= 1)).all()
     assert (weight[1] == 1).all()
+
+
+@anything
+@given(images(3, frames=3), st.floats(0, 1, width=32), st.sampled_from([1e-6, 1.0, 1e6]))
+def test_light_is_taken_along_without_harm(drawn, share, exposure):
+    window, rng = drawn
+    before, trusted = window.copy(), rng.uniform(0, 1, window.shape[:3]).astype(np.float32)
+    relight(window, trusted * np.float32(share), trusted, exposure)
+    assert np.isfinite(window).all()
+    assert (window >= np.minimum(before, 0)).all()
+    np.testing.assert_array_equal(window[1], before[1])
 
 
 # --- curves

@@ -14,7 +14,7 @@ from hybrid.files.sources import MADE_FROM
 from hybrid.pipeline import BESIDE, denoise_frames
 from hybrid.plan import Rules, decide, plan_shot
 from hybrid.records import read_records
-from hybrid.steady import MOST, WEIGHTS, Denoised, Pictures
+from hybrid.steady import MOST, Denoised, Pictures
 from tests.scenes import Scene
 
 MOVING = Scene(frames=7, noise=0.1)
@@ -61,8 +61,8 @@ def flicker(shot, scene, rules):
 def test_errors_that_change_from_frame_to_frame_are_averaged(tmp_path, scene):
     shot = open_shot(scene.write(tmp_path))
     alone, steady = flicker(shot, scene, ALONE), flicker(shot, scene, STEADY)
-    # Of weights 1 : 2 : 1 the deviation is √6 / 4 = 0.61. A pixel moved by whole pixels is not interpolated.
-    assert steady == pytest.approx(alone * np.sqrt(6) / 4, rel=0.05)
+    # Of equal weights the deviation is 1/√3. A pixel moved by whole pixels is not interpolated.
+    assert steady == pytest.approx(alone / np.sqrt(3), rel=0.05)
 
 
 def test_it_is_the_average_weighted_by_confidence(tmp_path):
@@ -72,12 +72,25 @@ def test_it_is_the_average_weighted_by_confidence(tmp_path):
     color = maker.make(MIDDLE)[0].color
     own = {n: denoise(Aligner(shot, STEADY).align(n)).color for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
     window, confidence, _ = maker.aligner.align_pictures(MIDDLE, own)
-    np.testing.assert_array_equal(window, np.stack(list(own.values())))  # nothing moves
+    np.testing.assert_allclose(window, np.stack(list(own.values())), rtol=0.01)  # nothing moves, in the same light
     assert confidence[1].min() == 1
     assert 0.5 < confidence[0].mean() < 1
-    weight = confidence * np.array(WEIGHTS)[:, None, None]
-    expected = (weight[..., None] * window).sum(axis=0) / weight.sum(axis=0)[..., None]
+    expected = (confidence[..., None] * window).sum(axis=0) / confidence.sum(axis=0)[..., None]
     np.testing.assert_allclose(color, expected, rtol=1e-5)
+
+
+def test_light_that_has_changed_by_less_than_the_noise_stays_with_its_frame(tmp_path):
+    """What is averaged of a neighbour is its detail: without `relight` the picture is 3.1 % too bright."""
+    shot, own = open_shot(STILL.write(tmp_path)), nearly(STILL)
+
+    def make(aligned):
+        light = np.float32(1 if aligned.number == MIDDLE else 1.05)
+        return Denoised(own(aligned).color * light)
+
+    inside = np.s_[8:-8, 8:-8]
+    maker = pictures(shot, make)
+    error = (maker.make(MIDDLE)[0].color / truth(STILL, MIDDLE) - 1)[inside]
+    assert abs(error.mean()) < 0.01
 
 
 def test_what_shows_another_light_is_left_out(tmp_path):
@@ -91,7 +104,7 @@ def test_what_shows_another_light_is_left_out(tmp_path):
         return Denoised(truth(STILL, aligned.number) * np.float32(1.3 if aligned.number == MIDDLE else 1))
 
     for number in (MIDDLE - 1, MIDDLE, MIDDLE + 1):
-        np.testing.assert_allclose(made(shot, make, number), make(Aligner(shot, ()).align(number)).color, rtol=1e-3)
+        np.testing.assert_allclose(made(shot, make, number), make(Aligner(shot, ()).align(number)).color, rtol=6e-3)
 
 
 def test_nothing_is_averaged_over_a_cut(tmp_path):

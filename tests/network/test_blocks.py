@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage, TemporalModule, outermost_first, ravg
+from network.blocks import ChannelAverage, ResidualBlock, RobustAverage, TemporalModule, outermost_first, ravg
 
 pytestmark = pytest.mark.neural
 
@@ -171,6 +171,30 @@ def test_robust_average_block_keeps_samples_of_a_batch_apart() -> None:
 def test_robust_average_block_of_one_frame_is_the_identity() -> None:
     x = random(2, 4, 6, 5, dtype=torch.float32)
     assert RobustAverage(4)(x, 1) is x
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 7])
+def test_channel_average_against_the_naive_one(count: int) -> None:
+    block = ChannelAverage(4, 0.8).double()
+    torch.nn.init.uniform_(block.blend, -2, 2)
+    frames = random(count, 2, 4, 6, 5, seed=3)
+    expected, weight = list(frames.unbind(0)), block.blend.sigmoid()[:, None, None]
+    for i in outermost_first(count):
+        others = torch.stack([f for j, f in enumerate(expected) if j != i])
+        average = ravg_by_sorting(others) if len(others) > 2 else others.mean(0)
+        expected[i] = (1 - weight) * expected[i] + weight * average
+    torch.testing.assert_close(block(frames.flatten(0, 1), count), torch.cat(expected))
+
+
+def test_channel_average_begins_where_it_is_told_to_and_learns() -> None:
+    block = ChannelAverage(3, 0.8).double()
+    torch.testing.assert_close(block.blend.sigmoid(), torch.full((3,), 0.8).double())
+    x = random(5, 3, 3, 4, seed=4).requires_grad_()
+
+    def run(x: torch.Tensor, blend: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(block, {"blend": blend}, (x, 5))
+
+    assert torch.autograd.gradcheck(run, (x, block.blend))
 
 
 @pytest.mark.parametrize("frames", [1, 3, 5])

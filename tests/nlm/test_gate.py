@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.gate import color_gate
+from nlm.gate import SHARE, color_gate, color_gates
 
 
 @pytest.fixture
@@ -42,6 +42,15 @@ def test_stays_open_on_errors_of_single_pixels(rng):
     noisy = estimates[1] + rng.normal(0, 0.1, estimates.shape[1:]).astype(np.float32)
     # Means of 9×9 pixels differ by 0.006 in tone-mapped units, a third of the gate's scale; pixels by twice the scale.
     assert color_gate(estimates, noisy, 0.5).mean() > 0.8
+
+
+def test_of_two_shares_the_greater_passes_more(rng):
+    estimates = rng.uniform(0.4, 0.6, (3, 40, 40, 3)).astype(np.float32)
+    noisy = estimates[1] + rng.normal(0, 0.1, estimates.shape[1:]).astype(np.float32)
+    strict, mild = color_gates(estimates, noisy, 0.5, (SHARE, 1.0))
+    np.testing.assert_array_equal(strict, color_gate(estimates, noisy, 0.5))
+    assert (strict <= mild).all()
+    assert strict[0].mean() < mild[0].mean() - 0.05
 
 
 def test_does_not_depend_on_the_exposure(rng):

@@ -10,6 +10,7 @@ import pytest
 from hybrid.alignment.neighbour import AGREEING, layers_of, novelty_of, trust_light, warp_layers
 from hybrid.alignment.prepare import prepare
 from hybrid.files.frames import open_shot
+from nlm.gate import color_gate
 from tests.scenes import Scene
 
 SCENE = Scene(frames=2, step=(0, 0))
@@ -49,9 +50,10 @@ def test_light_decides_where_geometry_does_not_trust_and_nothing_where_nothing_i
     light[2] = 4  # another light
     seen, none = np.ones(shape, np.float32), np.zeros(shape, np.float32)
     seen[0, :, :12] = 0
-    trusted = trust_light(none, seen, light, light[1], 1.0, {"gate"})
+    gate = color_gate(light, light[1], 1.0)
+    trusted = trust_light(none, seen, gate, {"gate"})
     np.testing.assert_array_equal(trusted[0, :, :12], 0)
     np.testing.assert_allclose(trusted[0, :, 12:], AGREEING, rtol=1e-6)
     assert trusted[2].max() < 0.01 * AGREEING
-    sure = trust_light(np.ones(shape, np.float32), np.ones(shape, np.float32), light, light[1], 1.0, set())
+    sure = trust_light(np.ones(shape, np.float32), np.ones(shape, np.float32), gate, set())
     np.testing.assert_array_equal(sure, 1)  # nobody has asked the gate

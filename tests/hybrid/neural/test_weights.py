@@ -16,7 +16,7 @@ from hybrid.files.frames import open_shot
 from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
-from network.blocks import RobustAverage
+from network.blocks import ChannelAverage
 from network.checkpoint import shipped_weights
 from nlm.average import robust_average
 
@@ -86,5 +86,5 @@ def test_the_networks_ra_blocks_are_worth_something(preset, loss, monkeypatch):
     """Put the identity in the place of all of them, and something must be missing."""
     denoiser = Denoiser(shipped_weights(preset))
     whole = decibels(picture(denoiser))
-    monkeypatch.setattr(RobustAverage, "forward", identity)
+    monkeypatch.setattr(ChannelAverage, "forward", identity)
     assert whole > decibels(picture(denoiser)) + loss
