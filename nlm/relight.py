@@ -66,7 +66,8 @@ def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, 
         on_all_cores(_sum_cells, rows, *pair, above, sums)
         means = [gaussian_mean(part, _SIGMA) for part in sums]
         change = np.stack([_ratio(part, means[-1]) for part in means[:-1]], axis=-1)
-        change = cv2.resize(change, (columns * _CELL, rows * _CELL), interpolation=cv2.INTER_LINEAR)
+        whole = (columns * _CELL, rows * _CELL)
+        change = np.asarray(cv2.resize(change, whole, interpolation=cv2.INTER_LINEAR), np.float32)
         on_all_cores(_take, height, *pair, alike[t], change[above : above + height, :width])
 
 
