@@ -18,7 +18,7 @@ from torch import Tensor
 from loops.cores import on_all_cores
 
 _VALUES = 512  # at a time, about: those of all frames fit the fastest cache
-_WRITTEN_OUT = (5, 7)  # frames of windows for which the average is
+_WRITTEN_OUT = (3, 5, 7)  # frames of windows for which the average is
 
 
 def can_blend(x: Tensor, frames: int) -> bool:
@@ -47,7 +47,7 @@ def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor,
     x : Tensor
         ``(T·N, C, H, W)``, float32 or bfloat16, time first.
     frames : int
-        T, 5 or 7.
+        T: 3, 5 or 7.
     order : sequence of int
         In which the frames are visited.
     weight : Tensor
@@ -88,6 +88,12 @@ def _narrow(result: Any, bits: Any, low: Any) -> None:
 
 
 @njit(nogil=True)
+def _blend_two(x: Any, a: Any, b: Any, share: Any) -> None:
+    for p in range(len(x)):
+        x[p] += share[p] * (np.float32(0.5) * (a[p] + b[p]) - x[p])
+
+
+@njit(nogil=True)
 def _blend_four(x: Any, a: Any, b: Any, c: Any, d: Any, share: Any) -> None:
     for p in range(len(x)):
         lower, upper = max(min(a[p], b[p]), min(c[p], d[p])), min(max(a[p], b[p]), max(c[p], d[p]))
@@ -125,7 +131,9 @@ def _blend(
                 _widen(bits[t], given[t, y][part], low)
             for i in order:
                 o = np.array([t for t in range(T) if t != i])
-                if T == 5:
+                if T == 3:
+                    _blend_two(state[i], state[o[0]], state[o[1]], share)
+                elif T == 5:
                     _blend_four(state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], share)
                 else:
                     _blend_six(

@@ -28,7 +28,7 @@ def block_and_features(
 
 @pytest.mark.parametrize("channels", [24, 3, 600])
 @pytest.mark.parametrize("centre", [False, True])
-@pytest.mark.parametrize("frames", [5, 7])
+@pytest.mark.parametrize("frames", [3, 5, 7])
 def test_it_gives_what_torch_gives(frames: int, centre: bool, channels: int) -> None:
     block, x = block_and_features(frames, channels=channels)
     wanted = block(x, frames, centre)  # with gradients: torch
