@@ -23,7 +23,27 @@ SHARE, _FLOOR = 0.3, 0.004
 
 
 def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
-    """Weigh aligned frames by how well their denoised colours agree with the centre's: `color_gates` of one share."""
+    """Weigh aligned frames by how well their denoised colours agree with the centre's: `color_gates` of one share.
+
+    Parameters
+    ----------
+    estimates : (T, H, W, 3) float32
+        Denoised, aligned frames, linear, at least 0; the centre is ``T // 2``.
+    noisy : (H, W, 3) float32
+        The centre frame as it was rendered, in the same unit.
+    exposure : float
+        The radiance that is mapped to one half.
+
+    Returns
+    -------
+    (T, H, W) float32
+        Weights in [0, 1] of the share 0.3; 1 at the centre.
+
+    Raises
+    ------
+    ValueError
+        As `color_gates` does.
+    """
     return color_gates(estimates, noisy, exposure, (SHARE,))[0]
 
 
