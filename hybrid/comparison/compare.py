@@ -21,6 +21,7 @@ from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
+LARGE = 1 << 20  # pixels of a frame; above, the maps of all frames would take longer than the rest of a comparison
 
 
 def compare_shot(
@@ -68,7 +69,7 @@ def compare_shot(
         Looks what else there is to say, while reference and motion are read. What it raises ends the comparison before
         any method runs.
     maps : bool
-        Whether the methods' own maps are made too.
+        Whether the methods' own maps are made too, of the frames that `mapped_frames` chooses.
     folder : Path, optional
         A new one, or an empty one. It keeps the frames and maps of every method, and the reference, for a `FrameStore`.
         Without it they are removed in the end.
@@ -127,10 +128,13 @@ def compare_shot(
         ]
         if said:
             facts["Layers"] = "; ".join(said)
+        looked_at = mapped_frames(numbers, judge.static.size)
+        if mapped and len(looked_at) < len(numbers):
+            facts["Maps"] = f"confidence and contribution of frame {looked_at[0]} alone, for the frames are large"
         for done, name in enumerate(mapped):
             if name in runs:
                 tell(f"maps of {name}", done, before=total - len(mapped))
-                run_apart(_store_maps, methods[name], shot, numbers, name, store)
+                run_apart(_store_maps, methods[name], shot, looked_at, name, store)
         tell("done", total)
     return Comparison(title, tuple(results), facts | _facts_of_runs(exposure, rounds, load))
 
@@ -239,12 +243,29 @@ def _absent_result(name: str, method: Method, reason: str) -> MethodResult:
     )  # fmt: skip
 
 
+def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
+    """Choose the frames whose maps are made.
+
+    Parameters
+    ----------
+    numbers : sequence of int
+        Of the frames that are judged.
+    pixels : int
+        Of a frame.
+
+    Returns
+    -------
+    list of int
+        All; of frames above `LARGE` pixels the middle one, as a map costs more than the frame did.
+    """
+    return list(numbers) if pixels <= LARGE else [numbers[len(numbers) // 2]]
+
+
 def _store_maps(method: Method, shot: Shot, numbers: Sequence[int], name: str, store: FrameStore) -> None:
-    """Keep a method's maps."""
-    for number, maps in method.maps(shot) if method.maps is not None else ():
-        if number in numbers:
-            for title, values in maps.items():
-                store.save(name, number, values, title)
+    """Keep a method's maps of these frames."""
+    for number, maps in method.maps(shot, numbers) if method.maps is not None else ():
+        for title, values in maps.items():
+            store.save(name, number, values, title)
 
 
 # What to know about how it was measured

@@ -38,12 +38,13 @@ class ReportImages:
     frame : callable
         From a frame number to its (H, W, 3) linear radiance.
     maps : mapping of str to callable
-        From a title, such as "FLIP" or "Confidence", to a function from a frame number to an (H, W) map in [0, 1].
+        From a title, such as "FLIP" or "Confidence", to a function from a frame number to an (H, W) map in [0, 1], or
+        to None where that frame has none.
     """
 
     name: str
     frame: Callable[[int], Array]
-    maps: Mapping[str, Callable[[int], Array]] = field(default_factory=dict)
+    maps: Mapping[str, Callable[[int], Array | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,10 @@ def _encode_all(
                 flicker += np.abs(error - before).mean(axis=(1, 2))
             before = error
             for j, (title, read) in enumerate(source.maps.items()):
-                values = _cut(read(number), box, shape[:2], f"{source.name}, {title}")
+                whole = read(number)
+                if whole is None:
+                    continue
+                values = _cut(whole, box, shape[:2], f"{source.name}, {title}")
                 levels = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (MAP_LEVELS - 1)).astype(np.int32)
                 elements.append((f"m{i}-{j}-{k}", compress(levels[..., None], MAP_LEVELS)))
     return elements, int(np.argmax(flicker))

@@ -7,7 +7,7 @@ settings of some of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float32]
 Run = Callable[[Shot], Iterator[tuple[int, Array]]]
-Maps = Callable[[Shot], Iterator[tuple[int, dict[str, Array]]]]
+Maps = Callable[[Shot, Sequence[int]], Iterator[tuple[int, dict[str, Array]]]]
 DenoiseWindow = Callable[[AlignedWindow], Array]
 
 
@@ -50,7 +50,7 @@ class Method:
     family : str
         What the chart draws alike.
     maps : callable, optional
-        From a shot to (number, (H, W) maps in [0, 1] by title), to be looked at.
+        From a shot and numbers of frames to (number, (H, W) maps in [0, 1] by title), to be looked at.
     cost : float, optional
         Seconds where they are not measured: 0 for what is there anyway, None where they are not known. NaN: measured.
     threads : int
@@ -140,10 +140,10 @@ def _aligner(
     return Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
 
 
-def _windows(shot: Shot, **window: Any) -> Iterator[AlignedWindow]:
-    """Every aligned window of a shot, with the settings of `_aligner`."""
+def _windows(shot: Shot, numbers: Sequence[int], **window: Any) -> Iterator[AlignedWindow]:
+    """The aligned windows of some frames of a shot, with the settings of `_aligner`."""
     aligner = _aligner(shot, **window)
-    for number in shot.numbers:
+    for number in numbers:
         yield aligner.align(number)
 
 
@@ -170,7 +170,7 @@ def classical(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[
     (int, (H, W, 3) array)
         Number and linear radiance of each frame.
     """
-    for aligned in _windows(shot, **window):
+    for aligned in _windows(shot, shot.numbers, **window):
         yield aligned.number, denoise(aligned)
 
 
@@ -229,13 +229,17 @@ def network(
         yield number, pictures.make(number)[0].color
 
 
-def classical_maps(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
+def classical_maps(
+    shot: Shot, numbers: Sequence[int], *, denoise: DenoiseWindow, **window: Any
+) -> Iterator[tuple[int, dict[str, Array]]]:
     """Map the confidence, and the temporal contribution to a classical estimate.
 
     Parameters
     ----------
     shot : Shot
         The noisy shot.
+    numbers : sequence of int
+        Of the frames to map.
     denoise : callable
         From an `AlignedWindow` to (H, W, 3) radiance.
     **window : object
@@ -246,17 +250,21 @@ def classical_maps(shot: Shot, *, denoise: DenoiseWindow, **window: Any) -> Iter
     (int, dict of str to (H, W) array)
         Number and `window_maps` of each frame.
     """
-    for aligned in _windows(shot, **window):
+    for aligned in _windows(shot, numbers, **window):
         yield aligned.number, window_maps(aligned, denoise)
 
 
-def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[int, dict[str, Array]]]:
+def network_maps(
+    shot: Shot, numbers: Sequence[int], *, preset: str, **window: Any
+) -> Iterator[tuple[int, dict[str, Array]]]:
     """Map the confidence, and the temporal contribution to what a network gives.
 
     Parameters
     ----------
     shot : Shot
         The noisy shot.
+    numbers : sequence of int
+        Of the frames to map.
     preset : str
         Whose weights the network takes.
     **window : object
@@ -268,7 +276,7 @@ def network_maps(shot: Shot, *, preset: str, **window: Any) -> Iterator[tuple[in
         Number and `window_maps` of each frame.
     """
     denoiser = _denoiser(preset, None, "float32", None)  # the difference of two runs must not be rounding
-    for aligned in _windows(shot, radius=denoiser.radius, **window):
+    for aligned in _windows(shot, numbers, radius=denoiser.radius, **window):
         yield aligned.number, window_maps(aligned, lambda seen: denoiser(seen).color)
 
 

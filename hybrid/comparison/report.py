@@ -37,7 +37,7 @@ from hybrid.comparison.results import (
     to_json,
     to_plain_numbers,
 )
-from hybrid.comparison.store import REFERENCE, FrameStore
+from hybrid.comparison.store import MAP_TITLES, REFERENCE, FrameStore
 from hybrid.comparison.tables import (
     format_bytes,
     format_change,
@@ -220,15 +220,19 @@ def report_images(
             r.name,
             partial(store.load, r.name),
             {
-                title: partial(store.load, r.name, title=title)
-                for title in store.map_titles(r.name, frames[0])
-                if all(store.has(r.name, number, title) for number in frames)
+                title: partial(_load_map, store, r.name, title)
+                for title in MAP_TITLES
+                if any(store.has(r.name, number, title) for number in frames)
             },
         )
         for r in comparison.results
         if r.absent_reason is None and not r.sweep
     ]
     return images, partial(store.load, REFERENCE)
+
+
+def _load_map(store: FrameStore, name: str, title: str, number: int) -> Array | None:
+    return store.load(name, number, title) if store.has(name, number, title) else None
 
 
 def _check(

@@ -16,10 +16,10 @@ class Pictures {
     return this.planes(`p${source}-${frame}`, 3, this.codes);
   }
 
-  // Levels of a map; null where the source has none of this title.
+  // Levels of a map; null where the source has none of this title, or none of this frame.
   map(source, title, frame) {
-    const j = this.sources[source].maps.indexOf(title);
-    return j < 0 ? null : this.planes(`m${source}-${j}-${frame}`, 1, this.mapLevels);
+    const id = `m${source}-${this.sources[source].maps.indexOf(title)}-${frame}`;
+    return document.getElementById(id) ? this.planes(id, 1, this.mapLevels) : null;
   }
 
   planes(id, channels, levels) {

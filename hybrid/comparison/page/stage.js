@@ -83,7 +83,7 @@ class Stage {
     context.rect(pane.from, pane.y, pane.to - pane.from, pane.h);
     context.clip();
     if (tile) context.drawImage(tile, left, top, width * scale, height * scale);
-    else writeAmid(context, "no such map", (pane.from + pane.to) / 2, pane.y + pane.h / 2);
+    else writeAmid(context, "no such map of this frame", (pane.from + pane.to) / 2, pane.y + pane.h / 2);
     if (layout !== "all") drawTicks(context, pane, top + (row + 0.5) * scale);
     if (layout !== "slider" && pane.x) {
       context.fillStyle = "#18181a"; // between this pane and the one left of it

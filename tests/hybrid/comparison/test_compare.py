@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from hybrid.comparison import compare
 from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
+from hybrid.comparison.report import report_images
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, REFERENCE, FrameStore
 from hybrid.files.frames import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
@@ -20,8 +21,8 @@ from tests.hybrid.comparison.test_running import killed, not_installed
 # Methods, at module level: they run in another process.
 
 
-def with_maps(shot: MemoryShot) -> Iterator[tuple[int, dict[str, Array]]]:
-    for number in shot.numbers:
+def with_maps(shot: MemoryShot, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
+    for number in numbers:
         yield number, {"Confidence": np.full(SIZE, 0.5, np.float32)}
 
 
@@ -70,6 +71,19 @@ def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
     assert set(store.map_titles("noisy", 5)) <= {FLIP_MAP, CHANGE_MAP}
     assert "Confidence" in store.map_titles("mapped", 5)
     assert store.load("mapped", 5, "Confidence").shape == SIZE
+
+
+def test_large_frames_have_maps_in_the_middle_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shot, reference = make_shots()
+    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
+    monkeypatch.setattr(compare, "LARGE", SIZE[0] * SIZE[1] - 1)
+    comparison = compare_shot(shot, reference, methods, maps=True, folder=tmp_path)
+    middle = shot.numbers[len(shot.numbers) // 2]
+    assert f"of frame {middle} alone" in comparison.facts["Maps"]
+    images, _ = report_images(FrameStore(tmp_path), comparison, shot.numbers)
+    maps = next(image.maps for image in images if image.name == "mapped")
+    assert [number for number in shot.numbers if maps["Confidence"](number) is not None] == [middle]
+    assert all(maps[FLIP_MAP](number) is not None for number in shot.numbers)
 
 
 def test_progress_says_what_is_being_done() -> None:
