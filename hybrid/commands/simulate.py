@@ -12,7 +12,7 @@ import typer
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import INPUT, OUTPUT, RESOURCES, WHAT, usage
-from hybrid.simulate.run import missing, parse_center, parse_numbers, parse_size, shots_of
+from hybrid.simulate.run import missing, parse_center, parse_numbers, parse_size, read_meta, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
@@ -133,6 +133,8 @@ def simulate(
         several = shots_of(scene, output, shots, spp, levels, first)
         # Half buffers last: they ask for levels of two samples, and the levels are only now read.
         asked = [(replace(shot, halves=halves), folder) for shot, folder in several]
+    for shot, folder in asked:
+        read_meta(shot, folder)  # pictures of another shot are not those that are asked for
     if scheduler is not None:
         chunks = {}
         for shot, folder in asked:

@@ -80,7 +80,8 @@ def simulate(
     metas: dict[Path, dict[str, Any]] = {}
     parts = -(-jobs // len(shots)) if shots else 1
     for shot, out in shots:
-        metas[out] = _read_meta(shot, out)
+        metas[out] = read_meta(shot, out)
+        out.mkdir(parents=True, exist_ok=True)
         left = [frame for frame in shot.frames if missing(shot, out, frame)]
         for part in range(min(parts, len(left))):
             waiting.append((shot, out, left[part::parts]))
@@ -134,18 +135,40 @@ def missing(shot: ShotSettings, out: Path, frame: int) -> int:
     return sum(spp for name, spp in shot.pictures(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
 
 
-def _read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
+def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
+    """Read what a folder says of the shot in it.
+
+    Parameters
+    ----------
+    shot : ShotSettings
+        What is asked for.
+    out : Path
+        The folder, which need not exist.
+
+    Returns
+    -------
+    dict
+        "shot", the settings as asked for; "seconds" by picture, and "plan" where there is one.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds a shot with other settings, or its `meta.json` is not one.
+    """
     path = out / "meta.json"
     asked = json.loads(json.dumps(shot.to_json()))
     if not path.exists():
-        out.mkdir(parents=True, exist_ok=True)
         return {"shot": asked, "seconds": {}}
-    meta: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        meta: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        there = meta["shot"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected what ravg simulate writes, got {error!r}") from error
     for name, value in asked.items():
         # More frames may be asked for; the ones there were rendered with the plan that is there.
-        if name != "frames" and meta["shot"].get(name) != value:
-            raise ValueError(f"{out}: holds a shot with {name} {meta['shot'].get(name)!r}, expected {value!r}")
-    if meta["shot"]["frames"] != asked["frames"] and shot.scene in RANDOM:
+        if name != "frames" and there.get(name) != value:
+            raise ValueError(f"{out}: holds a shot with {name} {there.get(name)!r}, expected {value!r}")
+    if there["frames"] != asked["frames"] and shot.scene in RANDOM:
         raise ValueError(f"{out}: holds a random shot of other frames; its motion is drawn for them")
     return {**meta, "shot": asked}
 

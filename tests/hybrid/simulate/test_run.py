@@ -199,6 +199,22 @@ def test_a_folder_of_another_shot_is_refused(tmp_path, stub):
         simulate([(other, tmp_path)], python=python)
 
 
+def test_finished_pictures_of_another_shot_are_not_those_asked_for(tmp_path, stub, capsys):
+    """The command has nothing to render then, and must not say that all is there."""
+    words = ["-o", str(tmp_path / "shot"), "--frames", "1-2", "--levels", "n", "--spp", "2", "--python", stub()]
+    assert main(["simulate", "test:lens", *words]) == 0
+    assert main(["simulate", "test:lens", *words]) == 0
+    assert "all 2 pictures are there" in capsys.readouterr().err
+    assert main(["simulate", "test:shadow", *words]) == 1
+    assert "holds a shot with scene 'test:lens', expected 'test:shadow'" in capsys.readouterr().err
+
+
+def test_what_a_folder_says_of_its_shot_must_be_readable(tmp_path, stub):
+    (tmp_path / "meta.json").write_text("{")
+    with pytest.raises(ValueError, match=r"meta\.json: expected what ravg simulate writes"):
+        simulate([(SHOT, tmp_path)], python=stub())
+
+
 def test_a_renderer_that_fails_is_reported_with_its_last_word(tmp_path, stub):
     with pytest.raises(SimulationError, match="out of rays"):
         simulate([(SHOT, tmp_path)], python=stub(fail="True"))
