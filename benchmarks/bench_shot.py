@@ -45,9 +45,9 @@ VIEW = "ViewLayer"
 SHOTS = ("pan", "busy", "tiled")
 PREFILTERS = {"high": None, "best": "high"}
 FAST = "denoise --preset fast"
-# Scale, frames, window and cores: one of them at a time differs from the second.
+# Scale, frames, window and cores: one of them at a time differs from the second, or the frames from the first.
 SWEEP = [(1, 3, 5, 2), (3, 3, 5, 2), (6, 3, 5, 2), (12, 3, 5, 2), (3, 1, 5, 2), (3, 10, 5, 2), (3, 20, 5, 2)]
-SWEEP += [(3, 3, 3, 2), (3, 3, 7, 2), (3, 3, 5, 1)]
+SWEEP += [(3, 3, 3, 2), (3, 3, 7, 2), (3, 3, 5, 1), (1, 10, 5, 2), (1, 100, 5, 2)]
 
 
 def tile_shot(folder: Path, frames: int, scale: int = REPEAT) -> None:
