@@ -223,6 +223,7 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
     speed = max((pair.speed for pair in pairs), default=0.0)
     moves = speed > STILL if vectors else changed > GATE_ABOVE
     changes = "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)")
+    pairs_beside = "{:.0f} pairs of neighbouring frames without a cut between them"
     transparent = [frame.transparent for frame in frames if frame.transparent is not None]
     return Plan(
         (
@@ -238,11 +239,12 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             _decide_dense_flow(pairs, vectors, moves),
             _decide_refine(moves, vectors, unexplained),
             _decide("gate", unexplained, GATE_ABOVE, changes),
-            _decide("drift", unexplained, GATE_ABOVE, changes),
+            # Samples see what this plan cannot: light that moves by less than the noise of a pixel.
+            _decide("drift", float(len(pairs)), 0, pairs_beside),
             _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
             _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
             _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
-            _decide("steady", float(len(pairs)), 0, "{:.0f} pairs of neighbouring frames without a cut between them"),
+            _decide("steady", float(len(pairs)), 0, pairs_beside),
             Decision("alpha", False, None, 0, "no alpha in the file")
             if not transparent
             else _decide("alpha", max(transparent), 0, "{:.1%} of the picture is transparent"),

@@ -33,9 +33,12 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
-# their mean difference (`nlm.relight`). On validation shots 0.1 dB, and 0.7 dB in time, better than one share of 0.1. A
-# single share of 0.5 is as good there, and averages moving shadows.
-FINISHED = 0.2, 1.0
+# their mean difference (`nlm.relight`), where the light stands still as far as samples tell (`nlm.drift`). The second
+# alone is steadier by 0.2 dB, and averages moving shadows: 2.7 dB of such a shot.
+FINISHED = 0.1, 0.5
+# How much more finished pictures lose by a drift than estimates do, whose errors are several times as large: 20 and 100
+# differ by 0.05 dB, and by 0.25 dB where shadows move.
+DRIFTED = 100
 # Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, or what
 # a trunk sees (112) of what drift is measured in (55) and the gate compares (11). The mean of `gathered` (72) reaches
 # beyond, for 2e-7 of the light. Whole strips of the guided filter (64 rows): it then sums in the order it would in the
@@ -120,6 +123,8 @@ class Aligner:
         # Of neighbours, some rows of each: where one shows the other, and how far geometry trusts it. Their pictures
         # are compared after both windows.
         self._trusted: dict[tuple[int, int, int, int], tuple[Mask, Array]] = {}
+        # Of frames whose pictures are compared later: the weight that the next ones' estimates have by their drift.
+        self._drift: dict[int, Array] = {}
         self.hold: Collection[int] = ()
 
     def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
@@ -191,7 +196,10 @@ class Aligner:
             # bundled shot with its chrome that is worth 0.4 dB.
             gates = color_gates(light, noisy, exposure, FINISHED)
             alike, confidence = (trust_light(confidence, seen, gate, stages, agreeing=0.0) for gate in gates)
+            still = self._stillness(number, outer)
+            confidence = alike + still * (confidence - alike)
             relight(window, alike, confidence, exposure, first_row=outer.start)
+            confidence[[0, 2]] *= (1 + still) / 2
         return window, confidence, inner
 
     def comparable(self, number: int) -> list[int]:
@@ -212,6 +220,7 @@ class Aligner:
         kept = {*numbers, *self.hold}
         self._trusted = {pair: known for pair, known in self._trusted.items() if pair[0] in kept}
         self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in kept}
+        self._drift = {n: weight for n, weight in self._drift.items() if n in kept}
         self.flows.forget(kept)
         self.frames.load(numbers, seen, self.hold)
 
@@ -252,6 +261,9 @@ class Aligner:
                 confidence = aligned.confidence
                 weight = drift_weights(estimates, aligned.own, confidence, aligned.exposure, first_row=outer.start)
                 pull_to_centre(estimates, confidence, weight)
+                if "steady" in self.frames.allowed:
+                    whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
+                    whole[outer][inner] = weight[aligned.centre + 1][inner]
         return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
 
     def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
@@ -260,6 +272,13 @@ class Aligner:
         rows = slice(0, height) if rows is None else rows
         outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
         return outer, slice(rows.start - outer.start, rows.stop - outer.start)
+
+    def _stillness(self, number: int, rows: slice) -> Array:
+        """How far the light of a frame stands still, (h, W) in [0, 1]: 1 where it does, 0 where nothing can tell."""
+        if number in self._drift:
+            return 1 / (1 + DRIFTED * (1 / self._drift[number][rows] - 1))
+        known = self.source is not None and self.radius >= 2 and "drift" in self.frames.allowed
+        return np.full((rows.stop - rows.start, self.shot.shape[1]), known, np.float32)
 
     def _lit(self, number: int) -> PreparedFrame:
         """Of the window around a frame the nearest one to it that shows anything."""

@@ -3,6 +3,7 @@
 import importlib.util
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,6 +28,10 @@ STEADY = Rules(off=frozenset({"mean"}))
 ERROR = 0.003
 
 
+# First looks, which are what tells whether light drifts.
+ESTIMATES = OfFrames(lambda frame: cv2.blur(np.nan_to_num(frame.color), (9, 9)))
+
+
 def truth(scene, number, scale=1.0):
     return scene.clean(number - scene.first)["ViewLayer.Combined"] * np.float32(scale)
 
@@ -42,8 +47,8 @@ def nearly(scene, scale=1.0):
     return make
 
 
-def pictures(shot, denoise, rules=None, **options):
-    return Pictures(Aligner(shot, rules or STEADY), denoise, **options)
+def pictures(shot, denoise, rules=None, estimates=ESTIMATES, **options):
+    return Pictures(Aligner(shot, rules or STEADY, estimates=estimates), denoise, **options)
 
 
 def made(shot, denoise, number=MIDDLE, rules=None, **options):
@@ -91,6 +96,42 @@ def test_light_that_has_changed_by_less_than_the_noise_stays_with_its_frame(tmp_
     maker = pictures(shot, make)
     error = (maker.make(MIDDLE)[0].color / truth(STILL, MIDDLE) - 1)[inside]
     assert abs(error.mean()) < 0.01
+
+
+def test_where_nothing_tells_whether_light_drifts_neighbours_count_half(tmp_path):
+    shot = open_shot(STILL.write(tmp_path))
+    maker = pictures(shot, nearly(STILL), estimates=None)
+    error = maker.make(MIDDLE)[0].color - truth(STILL, MIDDLE)
+    alone = pictures(shot, nearly(STILL), ALONE).make(MIDDLE)[0].color - truth(STILL, MIDDLE)
+    inside = np.s_[8:-8, 8:-8]
+    # weights of 1, 2, 1
+    assert error[inside].std() == pytest.approx(alone[inside].std() * np.sqrt(6) / 4, rel=0.05)
+
+
+def under_a_shadow(index, width):
+    """What is left of the light under a soft edge that moves by three pixels a frame."""
+    return 0.5 + 0.5 / (1 + np.exp(-(np.arange(width) - width / 2 - 3 * (index - 3)) / 3))[None, :, None]
+
+
+def test_moving_shadows_are_not_averaged(tmp_path, monkeypatch):
+    scene = replace(STILL, height=96, width=160, noise=0.3)
+
+    def shade(index, layers):
+        layers["ViewLayer.Combined"] = (layers["ViewLayer.Combined"] * under_a_shadow(index, 160)).astype(np.float32)
+
+    def clean(number):
+        return np.asarray(truth(scene, number)[..., :3] * under_a_shadow(number - scene.first, 160), np.float32)
+
+    shot = open_shot(scene.write(tmp_path, edit=shade))
+    estimates = OfFrames(lambda frame: clean(frame.number))
+
+    def error():
+        picture = made(shot, lambda aligned: Denoised(clean(aligned.number)), estimates=estimates)
+        return float(np.abs(picture / clean(MIDDLE) - 1)[8:-8, 60:100].mean())
+
+    seen = error()
+    monkeypatch.setattr(Aligner, "_stillness", lambda self, number, rows: np.float32(1))
+    assert seen < 0.5 * error()
 
 
 def test_what_shows_another_light_is_left_out(tmp_path):
