@@ -96,9 +96,9 @@ class Pictures:
     -----
     With d the denoised frames, W the warp to the frame t, R what puts them into its light (`nlm.relight`) and c the
     confidence of their comparison (`Aligner.align_pictures`), 1 for the frame itself, the picture of t is
-    Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1. No pixel changes by more than a factor of two. Where light drifts, or
-    where nothing could tell (windows of three frames, or without estimates), nothing is put into another light, and c is
-    a half at most.
+    Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1. No pixel changes by more than a factor of two. Where light drifts
+    (`nlm.drift`), or where nothing could tell (windows of three frames, or without estimates), nothing is put into
+    another light, and c is a half at most.
     """
 
     def __init__(

@@ -261,7 +261,7 @@ class Aligner:
                 confidence = aligned.confidence
                 weight = drift_weights(estimates, aligned.own, confidence, aligned.exposure, first_row=outer.start)
                 pull_to_centre(estimates, confidence, weight)
-                if "steady" in self.frames.allowed:
+                if "steady" in self.frames.allowed and self._shows_drift(number):
                     whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
                     whole[outer][inner] = weight[aligned.centre + 1][inner]
         return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
@@ -273,12 +273,16 @@ class Aligner:
         outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
         return outer, slice(rows.start - outer.start, rows.stop - outer.start)
 
+    def _shows_drift(self, number: int) -> bool:
+        """Whether two frames on one side show what a frame shows: `nlm.drift` compares them."""
+        first, second, _, fourth, fifth = (self._link(number, n) for n in self.frames.around(number, 2))
+        return None not in (first, second) or None not in (fourth, fifth)
+
     def _stillness(self, number: int, rows: slice) -> Array:
         """How far the light of a frame stands still, (h, W) in [0, 1]: 1 where it does, 0 where nothing can tell."""
-        if number in self._drift:
-            return 1 / (1 + DRIFTED * (1 / self._drift[number][rows] - 1))
-        known = self.source is not None and self.radius >= 2 and "drift" in self.frames.allowed
-        return np.full((rows.stop - rows.start, self.shot.shape[1]), known, np.float32)
+        if number not in self._drift:
+            return np.zeros((rows.stop - rows.start, self.shot.shape[1]), np.float32)
+        return np.asarray(1 / (1 + DRIFTED * (1 / self._drift[number][rows] - 1)), np.float32)
 
     def _lit(self, number: int) -> PreparedFrame:
         """Of the window around a frame the nearest one to it that shows anything."""

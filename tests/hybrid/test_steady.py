@@ -98,6 +98,14 @@ def test_light_that_has_changed_by_less_than_the_noise_stays_with_its_frame(tmp_
     assert abs(error.mean()) < 0.01
 
 
+def test_of_two_frames_nothing_tells_whether_light_drifts(tmp_path):
+    shot = open_shot(replace(STILL, frames=2).write(tmp_path))
+    maker = pictures(shot, nearly(STILL))
+    maker.make(STILL.first)
+    _, confidence, _ = maker.aligner.align_pictures(STILL.first, {n: truth(STILL, n) for n in shot.numbers})
+    assert 0.4 < confidence[2].max() <= 0.5
+
+
 def test_where_nothing_tells_whether_light_drifts_neighbours_count_half(tmp_path):
     shot = open_shot(STILL.write(tmp_path))
     maker = pictures(shot, nearly(STILL), estimates=None)
