@@ -12,7 +12,6 @@ from hybrid.comparison import compare
 from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
-from hybrid.comparison.report import report_images
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, REFERENCE, FrameStore
 from hybrid.files.frames import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
@@ -74,6 +73,9 @@ def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
 
 
 def test_large_frames_have_maps_in_the_middle_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("font_manrope")
+    from hybrid.comparison.report import report_images
+
     shot, reference = make_shots()
     methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
     monkeypatch.setattr(compare, "LARGE", SIZE[0] * SIZE[1] - 1)
