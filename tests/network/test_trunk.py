@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from network import convolution, trunk
+from network.devices import has_bfloat16
 from network.trunk import (
     OIDN_WEIGHTS,
     Trunk,
@@ -146,10 +147,10 @@ class TestOidn:
         monkeypatch.setattr(trunk, "can_enlarge", lambda *_: False)
         plain = denoise_picture(as_they_are(exact), *layers)
         error, naive = (decibels(compressed(x), compressed(wanted)) for x in (rounded, plain))
-        # Measured on this picture: 60 to 62 dB, where weights cast as they are give 55 to 57; for the large network on
-        # a processor without bfloat16 63.2 and 62.0.
+        # Measured on this picture: 60 to 62 dB, where weights cast as they are give 55 to 57. A processor without bfloat16
+        # computes both otherwise, and runs neither outside of tests: there the large network has 63.2 and 62.0.
         assert error > 58
-        assert error > naive + 0.6
+        assert error > naive + (2 if has_bfloat16(torch.device("cpu")) else 1)
         assert abs(float(rounded.mean() / wanted.mean()) - 1) < 1e-2  # 0.6 % was measured without bf16 units
 
     def test_every_entry_is_a_network_for_its_inputs(self) -> None:
