@@ -148,7 +148,7 @@ class TestOidn:
         plain = denoise_picture(as_they_are(exact), *layers)
         error, naive = (decibels(compressed(x), compressed(wanted)) for x in (rounded, plain))
         # Measured on this picture: 60 to 62 dB, where weights cast as they are give 55 to 57. A processor without
-        # bfloat16 computes both otherwise, and runs neither outside of tests: the large network has 63.2 and 62.0 there.
+        # bfloat16 computes both otherwise, and runs neither outside of tests: large: 63.2 and 62.0 there.
         assert error > 58
         assert error > naive + (2 if has_bfloat16(torch.device("cpu")) else 1)
         assert abs(float(rounded.mean() / wanted.mean()) - 1) < 1e-2  # 0.6 % was measured without bf16 units
