@@ -37,8 +37,9 @@ class ReadAhead:
         return self._shot.shape
 
     def expect(self, numbers: Iterable[int]) -> None:
-        """Say which frames will be asked for; those up to the last one that was asked for are not read ahead."""
+        """Say which frames will be asked for; the first of them after the last one that was asked for is begun."""
         self._expected = sorted(numbers)
+        self._begin()
 
     def read(self, number: int) -> Frame:
         """A frame; the next one that is expected is begun.
@@ -52,10 +53,13 @@ class ReadAhead:
         frame = wanted.result()
         self._last = max(self._last, number)
         self._begun = {n: begun for n, begun in self._begun.items() if n > number}
+        self._begin()
+        return frame
+
+    def _begin(self) -> None:
         following = next((n for n in self._expected if n > self._last), None)
         if following is not None and not self._begun:
             self._begun[following] = self._thread.submit(self._read, following)
-        return frame
 
     def _read(self, number: int) -> Frame:
         with self._timings.beside("read"):

@@ -7,12 +7,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
+from hybrid.alignment.window import AlignedWindow
 from hybrid.beside import ReadAhead
 from hybrid.estimates import OIDN_MODES, EstimateSource
 from hybrid.files.frames import Shot, output_path
@@ -20,7 +22,7 @@ from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_lost_light, find_nonfinite
-from hybrid.steady import DenoiseWindow, Pictures
+from hybrid.steady import Denoised, DenoiseWindow, Pictures
 from hybrid.timing import Timings
 
 Array = NDArray[np.float32]
@@ -152,8 +154,8 @@ def denoise_frames(
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
 
-    While a frame is made, the next one that its successor needs is read in one thread, and the frame before it is
-    written in another.
+    While a frame is made, the one before it is written in one thread; once it is denoised, the next one that its
+    successor needs is read in another.
 
     Parameters
     ----------
@@ -218,10 +220,28 @@ def denoise_frames(
             Aligner(frames, rules, radius=radius, estimates=theirs, timings=timings)
             for frames, (_, theirs) in zip(readers, all_pictures, strict=True)
         ]
-        makers = [Pictures(aligner, denoise, rows=rows, keep_going=keep_going) for aligner in aligners]
+        after = dict(pairwise(shot.numbers))
+        making = shot.numbers[0]
 
-        def make(number: int, following: int | None) -> Finished | Callable[[], Finished]:
+        def expect(number: int) -> None:
+            """Have the frames read ahead that the picture of a frame needs."""
+            # The outermost are read only where something shines in the one beside them, or by a later window.
+            near = shot.near(number, reach - 1) if beside else ()
+            for frames in readers:
+                frames.expect(near)
+
+        def denoise_window(aligned: AlignedWindow) -> Denoised:
+            denoised = denoise(aligned)
+            # No sooner: while a picture is denoised, memory is at its fullest.
+            expect(after.get(making, making))
+            return denoised
+
+        makers = [Pictures(aligner, denoise_window, rows=rows, keep_going=keep_going) for aligner in aligners]
+
+        def make(number: int) -> Finished | Callable[[], Finished]:
             """Make a frame; give what writes it, or what there is to say of one that is there."""
+            nonlocal making
+            making = number
             started, path = time.perf_counter(), paths[number]
             read_as = [picture.taken(number) for picture, _ in all_pictures]
             # With its number: in a shot that one window holds, all frames are made from the same files.
@@ -230,12 +250,7 @@ def denoise_frames(
             again = why_stale(path, planned) if resume else ""
             if again is None:
                 return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
-            # The outermost frames are read only where something shines in the one beside them, or by a later window.
-            near = shot.near(number, reach - 1)
-            if following is not None:
-                near += shot.near(following, reach - (following == shot.numbers[-1]))
-            for frames in readers:
-                frames.expect(near if beside else ())
+            expect(number)
             made = [maker.make(number) for maker in makers]
             counted = [counts for _, counts in made]
             plan = as_run(rules.plan(*counted[0].facts), counted[0].stages, counted[0].shares)
@@ -294,10 +309,10 @@ def denoise_frames(
                     raise
                 return [Failed(number, error)]
 
-        for number, following in zip(paths, (*shot.numbers[1:], None), strict=True):
+        for number in paths:
             outcome: Finished | Failed | Callable[[], Finished]
             try:
-                outcome = make(number, following)
+                outcome = make(number)
             except (Exception, KeyboardInterrupt) as error:
                 if not keep_going or not isinstance(error, ValueError | OSError):
                     yield from settle()  # the frame before has been made all the same

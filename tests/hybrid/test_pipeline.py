@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from hybrid import pipeline
 from hybrid.files.frames import Shot, open_shot
 from hybrid.pipeline import Finished, denoise_frames
 from hybrid.plan import Rules
@@ -77,21 +78,28 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
     assert sorted(read) == list(shot.numbers)
 
 
-def test_the_next_frame_is_read_while_one_is_made(tmp_path, shot, monkeypatch):
-    read, whole = {number: threading.Event() for number in shot.numbers}, Shot.read
+def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, shot, monkeypatch):
+    """While one is denoised, memory is at its fullest."""
+    begun, read = [], {number: threading.Event() for number in shot.numbers}
+    whole, check = Shot.read, pipeline._check_picture
 
     def told(self, number):
+        begun.append(number)
         frame = whole(self, number)
         read[number].set()
         return frame
 
-    monkeypatch.setattr(Shot, "read", told)
-
     def make(aligned):
-        if aligned.number == FIRST:
-            assert read[FIRST + 2].wait(60)  # of the next window
+        assert max(begun) <= aligned.number + 1
         return picture(aligned)
 
+    def check_late(images, aligner, number):
+        if number == FIRST:
+            assert read[FIRST + 2].wait(60)  # of the next window
+        check(images, aligner, number)
+
+    monkeypatch.setattr(Shot, "read", told)
+    monkeypatch.setattr(pipeline, "_check_picture", check_late)
     assert len(list(denoise_frames(shot, tmp_path / "out", make, ALONE, radius=1))) == 4
 
 
