@@ -4,13 +4,14 @@
     ravg prepare a/* -o test_a --reference --tile 0 --estimate oidn-fast      # the same frames, each with
     ravg prepare b/* -o test_b --reference --tile 0 --estimate oidn-fast      # a reference of its own
     python benchmarks/ra_worth.py clips --test test_a test_b --steps 150 --seeds 0 1 2
+    python benchmarks/ra_worth.py clips --test test_a test_b --seconds 120      # for equal time
 
 All begin with OIDN's weights and see the same samples in the same order. *RA* is the final stage as it ships. *Joined*
 has in the block's place what tKPCN does with the frames (Vogels et al. 2018, section 5.2): a convolution over the
 features of all of them, which begins as their mean, and a residual block. *None* has nothing there: the gathered
-picture enters the decoder alone. The table has PSNR on x/(1+x) before and after, the product of the errors against both
-references in place of the square of one; CPU seconds of a step; and by how many per cent the picture brightens when a
-frame of the window does by one.
+picture enters the decoder alone. The table has PSNR before and after, against both references
+(`hybrid.comparison.metrics.psnr`); by how many per cent the picture brightens when a frame of the window does by one;
+steps, and CPU seconds of one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from math import log10
 from pathlib import Path
 
 import torch
@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from hybrid.comparison.metrics import psnr
 from network.blocks import ResidualBlock
 from network.clips import Clips, open_clips, whole_frames
 from network.models import filter_window
@@ -83,8 +84,8 @@ def judge(model: RobustUNet, tests: tuple[Clips, Clips]) -> tuple[float, list[fl
         pairs = zip(*(whole_frames(test, index, model.multiple) for test in tests), strict=True)
         for batch, other in pairs:
             image = picture(batch)
-            shown = [x.clamp_min(0) / (1 + x.clamp_min(0)) for x in (image, batch["target"], other["target"])]
-            found.append(-10 * log10(max(float(((shown[0] - shown[1]) * (shown[0] - shown[2])).mean()), 1e-12)))
+            shown, *truths = (x[0].permute(1, 2, 0).numpy() for x in (image, batch["target"], other["target"]))
+            found.append(psnr(shown, (truths[0], truths[1])))
             row = []
             for frame in range(batch["estimate"].shape[1]):
                 brighter = {name: batch[name].clone() for name in ("estimate", "residual")}
@@ -101,29 +102,48 @@ def main() -> int:
     parser.add_argument("--test", type=Path, nargs=2, required=True, help="clips of whole frames, two references")
     parser.add_argument("--size", default="small", help="of the trunk")
     parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--seconds", type=float, help="CPU seconds of each training, in place of steps")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     options = parser.parse_args()
     training = open_clips(options.clips)
     tests = (open_clips(options.test[0]), open_clips(options.test[1]))
     config = TrainConfig(
-        steps=options.steps, loss="display", batch=4, rate=3e-4, warmup=20, ema=0.98, checkpoint_minutes=1e9
+        steps=options.steps,
+        loss="display",
+        batch=4,
+        crop=min(TrainConfig.crop, *training.size),
+        rate=3e-4,
+        warmup=20,
+        ema=0.98,
+        checkpoint_minutes=1e9,
     )
-    print("| in the block's place | untrained | trained, each seed | frames give | CPU-s a step |")
-    print("|---|---|---|---|---|")
+
+    def trained(name: str, steps: int, seed: int) -> tuple[RobustUNet, float]:
+        """A model after so many steps, and CPU seconds of one."""
+        model, started = make(name, options.size, seed), time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            own = replace(config, steps=steps, seed=seed)
+            train(training, training.of([]), model, own, Path(folder) / "w.safetensors")
+        return model, (time.process_time() - started) / steps
+
+    print("| in the block's place | untrained | trained, each seed | frames give | steps | CPU-s a step |")
+    print("|---|---|---|---|---|---|")
     for name in ("RA", "joined", "none"):
         before = judge(make(name, options.size, 0), tests)[0]
+        steps = options.steps
+        if options.seconds is not None:
+            trained(name, 2, 0)  # what runs for the first time takes longer
+            steps = max(round(options.seconds / trained(name, 8, 0)[1]), 1)
         after, gives, seconds = [], [], []
         for seed in options.seeds:
-            model, started = make(name, options.size, seed), time.process_time()
-            with tempfile.TemporaryDirectory() as folder:
-                train(training, training.of([]), model, replace(config, seed=seed), Path(folder) / "w.safetensors")
-            seconds.append((time.process_time() - started) / options.steps)
-            psnr, shares = judge(model, tests)
-            after.append(psnr)
+            model, spent = trained(name, steps, seed)
+            seconds.append(spent)
+            found, shares = judge(model, tests)
+            after.append(found)
             gives.append(shares)
         each, mean = " ".join(f"{value:.2f}" for value in after), [statistics.mean(c) for c in zip(*gives, strict=True)]
         given = " ".join(f"{value:.2f}" for value in mean)
-        print(f"| {name} | {before:.2f} | {each} | {given} | {statistics.mean(seconds):.2f} |", flush=True)
+        print(f"| {name} | {before:.2f} | {each} | {given} | {steps} | {statistics.mean(seconds):.2f} |", flush=True)
     return 0
 
 

@@ -160,7 +160,11 @@ def _smooth_start(start: np.ndarray, guides: GuidePair) -> np.ndarray:
         cv2.ximgproc.guidedFilter(guides.centre, start, radius, 1e-3, scale=1 / spacing)
         for radius, spacing in ((4, 2), (16, 4))
     )
-    return select_flow([near, far], guides)[0]
+    # Chosen at half the size, in half the time: vectors so smooth differ over many pixels.
+    half = _build_pyramid(guides, 2)[-1]
+    choice = select_flow([_rescale(flow, *half.centre.shape[1::-1]) for flow in (near, far)], half)[1]
+    chosen = cv2.resize(choice, start.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return np.where(chosen[..., None] > 0, far, near)
 
 
 def _find_tiles(

@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 #: A method whose runs have taken so long together is not run again, seconds: what meets a short run by chance is
 #: spread over a long one.
-ENOUGH = 10.0
+ENOUGH = 5.0
 # Pixels on a side of what methods warm up with: frames of shots for tests are warmed up with as a whole, and of one of
 # 1920×1080 it is a fourteenth.
 WARM_UP = 384
