@@ -35,7 +35,7 @@ from network.clips import Clips, open_clips, whole_frames
 from network.models import filter_window
 from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, start_from_oidn
 from network.train import train
-from network.train_config import TrainConfig
+from network.train_config import SamplerConfig, TrainConfig
 
 
 class Joined(nn.Module):
@@ -111,7 +111,7 @@ def main() -> int:
         steps=options.steps,
         loss="display",
         batch=4,
-        crop=min(TrainConfig.crop, *training.size),
+        sampler=SamplerConfig(crop=min(SamplerConfig.crop, *training.size)),
         rate=3e-4,
         warmup=20,
         ema=0.98,
