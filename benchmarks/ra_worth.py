@@ -111,7 +111,7 @@ def main() -> int:
         steps=options.steps,
         loss="display",
         batch=4,
-        sampler=SamplerConfig(crop=min(SamplerConfig.crop, *training.size)),
+        sampler=SamplerConfig(crop=min(SamplerConfig.crop, training.size)),
         rate=3e-4,
         warmup=20,
         ema=0.98,
