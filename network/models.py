@@ -508,7 +508,7 @@ def balanced(frames: int = 5, seed: int = 0) -> RobustUNet:
         return RobustUNet(RobustUNetConfig(frames, "base"))
 
 
-def quality(frames: int = 5, seed: int = 0) -> RobustUNet:
+def quality(frames: int = 7, seed: int = 0) -> RobustUNet:
     """The final stage on OIDN's large U-Net, which relies on clean guides: 3.9 M parameters.
 
     Parameters

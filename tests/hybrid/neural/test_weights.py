@@ -17,7 +17,8 @@ from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
 from network.blocks import ChannelAverage
-from network.checkpoint import shipped_weights
+from network.checkpoint import load_model, shipped_weights
+from network.models import PRESETS, window_length
 from nlm.average import robust_average
 
 pytestmark = pytest.mark.neural
@@ -59,6 +60,13 @@ def test_weights_reach_what_their_card_says(reference, preset):
     assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
     assert preset == "tkpcn" or psnr(image, reference) > psnr(filter_window(window(), FINAL), reference)
     assert abs(mean_bias(image, reference)) < 0.01
+
+
+@pytest.mark.parametrize(("preset", "frames"), [("fast", 5), ("balanced", 5), ("quality", 7)])
+def test_windows_are_as_long_as_is_promised_and_as_trainings_begin_with(preset, frames):
+    shipped = load_model(shipped_weights(preset))
+    assert window_length(shipped) == frames
+    assert shipped.config == PRESETS[preset]().config
 
 
 def identity(self, x, frames, centre=False):
