@@ -136,7 +136,7 @@ def test_rounds_take_turns_and_what_is_there_already_runs_once(tmp_path: Path) -
 
 def test_what_has_taken_long_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
     shot, _ = make_shots()
-    seconds = {"a": 12.0, "b": 6.0, "c": 1.0}
+    seconds = {"a": 1.2 * running.ENOUGH, "b": 0.6 * running.ENOUGH, "c": 0.1 * running.ENOUGH}
     monkeypatch.setattr(running, "run_apart", lambda _, method, shot, name, store: Run(1.0, seconds[name], 1.0, 0))
     runs, _ = time_methods(ways(a=perfect, b=perfect, c=perfect), shot, 4)
     assert {name: len(series) for name, series in runs.items()} == {"a": 1, "b": 2, "c": 4}
