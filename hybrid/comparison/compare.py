@@ -286,7 +286,7 @@ def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:
         f"fewer where that took more than {ENOUGH:g} seconds, in a process of its own, warmed up with the middle of a "
         f"frame, up to {WARM_UP} pixels on a side. Compilation, weights and reading files are not counted. Median, and "
         "the range of the runs. Peak memory as the operating system counted it. Threads that wait sleep "
-        "(OMP_WAIT_POLICY=PASSIVE).",
+        f"(OMP_WAIT_POLICY=PASSIVE, GOMP_SPINCOUNT={os.environ.get('GOMP_SPINCOUNT', '0')}).",
         "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {load:.1f} at the start",
         "Versions": ", ".join(_versions()),
     }

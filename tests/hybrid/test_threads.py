@@ -7,14 +7,25 @@ import sys
 import pytest
 
 from hybrid.cli import main
+from hybrid.threads import SPINS
+
+VARIABLES = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"
 
 
-@pytest.mark.parametrize(("given", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, ("PASSIVE", str(SPINS))),
+        ({"OMP_WAIT_POLICY": "passive"}, ("passive", str(SPINS))),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, ("ACTIVE", None)),
+        ({"GOMP_SPINCOUNT": "0"}, ("PASSIVE", "0")),
+    ],
+)
 def test_the_command_lets_waiting_threads_sleep_unless_told_otherwise(given, expected, monkeypatch, capsys):
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    monkeypatch.setattr(os, "environ", environment | ({"OMP_WAIT_POLICY": given} if given else {}))
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    monkeypatch.setattr(os, "environ", environment | given)
     assert main(["--version"]) == 0
-    assert os.environ["OMP_WAIT_POLICY"] == expected
+    assert tuple(os.environ.get(name) for name in VARIABLES) == expected
 
 
 def test_openmp_has_not_read_the_variable_before_the_command_sets_it():
