@@ -84,8 +84,8 @@ def refine_flow(
     start = np.array(start, np.float32)
     start[~usable] = 0
     guides = _blurred(guides)
-    base = _smooth_start(start, guides)
     pyramid = _build_pyramid(guides, scales)
+    base = _smooth_start(start, pyramid)
     effort = warps, iterations, _REFINE_ATTACHMENT
     change = _solve(pyramid[1:], base, np.zeros_like(base), *effort)
     tiles = _find_tiles(pyramid[1], start, base, change) if pyramid[1:] else None
@@ -150,18 +150,18 @@ def _blurred(guides: GuidePair) -> GuidePair:
     return guides._replace(centre=centre, neighbour=neighbour)
 
 
-def _smooth_start(start: np.ndarray, guides: GuidePair) -> np.ndarray:
+def _smooth_start(start: np.ndarray, pyramid: Sequence[GuidePair]) -> np.ndarray:
     """Smooth a flow within the guides' edges, over 17 pixels, or over 129 where that explains the guides better."""
     if min(start.shape[:2]) < 32:
         return start
     # (radius in pixels of the subsampled grid on which the filter is fitted, its spacing); 1e-3: contrasts of the
     # guide below 0.03 are smoothed over.
     near, far = (
-        cv2.ximgproc.guidedFilter(guides.centre, start, radius, 1e-3, scale=1 / spacing)
+        cv2.ximgproc.guidedFilter(pyramid[0].centre, start, radius, 1e-3, scale=1 / spacing)
         for radius, spacing in ((4, 2), (16, 4))
     )
     # Chosen at half the size, in half the time: vectors so smooth differ over many pixels.
-    half = _build_pyramid(guides, 2)[-1]
+    half = pyramid[:2][-1]
     choice = select_flow([_rescale(flow, *half.centre.shape[1::-1]) for flow in (near, far)], half)[1]
     chosen = cv2.resize(choice, start.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     return np.where(chosen[..., None] > 0, far, near)
