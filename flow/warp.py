@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from loops.cores import on_all_cores
+
+Four = tuple[Any, Any, Any, Any]
 
 
 class Place(NamedTuple):
@@ -93,9 +95,11 @@ def interpolate(
     float32
         In the image's unit.
     """
+    # Unsigned: of a signed index numba asks each time whether it counts from the end.
+    x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
     value: np.float32 = (
-        weights[0] * image[place.y0, place.x0, channel] + weights[1] * image[place.y0, place.x1, channel]
-        + weights[2] * image[place.y1, place.x0, channel] + weights[3] * image[place.y1, place.x1, channel]
+        weights[0] * image[y0, x0, channel] + weights[1] * image[y0, x1, channel]
+        + weights[2] * image[y1, x0, channel] + weights[3] * image[y1, x1, channel]
     )  # fmt: skip
     return value
 
@@ -144,35 +148,49 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(inline="always")
+def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, wx: Four, wy: Four) -> np.float32:
+    """Weigh sixteen values of a flat image, within the range of the four in their midst."""
+    x0, x1, x2, x3 = columns
+    y0, y1, y2, y3 = rows[0] + channel, rows[1] + channel, rows[2] + channel, rows[3] + channel
+    a, b, c, d = image[y1 + x1], image[y1 + x2], image[y2 + x1], image[y2 + x2]
+    first = wx[0] * image[y0 + x0] + wx[1] * image[y0 + x1] + wx[2] * image[y0 + x2] + wx[3] * image[y0 + x3]
+    second = wx[0] * image[y1 + x0] + wx[1] * a + wx[2] * b + wx[3] * image[y1 + x3]
+    third = wx[0] * image[y2 + x0] + wx[1] * c + wx[2] * d + wx[3] * image[y2 + x3]
+    last = wx[0] * image[y3 + x0] + wx[1] * image[y3 + x1] + wx[2] * image[y3 + x2] + wx[3] * image[y3 + x3]
+    total = wy[0] * first + wy[1] * second + wy[2] * third + wy[3] * last
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    value: np.float32 = min(max(total, low), high)
+    return value
+
+
+# A product and a sum may be one operation. Unsigned: of a signed index numba asks each time whether it counts from the
+# end. Together they halve the time.
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _bicubic(
     first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
 ) -> None:
     height, width, channels = image.shape
+    flat, result = image.reshape(-1), out.reshape(-1)
+    column, row = np.uintp(channels), np.uintp(width * channels)
     for y in range(first, last):
-        columns = np.empty(4, np.int64)
-        rows = np.empty(4, np.int64)
         for x in range(width):
             inside[y, x], x0, y0, x1, y1, fx, fy = locate(
                 np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
             )
-            for i in range(4):
-                # A fraction of 0 has the weights (0, 1, 0, 0): read the one sample that counts.
-                columns[i] = min(max(x0 - 1 + i, 0), width - 1) if fx > 0 else x0
-                rows[i] = min(max(y0 - 1 + i, 0), height - 1) if fy > 0 else y0
+            # A fraction of 0 has the weights (0, 1, 0, 0): read the one sample that counts.
+            before, after = (max(x0 - 1, 0), min(x1 + 1, width - 1)) if fx > 0 else (x0, x0)
+            above, below = (max(y0 - 1, 0), min(y1 + 1, height - 1)) if fy > 0 else (y0, y0)
+            columns = np.uintp(before) * column, np.uintp(x0) * column, np.uintp(x1) * column, np.uintp(after) * column
+            rows = np.uintp(above) * row, np.uintp(y0) * row, np.uintp(y1) * row, np.uintp(below) * row
             wx, wy = _catmull_rom(fx), _catmull_rom(fy)
-            for c in range(channels):
-                total = np.float32(0)
-                for j in range(4):
-                    row = (
-                        wx[0] * image[rows[j], columns[0], c] + wx[1] * image[rows[j], columns[1], c]
-                        + wx[2] * image[rows[j], columns[2], c] + wx[3] * image[rows[j], columns[3], c]
-                    )  # fmt: skip
-                    total += wy[j] * row
-                a, b = image[y0, x0, c], image[y0, x1, c]
-                d, e = image[y1, x0, c], image[y1, x1, c]
-                low, high = min(min(a, b), min(d, e)), max(max(a, b), max(d, e))
-                out[y, x, c] = min(max(total, low), high)
+            here = np.uintp(y) * row + np.uintp(x) * column
+            if channels == 3:  # written out, so that they are taken at once
+                for c in range(np.uintp(3)):
+                    result[here + c] = _sample_bicubic(flat, c, columns, rows, wx, wy)
+            else:
+                for c in range(column):
+                    result[here + c] = _sample_bicubic(flat, c, columns, rows, wx, wy)
 
 
 _KERNELS: dict[str, Callable[..., None]] = {"nearest": _nearest, "bilinear": _bilinear, "bicubic": _bicubic}

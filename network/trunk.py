@@ -30,6 +30,7 @@ from torch.nn import functional
 
 from network.convolution import can_fuse, convolve
 from network.enlarged import Taps, add_taps, can_enlarge, convolve_enlarged
+from network.fused import can_end, convolve_to_picture
 
 #: Channels of the convolutions at each scale of the encoder, finest first.
 ENCODERS: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -203,6 +204,8 @@ class Trunk(nn.Module):
 
     def finish(self, x: Tensor) -> Tensor:
         """The picture, ``(N, 3, H, W)``, of the features of the finest scale; not rounded by any autocast."""
+        if can_end(x):
+            return convolve_to_picture(x, self.last.weight, cast(Tensor, self.last.bias))
         with torch.autocast(x.device.type, enabled=False):
             return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
 

@@ -1,4 +1,4 @@
-"""The Robust Average block in one pass gives what torch gives."""
+"""What is made in one pass is what torch gives."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
@@ -84,3 +84,27 @@ def test_the_order_is_that_of_the_block() -> None:
         wrong = fused.blend_channels(x, 5, range(5), weight, range(5))
         torch.testing.assert_close(block(x, 5), right)
     assert float((right - wrong).abs().max()) > 0.01
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("count", "channels", "height", "width"), [(1, 32, 9, 21), (2, 64, 2, 1), (3, 5, 1, 7)])
+def test_the_last_convolution(count: int, channels: int, height: int, width: int, dtype: torch.dtype) -> None:
+    torch.manual_seed(0)
+    layer = torch.nn.Conv2d(channels, 3, 3, padding=1)
+    x = torch.randn(count, channels, height, width).to(dtype)
+    wanted = layer(x.float()).detach()
+    assert not fused.can_end(x)  # with gradients: torch
+    with torch.no_grad():
+        assert fused.can_end(x)
+        found = fused.convolve_to_picture(x.to(memory_format=torch.channels_last), layer.weight, layer.bias)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
+
+
+def test_what_is_not_finite_stays_where_the_last_convolution_sees_it() -> None:
+    x = torch.zeros(1, 4, 8, 8)
+    x[0, 2, 3, 4] = torch.nan
+    with torch.no_grad():
+        found = fused.convolve_to_picture(x, torch.ones(3, 4, 3, 3), torch.ones(3))
+    assert torch.isnan(found[0, :, 2:5, 3:6]).all()
+    assert torch.isfinite(found).sum() == 3 * (64 - 9)
