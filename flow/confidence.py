@@ -102,11 +102,10 @@ def _agree(
                 place = locate(np.float32(x) + u, np.float32(first_row + y) + v, width, height)
                 weights = weigh(place)
                 # Sundaram's test: there and back ends near the start.
-                error = np.hypot(
-                    interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
-                )
+                du, dv = interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
+                error = np.sqrt(du * du + dv * dv)
                 # The loop is f + r, so r at the arrival is about -f within the error: |r| is |f| + error at most.
-                length = np.hypot(u, v)
+                length = np.sqrt(u * u + v * v)
                 bound = np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
                 if not error**2 < bound:
                     continue
