@@ -164,9 +164,8 @@ def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, 
     return value
 
 
-# A product and a sum may be one operation. Unsigned: of a signed index numba asks each time whether it counts from the
-# end. Together they halve the time.
-@njit(nogil=True, cache=True, fastmath={"contract"})
+# Unsigned: of a signed index numba asks each time whether it counts from the end.
+@njit(nogil=True, cache=True)
 def _bicubic(
     first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
 ) -> None:

@@ -94,10 +94,9 @@ def convolve_to_picture(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ``(N, 3, H, W)`` float32, channels last; features beyond the borders count as 0.
     """
     given = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
-    count, height, width, channels = given.shape
+    count, height, width, _ = given.shape
     result = torch.empty(count, height, width, 3)
-    # Of each row of the kernel and each color the taps as they lie along a row of features.
-    taps = weight.detach().permute(2, 0, 3, 1).reshape(3, 3, 3 * channels).contiguous().numpy()
+    taps = weight.detach().contiguous().numpy()
     for features, picture in zip(_bits(given).reshape(count, height, -1), result.numpy(), strict=True):
         on_all_cores(_convolve_to_picture, height, features, taps, bias.detach().numpy(), picture)
     return result.permute(0, 3, 1, 2)
@@ -180,8 +179,27 @@ def _blend(
                 _narrow(result[n, y][part], bits[kept[n]], low)
 
 
-# Sums may be taken in any order, which is what vectors need.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+# Every channel of a row comes to lie by itself, so that the sums run over pixels side by side, each in its own order.
+@njit(nogil=True)
+def _spread(bits: Any, given: Any, low: Any) -> None:
+    channels, width = len(bits), bits.shape[1] - 2
+    for x in range(width):
+        pixel = given[x * channels : (x + 1) * channels]
+        for c in range(channels):
+            bits[c, x + 1] = np.uint32(pixel[c]) << low
+
+
+@njit(nogil=True)
+def _add_taps(sums: Any, above: Any, own: Any, below: Any, taps: Any) -> None:
+    a0, a1, a2, o0, o1, o2, b0, b1, b2 = taps
+    for x in range(np.uintp(len(sums))):  # unsigned: of a signed index numba asks whether it counts from the end
+        after, beyond = x + np.uintp(1), x + np.uintp(2)
+        upper = a0 * above[x] + a1 * above[after] + a2 * above[beyond]
+        middle = o0 * own[x] + o1 * own[after] + o2 * own[beyond]
+        sums[x] += upper + middle + (b0 * below[x] + b1 * below[after] + b2 * below[beyond])
+
+
+@njit(cache=True, nogil=True)
 def _convolve_to_picture(
     first: int, stop: int, given: NDArray[Any], taps: NDArray[np.float32], bias: NDArray[np.float32],
     picture: NDArray[np.float32],
@@ -190,28 +208,22 @@ def _convolve_to_picture(
     width = picture.shape[1]
     channels, low = row // width, np.uint32(32 - 8 * given.itemsize)
     # Three rows at a time, widened, with a pixel of nothing before and after.
-    bits = np.zeros((3, row + 2 * channels), np.uint32)
+    bits = np.zeros((3, channels, width + 2), np.uint32)
     rows = bits.view(np.float32)
-    # Of each color the taps on the row above, the own and the one below: vectors need rows that are known to be whole.
-    ra, ro, rb = taps[0, 0], taps[1, 0], taps[2, 0]
-    ga, go, gb = taps[0, 1], taps[1, 1], taps[2, 1]
-    ba, bo, bb = taps[0, 2], taps[1, 2], taps[2, 2]
+    sums = np.empty((3, width), np.float32)
     for y in range(max(first - 1, 0), first + 1):
-        _widen(bits[y % 3][channels : channels + row], given[y], low)
+        _spread(bits[y % 3], given[y], low)
     for y in range(first, stop):
-        following = bits[(y + 1) % 3]
         if y + 1 < height:
-            _widen(following[channels : channels + row], given[y + 1], low)
+            _spread(bits[(y + 1) % 3], given[y + 1], low)
         else:
-            following[:] = 0
+            bits[(y + 1) % 3] = 0
         above, own, below = rows[(y - 1) % 3], rows[y % 3], rows[(y + 1) % 3]
+        for color in range(3):
+            sums[color] = bias[color]
+            for c in range(channels):
+                t = taps[color, c]
+                nine = t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2], t[2, 0], t[2, 1], t[2, 2]
+                _add_taps(sums[color], above[c], own[c], below[c], nine)
         for x in range(width):
-            # Unsigned: of a signed index numba asks each time whether it counts from the end.
-            start = np.uintp(x) * np.uintp(channels)
-            red, green, blue = bias[0], bias[1], bias[2]
-            for k in range(np.uintp(3 * channels)):
-                a, o, b = above[start + k], own[start + k], below[start + k]
-                red += a * ra[k] + o * ro[k] + b * rb[k]
-                green += a * ga[k] + o * go[k] + b * gb[k]
-                blue += a * ba[k] + o * bo[k] + b * bb[k]
-            picture[y, x, 0], picture[y, x, 1], picture[y, x, 2] = red, green, blue
+            picture[y, x, 0], picture[y, x, 1], picture[y, x, 2] = sums[0, x], sums[1, x], sums[2, x]
