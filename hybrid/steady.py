@@ -98,7 +98,8 @@ class Pictures:
     confidence of their comparison (`Aligner.align_pictures`), 1 for the frame itself, the picture of t is
     Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1. No pixel changes by more than a factor of two. Where light drifts
     (`nlm.drift`), or where nothing could tell (windows of three frames, or without estimates), nothing is put into
-    another light, and c is a half at most.
+    another light, and c is a half at most. Where the light of a whole frame drifts nothing is averaged: c is multiplied
+    by how much of it stands still, from 0 (a fifth) to 1 (two fifths).
     """
 
     def __init__(

@@ -154,7 +154,7 @@ EstimateOption = Annotated[
         metavar="SOURCE",
         callback=check_estimate,
         help="denoised single frames to start from: auto (in the file, else OIDN if installed, else bundled), oidn, "
-        "oidn-fast, oidn-clean, oidn-best, bundled (a small network that comes with ravg), nlm (without one), none, "
+        "oidn-fast, oidn-clean, oidn-best, bundled (a network that comes with ravg), nlm (without one), none, "
         "or a finished sequence, OTHER.####.exr",
         rich_help_panel=WHAT,
     ),

@@ -142,6 +142,30 @@ def test_moving_shadows_are_not_averaged(tmp_path, monkeypatch):
     assert seen < 0.5 * error()
 
 
+@pytest.mark.parametrize("step", [0, 2])
+def test_where_the_light_of_the_whole_frame_drifts_no_finished_picture_is_averaged(tmp_path, step):
+    """Samples tell the drift in places alone: between them it was averaged."""
+    scene = replace(STILL, height=96, width=160, noise=0.3)
+
+    def waves(index):
+        phase = 2 * np.pi * (np.arange(160) - step * index) / 60
+        return (0.7 + 0.2 * np.sin(phase))[None, :, None].astype(np.float32)
+
+    def shade(index, layers):
+        layers["ViewLayer.Combined"] = (layers["ViewLayer.Combined"] * waves(index)).astype(np.float32)
+
+    shot = open_shot(scene.write(tmp_path, edit=shade))
+    lit = {n: truth(scene, n)[..., :3] * waves(n - scene.first) for n in shot.numbers}
+    maker = pictures(shot, lambda aligned: Denoised(lit[aligned.number]), estimates=OfFrames(lambda f: lit[f.number]))
+    maker.make(MIDDLE)
+    _, confidence, _ = maker.aligner.align_pictures(MIDDLE, lit)
+    assert np.all(confidence[1] == 1)
+    if step:
+        assert np.all(confidence[[0, 2]] == 0)
+    else:
+        assert confidence[[0, 2]].mean() > 0.8
+
+
 def test_what_shows_another_light_is_left_out(tmp_path):
     def flare(index, layers):
         if index == 3:
