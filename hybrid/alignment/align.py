@@ -200,10 +200,11 @@ class Aligner:
             # bundled shot with its chrome that is worth 0.4 dB.
             gates = color_gates(light, noisy, exposure, FINISHED)
             alike, confidence = (trust_light(confidence, seen, gate, stages, agreeing=0.0) for gate in gates)
-            still = self._stillness(number, outer)
+            still, enough = self._stillness(number)
+            still = still[outer]
             confidence = alike + still * (confidence - alike)
             relight(window, alike, confidence, exposure, first_row=outer.start)
-            confidence[[0, 2]] *= self._standing(number) * (1 + still) / 2
+            confidence[[0, 2]] *= enough * (1 + still) / 2
         return window, confidence, inner
 
     def comparable(self, number: int) -> list[int]:
@@ -282,20 +283,20 @@ class Aligner:
         first, second, _, fourth, fifth = (self._link(number, n) for n in self.frames.around(number, 2))
         return None not in (first, second) or None not in (fourth, fifth)
 
-    def _stillness(self, number: int, rows: slice) -> Array:
-        """How far the light of a frame stands still, (h, W) in [0, 1]: 1 where it does, 0 where nothing can tell."""
-        if number not in self._drift:
-            return np.zeros((rows.stop - rows.start, self.shot.shape[1]), np.float32)
-        return np.asarray(1 / (1 + DRIFTED * (1 / self._drift[number][rows] - 1)), np.float32)
+    def _stillness(self, number: int) -> tuple[Array, np.float32]:
+        """How far the light of a frame stands still, (H, W) in [0, 1], and whether enough of it does, in [0, 1].
 
-    def _standing(self, number: int) -> np.float32:
-        """Whether enough of a frame stands still to average finished pictures, in [0, 1]; 1 where nothing can tell."""
+        Where nothing can tell, 0 and 1.
+        """
         if number not in self._drift:
-            return np.float32(1)
+            return np.zeros(self.shot.shape, np.float32), np.float32(1)
+        still = np.reciprocal(self._drift[number])  # 1 / (1 + DRIFTED (1 / w − 1)), in place: frames are large
+        still *= np.float32(DRIFTED)
+        still += np.float32(1 - DRIFTED)
+        np.reciprocal(still, out=still)
         least, enough = STANDING
-        share = float(self._stillness(number, slice(None, self.shot.shape[0])).mean(dtype=np.float64))
-        t = min(max((share - least) / (enough - least), 0.0), 1.0)
-        return np.float32(t * t * (3 - 2 * t))
+        t = min(max((float(still.mean()) - least) / (enough - least), 0.0), 1.0)
+        return still, np.float32(t * t * (3 - 2 * t))
 
     def _lit(self, number: int) -> PreparedFrame:
         """Of the window around a frame the nearest one to it that shows anything."""
