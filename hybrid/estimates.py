@@ -42,7 +42,7 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
 SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
 # What "auto" takes of them for a preset of the network, which looks at the samples again: what the first look is
 # matters little. With "oidn" `fast`, which keeps half of it, gains 0.2 dB, and 0.2 in time, on eight validation shots,
-# and takes 1.56 times OIDN's high mode where 1.5 is the bound; the two others gain next to nothing.
+# and takes 1.49 to 1.56 times OIDN's high mode where 1.5 is the bound; the two others gain next to nothing.
 MODE_OF = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
 
 
