@@ -19,7 +19,7 @@ from hybrid.commands.status import status
 from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt
-from hybrid.threads import let_waiting_threads_sleep
+from hybrid.threads import check_thread_counts, let_waiting_threads_sleep
 
 # Where numba looks for a folder for compiled loops: its own list, and after that ours.
 FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.compiled.Fallback"
@@ -77,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     try:
+        check_thread_counts()
         app(args=None if argv is None else list(argv), prog_name="ravg")
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0

@@ -24,7 +24,7 @@ SHARE = 0.92
 PREPARING, FILTERING = 14, 40
 # And while TV-L1 solves for a flow.
 REFINING = 45
-_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+_UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
 def parse_size(words: str) -> int:
@@ -33,13 +33,13 @@ def parse_size(words: str) -> int:
     Raises
     ------
     ValueError
-        If it is no size, nothing, or more than there is anywhere.
+        If it is no size, has no unit, is nothing, or more than there is anywhere.
     """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", words, re.IGNORECASE)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", words, re.IGNORECASE)
     size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
     if not 1 <= size < 2.0**63:
         shown = words if len(words) < 60 else f"{words[:56]}…"
-        raise ValueError(f"max-memory is {shown!r}, expected a size such as 8G or 500M")
+        raise ValueError(f"max-memory is {shown!r}, expected a size with its unit, such as 8G or 500M")
     return int(size)
 
 

@@ -12,6 +12,31 @@ import sys
 SPINS = 3000
 
 
+#: numba ends with a segmentation fault where it is to start a hundred thousand.
+MOST_THREADS = 1024
+
+
+def check_thread_counts() -> None:
+    """Refuse numbers of threads in the environment that the libraries warn about, ignore, or crash with.
+
+    OpenMP takes several, one for each level of nesting. An empty variable is removed: it asks for nothing.
+
+    Raises
+    ------
+    ValueError
+        If one is no whole number from 1 to `MOST_THREADS`; names the variable.
+    """
+    for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        said = os.environ.get(name, "")
+        if not said.strip():
+            os.environ.pop(name, None)
+            continue
+        for count in said.split(",") if name == "OMP_NUM_THREADS" else (said,):
+            text = count.strip()
+            if not (text.isdecimal() and len(text) < 9 and 1 <= int(text) <= MOST_THREADS):
+                raise ValueError(f"{name} is {said[:60]!r}, expected a number of threads from 1 to {MOST_THREADS}")
+
+
 def let_waiting_threads_sleep() -> None:
     """Let OpenMP's threads sleep where they wait long for each other, unless the environment says otherwise.
 

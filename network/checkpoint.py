@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, fields
@@ -151,7 +152,7 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
     path = Path(path)
     partial = new_partial(path)
     try:
-        save_file(tensors, partial, metadata)
+        write_tensors(partial, tensors, metadata)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
@@ -173,6 +174,16 @@ def new_partial(path: Path) -> Path:
     partial.unlink(missing_ok=True)
     os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     return partial
+
+
+def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
+    """Write tensors in place of an empty file of `new_partial`, with its mode.
+
+    safetensors replaces the file by one that only its owner may read, whatever the umask.
+    """
+    mode = stat.S_IMODE(path.stat().st_mode)
+    save_file(dict(tensors), path, dict(metadata))
+    path.chmod(mode)
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:

@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from network import losses
-from network.checkpoint import new_partial
+from network.checkpoint import new_partial, write_tensors
 from network.kernels import mean_of
 from network.losses import ImageLoss
 from network.train_config import SamplerConfig
@@ -294,7 +293,7 @@ def write_shards(
     def flush() -> None:
         path = new_partial(folder / f"{shot}.{len(partial):04d}.safetensors")
         metadata = {"format": FORMAT, "version": VERSION, "shot": shot, "samples": json.dumps(list(samples))}
-        save_file({name: torch.stack([clip[name] for clip in waiting]) for name in waiting[0]}, path, metadata)
+        write_tensors(path, {name: torch.stack([clip[name] for clip in waiting]) for name in waiting[0]}, metadata)
         partial.append(path)
         waiting.clear()
 

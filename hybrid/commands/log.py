@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from hybrid.streams import open_standard_streams
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bar
@@ -312,6 +314,7 @@ def duration(seconds: float) -> str:
 @contextmanager
 def lasting_streams() -> Iterator[None]:
     """Let the work go on where standard output or error is closed or knows only ASCII."""
+    open_standard_streams()
     before = sys.stdout, sys.stderr
     codecs.register_error("plain", _replace_sign)
     sys.stdout, sys.stderr = _Lasting.of(sys.stdout), _Lasting.of(sys.stderr)

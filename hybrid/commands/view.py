@@ -41,6 +41,8 @@ def view(
     for sequence in sequences[1:]:
         if not sequence.files():
             raise FileNotFoundError(f"no frames in {sequence.spec}")
+    for sequence in sequences:
+        sequence.check_sizes()
     with ViewServer(sequences, rate=fps, port=port) as server:
         typer.echo(f"{server.url}\nCtrl-C ends it")
         screen = sys.platform in ("darwin", "win32") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()

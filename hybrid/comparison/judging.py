@@ -28,7 +28,7 @@ from hybrid.comparison.metrics import (
     tone_map,
 )
 from hybrid.comparison.results import Statistic, summarize
-from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor
+from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
 from hybrid.files.frames import Frame, Shot
 from hybrid.plan import STILL
@@ -222,7 +222,7 @@ class Judge:
     ) -> tuple[float, str]:
         """The reference's part in the errors of `known`, and in words what is known of its noise."""
         if isinstance(self.store.load_reference(self.numbers[0]), tuple):
-            level = _level(np.mean([self._error_of_halves(number) for number in self.numbers]))
+            level = decibels(np.mean([self._error_of_halves(number) for number in self.numbers]))
             return 0.0, (
                 f"Two independent halves; their mean has a noise of {level} PSNR. PSNR, temporal PSNR "
                 "and relMSE are products of the errors against both, free of it; the others are taken against the mean."
@@ -236,7 +236,7 @@ class Judge:
         else:
             return 0.0, "One render; its noise is not known and counts as error of the methods."
         return floor, (
-            f"One render with a noise of {_level(floor)} PSNR, {source}. It counts as error of the methods and "
+            f"One render with a noise of {decibels(floor)} PSNR, {source}. It counts as error of the methods and "
             "compresses differences between those that come near it; it is taken off only for the worth in samples."
         )
 
@@ -253,10 +253,6 @@ def error_of(statistic: Statistic) -> float:
 
 def _mean_error(scores: Sequence[float]) -> float:
     return float(np.mean([float(10 ** (-score / 10)) for score in scores]))
-
-
-def _level(error: float | np.floating) -> str:
-    return f"{-10 * np.log10(error):.2f} dB" if error > 0 else "∞ dB"
 
 
 # What is made ready before any method is judged

@@ -13,6 +13,11 @@ from hybrid.files.exr import read_exr
 from hybrid.files.frames import Shot
 
 
+def decibels(error: float | np.floating) -> str:
+    """PSNR of a mean squared error, in words; ∞ where it is zero, or less as an unbiased estimate may be."""
+    return f"{-10 * math.log10(error):.2f} dB" if error > 0 else "∞ dB"
+
+
 @dataclass(frozen=True)
 class NoiseLaw:
     """Mean squared error of the noisy render, measured at some numbers of samples, and the law between and beyond.
@@ -61,7 +66,7 @@ class NoiseLaw:
 
     def describe(self) -> str:
         """Say in words where the figures come from, and whether the law holds."""
-        measured = ", ".join(f"{n:g}: {-10 * math.log10(e):.2f} dB" for n, e in self.levels)
+        measured = ", ".join(f"{n:g}: {decibels(e)}" for n, e in self.levels)
         if self.slope is None:
             return "By the 1/n law from the noisy render's own error; not checked, no other level was given."
         verdict = "as 1/n asks" if abs(self.slope + 1) < 0.1 else "not as 1/n, which is assumed beyond them"

@@ -9,6 +9,7 @@ unless the channel already starts with it, so that one scheme covers both kinds 
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import sys
@@ -26,6 +27,7 @@ import OpenEXR
 
 from hybrid.files.replace import refuse_other_kinds, replace_file
 from hybrid.files.strings import readable_copy, restore_strings, without_surrogates
+from hybrid.streams import open_standard_streams
 
 # 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
 # that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
@@ -391,8 +393,8 @@ def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> No
 class _Listener:
     """Stands in for sys.stdout and keeps what one thread writes; all else goes where it would have gone."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream or io.StringIO()  # None where the process was started without one
         self._thread = threading.get_ident()
         self.heard = ""
 
@@ -439,8 +441,9 @@ def _library_messages() -> Iterator[list[str]]:
     """
     global _own_stderr
     messages: list[str] = []
+    open_standard_streams()
     with _LIBRARY_LOCK, tempfile.TemporaryFile() as sink:
-        listener = _Listener(sys.stdout)
+        before, listener = sys.stdout, _Listener(sys.stdout)
         stderr = _own_stderr = os.dup(2)
         os.dup2(sink.fileno(), 2)
         sys.stdout = listener
@@ -448,7 +451,7 @@ def _library_messages() -> Iterator[list[str]]:
             yield messages
         finally:
             if sys.stdout is listener:
-                sys.stdout = listener._stream
+                sys.stdout = before
             os.dup2(stderr, 2)
             _own_stderr = None
             os.close(stderr)
@@ -456,7 +459,8 @@ def _library_messages() -> Iterator[list[str]]:
             printed = sink.readlines()
             for line in printed:
                 if b"(EXR_ERR" not in line:
-                    os.write(2, line)
+                    with suppress(OSError):  # its reader has gone
+                        os.write(2, line)
             # The first line of the C library says most precisely what is wrong.
             reasons = [
                 line.decode(errors="replace").partition("(EXR_ERR")[2].partition(") ")[2].strip()

@@ -194,14 +194,17 @@ class Shot:
         max_pixels: int = MAX_PIXELS,
     ) -> None:
         wanted = sorted(files) if frames is None else parse_frames(frames)
-        # Of the files alone, or a frame would be another with other frames asked for: as it is in a chunk.
-        self.step = math.gcd(*(b - a for a, b in pairwise(sorted(files)))) or 1
         self.numbers = tuple(number for number in wanted if number in files)
         self.warnings: list[str] = []
         self.picture = ""
         if not self.numbers:
             folder = next(iter(files.values())).parent
             raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
+        if stale := _of_another_size({n: files[n] for n in files.keys() - wanted}, files[self.numbers[0]]):
+            files = {number: path for number, path in files.items() if number not in stale}
+            self.warnings.append(f"frames {format_frames(stale)} differ in size from those asked for: left out")
+        # Of the files alone, or a frame would be another with other frames asked for: as it is in a chunk.
+        self.step = math.gcd(*(b - a for a, b in pairwise(sorted(files)))) or 1
         self.missing = tuple(asked := [number for number in wanted if number not in files])
         if missing := format_frames(asked) if asked else name_holes(files, self.step) if frames is None else "":
             self.warnings.append(f"missing frames {missing}: the windows beside them are narrower")
@@ -624,7 +627,14 @@ class Shot:
                 if _size(home) == size:
                     boxes.append(_data_window(home))
         lefts, tops, rights, bottoms = zip(*boxes, strict=True)
-        return min(lefts), min(tops), max(rights), max(bottoms)
+        left, top, right, bottom = min(lefts), min(tops), max(rights), max(bottoms)
+        width, height = right - left + 1, bottom - top + 1
+        if width * height > self._max_pixels:
+            raise ExrError(
+                f"{self._files[min(self._files)].parent}: the data windows of all frames lie within {width}x{height} "
+                f"pixels, more than the {self._max_pixels} accepted"
+            )
+        return left, top, right, bottom
 
 
 def open_shot(
@@ -762,6 +772,22 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
     if shot.reads(path):
         raise ValueError(f"output {str(path)!r} would overwrite an input frame")
     return path
+
+
+def _of_another_size(files: Mapping[int, Path], first: Path) -> list[int]:
+    """The numbers of the files whose display window is not of the size of the first one's; from headers."""
+    if not files:
+        return []
+    expected = _size_of(first)
+    sizes = {number: _size_of(path) for number, path in sorted(files.items())}
+    return [number for number, size in sizes.items() if None not in (size, expected) and size != expected]
+
+
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """The size of a file's display window; None where it cannot be read, which is an error when its turn comes."""
+    with suppress(ExrError, OSError):
+        return _size(read_exr(path, pixels=False, max_pixels=2**62).parts[0])  # whatever its size
+    return None
 
 
 def _size(part: Part) -> tuple[int, int]:

@@ -162,12 +162,13 @@ def read_profile(path: str | Path) -> Profile:
     OSError
         If there is no such file.
     ValueError
-        If it is no TOML, or has a key, a role or a value that profiles do not have; names the file.
+        If it is no TOML, is nested too deeply, or has a key, a role or a value that profiles do not have; names the
+        file.
     """
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: not a profile: {error}") from None
     try:
         return _profile(path.stem, table)

@@ -162,7 +162,7 @@ def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
     try:
         meta: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         there = meta["shot"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: expected what ravg simulate writes, got {error!r}") from error
     for name, value in asked.items():
         # More frames may be asked for; the ones there were rendered with the plan that is there.

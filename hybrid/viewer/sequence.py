@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, read_exr
+from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
 from hybrid.files.pictures import encode_srgb
 from hybrid.files.profile import find_profile
@@ -29,6 +29,8 @@ Picture = NDArray[np.uint8]
 
 # Layers of frames that were looked at lately, so that another exposure is a matter of milliseconds.
 KEPT_BYTES = 512 * 2**20
+# Of a JPEG, pixels.
+LARGEST_SIDE = 65500
 
 
 class Sequence:
@@ -78,6 +80,21 @@ class Sequence:
         first = taken.target if self.finished else taken.color
         return [_name(layer) for layer in image.layers], _name(first)
 
+    def check_sizes(self) -> None:
+        """Refuse a sequence whose frames are too large to be shown; from the header of the first.
+
+        Raises
+        ------
+        ExrError
+            If the display window is larger than what can be shown.
+        """
+        for path in list(self.files().values())[:1]:
+            try:
+                image = read_exr(path, pixels=False)
+            except (OSError, ExrError):  # not whole yet
+                continue
+            _refuse_large_display(image)
+
     def exposure(self, number: int) -> float:
         """What the color of a frame is divided by for a mean of 0.18."""
         image = read_exr(self._path(number))
@@ -118,10 +135,11 @@ class Sequence:
             pixels = self._kept.get(key)
         image = read_exr(path, pixels=pixels is None)
         layer = {_name(layer): layer for layer in image.layers}[name]
+        _refuse_large_display(image)
         if pixels is None:
-            pixels = _on_display_window(image, layer)
+            pixels = image.pixels(layer.channels)
             self._keep(key, pixels)
-        return self._encode(pixels, layer, _layers(image), gain, ev)
+        return _on_display_window(self._encode(pixels, layer, _layers(image), gain, ev), image.parts[layer.part])
 
     def facts(self, number: int) -> dict[str, Any]:
         """What a frame's header says of its making, and the mean weight of each frame of its window, if it has them."""
@@ -130,7 +148,8 @@ class Sequence:
         header = image.parts[0].header
         own = {key: value for key, value in header.items() if key.startswith("ravg/") and key != MADE_FROM}
         made = {key.removeprefix("ravg/"): str(value) for key, value in own.items()}
-        with suppress(ValueError, AttributeError):  # options that were given stand in a header by themselves, as JSON
+        # Options that were given stand in a header by themselves, as JSON.
+        with suppress(ValueError, AttributeError, RecursionError):
             settings = json.loads(made.get("settings", "{}")).items()
             made = {name: value for name, value in made.items() if name != "settings"}
             made |= {name: str(value) for name, value in settings if value not in (None, False)}
@@ -214,18 +233,29 @@ def _name(layer: Layer) -> str:
     return layer.name or "RGBA"
 
 
-def _on_display_window(image: ExrImage, layer: Layer) -> NDArray[np.float32]:
-    part = image.parts[layer.part]
+def _refuse_large_display(image: ExrImage) -> None:
+    """Raise ExrError for a picture that is too large to be shown, however few of its pixels are stored."""
+    for part in image.parts:
+        left, top, right, bottom = part.display_window
+        width, height = right - left + 1, bottom - top + 1
+        if max(width, height) > LARGEST_SIDE or width * height > MAX_PIXELS:
+            raise ExrError(
+                f"{image.path}: display window of {width}x{height} pixels, expected sides up to {LARGEST_SIDE} and "
+                f"{MAX_PIXELS} pixels"
+            )
+
+
+def _on_display_window(picture: Picture, part: Part) -> Picture:
+    """A picture of the data window, cut or surrounded with black to the display window."""
     left, top, right, bottom = part.display_window
     x, y, last_x, last_y = part.data_window
-    pixels = image.pixels(layer.channels)
     if (left, top, right, bottom) == (x, y, last_x, last_y):
-        return pixels
-    shown = np.zeros((bottom - top + 1, right - left + 1, pixels.shape[2]), np.float32)
+        return picture
+    shown = np.zeros((bottom - top + 1, right - left + 1, 3), np.uint8)
     rows = slice(max(top, y), min(bottom, last_y) + 1)
     columns = slice(max(left, x), min(right, last_x) + 1)
     if rows.start < rows.stop and columns.start < columns.stop:
-        cut = pixels[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
+        cut = picture[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
         shown[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = cut
     return shown
 

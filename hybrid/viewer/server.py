@@ -140,6 +140,8 @@ class _Handler(BaseHTTPRequestHandler):
             # A damaged file is one that the page may ask for again: it may not be whole yet.
             code = 409 if isinstance(error, ExrError) else 404
             self._answer(code, "text/plain; charset=utf-8", str(error).encode())
+        except MemoryError as error:
+            self._answer(507, "text/plain; charset=utf-8", f"not enough memory: {error}".encode())
         except OSError as error:
             self._answer(409, "text/plain; charset=utf-8", str(error).encode())
         else:

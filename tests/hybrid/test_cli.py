@@ -331,6 +331,7 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["pseudoref", "SHOT", "-o", "OUT", "--estimate", "best"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "much"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "0"],
+        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "8"],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "9" * 400],
         ["pseudoref", "SHOT", "-o", "OUT", "--max-pixels", "0"],
         ["pseudoref", "SHOT", "-o", ""],

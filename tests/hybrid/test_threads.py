@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from hybrid.cli import main
-from hybrid.threads import SPINS
+from hybrid.threads import SPINS, check_thread_counts
 
 VARIABLES = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"
 
@@ -59,3 +59,22 @@ def test_numba_is_not_asked_for_more_than_it_started_with():
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     assert done.stdout.split() == ["2"]
+
+
+@pytest.mark.parametrize("name", ["NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"])
+@pytest.mark.parametrize("count", ["abc", "0", "-1", "1.5", "100000", "4,x", "9" * 5000])
+def test_numbers_of_threads_that_are_none_are_one_line(name, count, shot_folder, monkeypatch, capsys):
+    """Of numba came a traceback in a warning, a segmentation fault, or a line that did not name the variable."""
+    monkeypatch.setenv(name, count)
+    assert main(["inspect", str(shot_folder)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith(f"error: {name} is ")
+
+
+def test_numbers_of_threads_that_the_libraries_take_are_left_alone(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "4, 2")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", " ")
+    check_thread_counts()
+    assert os.environ["OMP_NUM_THREADS"] == "4, 2"
+    assert "NUMBA_NUM_THREADS" not in os.environ

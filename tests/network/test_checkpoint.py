@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -105,3 +107,15 @@ def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path)
     assert sorted(item.name for item in tmp_path.iterdir()) == ["precious", "w.safetensors"]
     with pytest.raises(OSError, match="is there and no file"):
         save_model(tmp_path, make_model())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+@pytest.mark.parametrize("mask", [0o022, 0o027])
+def test_weights_have_the_mode_that_the_umask_gives(tmp_path: Path, mask: int) -> None:
+    """safetensors writes files that only their owner may read."""
+    before = os.umask(mask)
+    try:
+        save_model(tmp_path / "w.safetensors", make_model())
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o666 & ~mask

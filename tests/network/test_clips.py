@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -151,6 +153,16 @@ def test_fireflies_beyond_a_half_are_stored_as_its_largest(tmp_path: Path) -> No
     write_shards(tmp_path, "s", SPP, [clip])
     values = open_clips(tmp_path).read(0, 0, (1, "noisy"))
     assert float(values["color"].max()) == 65504
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_clips_have_the_mode_that_the_umask_gives(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        [path] = write_shards(tmp_path, "s", SPP, [make_clip()])
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
 
 
 def test_of_longer_windows_the_middle_is_taken(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import pytest
 
 from hybrid.cli import main
@@ -50,3 +52,12 @@ def test_two_sequences_in_one_folder_are_told_apart_by_the_user(shot_folder, cap
     (shot_folder / "other.1001.exr").write_bytes((shot_folder / "shot.1001.exr").read_bytes())
     assert main(["view", str(shot_folder)]) == 1
     assert "several sequences" in capsys.readouterr().err
+
+
+def test_frames_that_are_too_large_to_be_shown_end_it_in_one_line(tmp_path, capsys):
+    window = {"dataWindow": ((0, 0), (1, 1)), "displayWindow": ((0, 0), (59999, 59999))}
+    plane = np.ones((2, 2), np.float32)
+    header = {**window, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, dict.fromkeys("RGB", plane)).write(str(tmp_path / "a.1.exr"))
+    assert main(["view", str(tmp_path), "--no-browser"]) == 1
+    assert len(capsys.readouterr().err.splitlines()) == 1

@@ -28,6 +28,12 @@ def test_by_the_law_worth_is_the_ratio_of_errors() -> None:
     assert "not checked" in law.describe()
 
 
+def test_a_render_without_error_is_described() -> None:
+    """A shot that was compared with itself ended in "math domain error"."""
+    assert "not checked" in NoiseLaw(((8, 0.0),), samples=8).describe()
+    assert "8: ∞ dB, 32: 14.00 dB" in NoiseLaw(((8, 0.0), (32, 10**-1.4), (64, 10**-1.7)), samples=8).describe()
+
+
 def test_levels_are_met_exactly_and_the_law_goes_on_beyond() -> None:
     # Between 8 and 32 the error falls as n^-0.5 only.
     law = NoiseLaw(((8, 0.04), (32, 0.02)), samples=8)

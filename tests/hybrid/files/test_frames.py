@@ -242,6 +242,36 @@ def test_frames_of_other_sizes_are_an_error_that_names_both(tmp_path):
         shot.read(3)
 
 
+@pytest.mark.parametrize("stale", [3, 4, 100])
+def test_a_frame_of_another_size_outside_the_range_changes_nothing(tmp_path, stale):
+    """It stopped the run as a neighbour, and shortened the step."""
+    numbers = [number for number in (1, 3, 5, 7) if number != stale]
+    save(tmp_path, [stale], size=(8, 8))
+    shot = open_shot(save(tmp_path, numbers), frames="5-7")
+    assert shot.step == 2
+    assert list(shot.available) == numbers
+    assert [shot.read(number).color[0, 0, 0] for number in shot.near(5, 2)] == numbers
+    assert f"frames {stale} differ in size from those asked for: left out" in shot.warnings
+
+
+def test_frames_asked_for_must_be_of_one_size_still(tmp_path):
+    save(tmp_path, [2], size=(8, 8))
+    shot = open_shot(save(tmp_path, [1, 3]), frames="1-3")
+    with pytest.raises(ValueError, match="frames differ in size: frame 1 is 6x4, frame 2 is 8x8"):
+        shot.read(2)
+
+
+def test_data_windows_that_lie_far_apart_are_refused_before_memory_is_taken(tmp_path):
+    """Two files of 24 pixels asked for 4.5 GiB."""
+    for number, at in ((1, 0), (2, 30000)):
+        header = {"dataWindow": ((at, at), (at + 5, at + 3)), "displayWindow": ((0, 0), (5, 3))}
+        OpenEXR.File({**header, "compression": OpenEXR.ZIP_COMPRESSION}, {c: image(1)[..., 0] for c in "RGB"}).write(
+            str(tmp_path / f"shot.{number:04d}.exr")
+        )
+    with pytest.raises(ExrError, match=r"data windows of all frames lie within 30006x30004 pixels, more than the \d+"):
+        open_shot(tmp_path).read(1)
+
+
 def test_missing_frame_cannot_be_read(tmp_path):
     shot = open_shot(save(tmp_path, [1, 3, 4]))
     assert [shot.has(number) for number in (1, 2)] == [True, False]

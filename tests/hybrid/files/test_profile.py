@@ -215,6 +215,7 @@ def test_the_users_folder_is_the_usual_one(monkeypatch):
     ("text", "message"),
     [
         ("name = ", "not a profile"),
+        ("name = " + 20000 * "[", "not a profile"),
         ("colour = 1", "profile has 'colour', expected some of name, found, layers"),
         ("layers = 3", r"layers is 3, expected a table, \[layers\]"),
         ('[layers]\ncolour = ["a"]', r"\[layers\] has 'colour', expected some of affixes, color"),

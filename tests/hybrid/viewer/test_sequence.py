@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from hybrid.files.exr import read_exr, write_layers
+from hybrid.files.exr import ExrError, read_exr, write_layers
 from hybrid.files.pictures import encode_srgb
 from hybrid.records import Record
 from hybrid.timing import Timings
@@ -111,6 +111,29 @@ def test_another_data_window_lies_where_it_belongs(tmp_path):
     expected = np.zeros((4, 4))
     expected[1:, 2:] = ramp[:, :2]
     np.testing.assert_allclose(shown, level(expected), atol=1)
+
+
+def test_around_the_data_is_black_whatever_zero_is_shown_as(tmp_path):
+    header = {"dataWindow": ((1, 1), (2, 2)), "displayWindow": ((0, 0), (3, 3)), "compression": OpenEXR.ZIP_COMPRESSION}
+    plane = np.zeros((2, 2), np.float32)
+    channels = {"R": plane, "G": plane, "B": plane, "vector.X": plane, "vector.Y": plane}
+    OpenEXR.File(header, channels).write(str(tmp_path / "a.1.exr"))
+    shown = Sequence(str(tmp_path), finished=False).picture(1, "vector", 1, 0)
+    assert set(shown[1:3, 1:3].ravel()) <= {127, 128}
+    shown[1:3, 1:3] = 0
+    assert shown.max() == 0
+
+
+@pytest.mark.parametrize("side", [60000, 65501])
+def test_a_display_window_that_cannot_be_shown_is_refused_before_memory_is_taken(tmp_path, side):
+    """A file of 4 pixels asked for 40 GiB."""
+    size = (side - 1, 59999 if side == 60000 else 1)
+    header = {"dataWindow": ((0, 0), (1, 1)), "displayWindow": ((0, 0), size), "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {c: np.ones((2, 2), np.float32) for c in "RGB"}).write(str(tmp_path / "a.1.exr"))
+    watched = Sequence(str(tmp_path), finished=False)
+    for ask in (watched.check_sizes, lambda: watched.picture(1, "RGBA", 1, 0)):
+        with pytest.raises(ExrError, match=rf"a\.1\.exr: display window of {side}x\d+ pixels, expected sides up to"):
+            ask()
 
 
 def test_a_replaced_file_is_read_anew(tmp_path):
