@@ -11,6 +11,7 @@ for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,14 @@ from tests.scenes import Scene
 def shot_folder(tmp_path: Path) -> Path:
     """Three noisy frames on disk."""
     return Scene().write(tmp_path / "noisy")
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """Processes that are started meanwhile do not ignore SIGINT, as those of a job in the background would."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")

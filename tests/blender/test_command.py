@@ -115,6 +115,7 @@ def test_letters_of_all_kinds_reach_the_log(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+@pytest.mark.usefixtures("interrupts")
 def test_stopping_is_heard_as_ctrl_c(tmp_path):
     ready = tmp_path / "ready"
     code = f"""

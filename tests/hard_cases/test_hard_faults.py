@@ -218,6 +218,7 @@ except KeyboardInterrupt:  # it came before that code did; the command ends with
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("interrupts")
 def test_a_stop_is_heard_in_the_midst_of_compiled_code(tmp_path, number):
     words = [sys.executable, "-c", BUSY, str(tmp_path / "frame.exr")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
@@ -247,6 +248,7 @@ with interruptible(lambda: print("2 of 5", file=sys.stderr, flush=True)):
 
 
 @pytest.mark.parametrize("seconds", [0.5, 600])
+@pytest.mark.usefixtures("interrupts")
 def test_the_report_of_a_stop_is_seen_while_a_file_is_read_beside_the_work(seconds):
     """Messages of the library for files are listened for on the descriptor that the report goes to."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}

@@ -49,6 +49,7 @@ def test_in_a_shell(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.neural
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+@pytest.mark.usefixtures("interrupts")
 def test_looking_at_a_shot(tmp_path, monkeypatch, capsys):
     pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)

@@ -172,6 +172,7 @@ def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
     assert {f"shot.{number}.exr" for number in range(1001, 1005)} <= contents(out).keys()
 
 
+@pytest.mark.usefixtures("interrupts")
 def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_path):
     out = tmp_path / "out"
     words = ["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "1"]

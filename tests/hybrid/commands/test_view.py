@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+@pytest.mark.usefixtures("interrupts")
 def test_it_serves_until_ctrl_c(tmp_path):
     """The result may be empty: it is watched while it is being made."""
     noisy = Scene().write(tmp_path / "noisy")
