@@ -15,18 +15,27 @@ CLASSES = (
     operators.AddToCompositor,
     panel.OutputPanel,
 )
+HANDLERS = (
+    ("load_pre", jobs.stop_current),
+    ("load_post", jobs.give_back_all),
+    ("render_init", jobs.protect),
+    ("render_complete", jobs.protected),
+    ("render_cancel", jobs.protected),
+)
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.ravg = bpy.props.PointerProperty(type=settings.SceneSettings)
-    bpy.app.handlers.load_pre.append(jobs.stop_current)
+    for name, handler in HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
     jobs.stop_current()
-    bpy.app.handlers.load_pre.remove(jobs.stop_current)
+    for name, handler in HANDLERS:
+        getattr(bpy.app.handlers, name).remove(handler)
     del bpy.types.Scene.ravg
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -5,18 +5,22 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-# How long `ravg` may take to clean up after it was asked to stop, seconds; it needs about one.
-PATIENCE = 10.0
+# Seconds after the request to stop: `ravg` needs about one. A version that does not watch its input is terminated, and
+# a process that does not end is killed.
+TERMINATED_AFTER = 3.0
+KILLED_AFTER = 10.0
 # The log is shown as plain text: no colors, no wrapped lines, UTF-8 on every system.
 _PLAIN = {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "160", "PYTHONIOENCODING": "utf-8", "PYTHONUNBUFFERED": "1"}
+# `ravg` stops as on Ctrl-C when its standard input closes: Windows has no signal for a process without a console.
+_STOPPABLE = {"RAVG_STOP_WITH_STDIN": "1"}
 
 
 def find_command(named: str) -> str:
@@ -58,14 +62,14 @@ class Run:
         self._stopped_at: float | None = None
         own: dict[str, Any] = {"start_new_session": True}  # Ctrl-C in Blender's terminal is Blender's
         if sys.platform == "win32":
-            own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+            own = {"creationflags": subprocess.CREATE_NO_WINDOW}
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
                 list(arguments),
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **_PLAIN},
+                env={**os.environ, **_PLAIN, **_STOPPABLE},
                 **own,
             )
 
@@ -86,17 +90,23 @@ class Run:
 
     @property
     def code(self) -> int | None:
-        """The exit code; None while it runs. One that was asked to stop and does not is killed in time."""
+        """The exit code; None while it runs. A process that was asked to stop and does not is killed in time."""
         code = self._process.poll()
-        if code is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > PATIENCE:
-            self._process.kill()
+        if code is None and self._stopped_at is not None:
+            waited = time.monotonic() - self._stopped_at
+            with suppress(OSError):  # it may have ended meanwhile
+                if waited > KILLED_AFTER:
+                    self._process.kill()
+                elif waited > TERMINATED_AFTER:
+                    self._process.terminate()
         return code
 
     def stop(self) -> None:
         """Ask it to stop; finished frames stay."""
         if self._stopped_at is None and self._process.poll() is None:
             self._stopped_at = time.monotonic()
-            self._process.send_signal(signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT)
+            with suppress(OSError):
+                self._process.stdin.close()
 
     def wait(self) -> int:
         """Wait for its end and return the exit code."""
@@ -124,8 +134,9 @@ class Run:
     @property
     def error(self) -> str:
         """Why it has failed, in one line: its own, else the last that it has printed."""
-        lines = [line.strip(" │╭╮╰╯─") for line in self.log.splitlines()]  # usage errors stand in a frame
-        lines = [line for line in lines if line]
+        # Usage errors are drawn in a frame: of box characters, or of + - | where the system has none.
+        lines = [line.strip(" │╭╮╰╯─┌┐└┘|+") for line in self.log.splitlines()]
+        lines = [line for line in lines if line.strip("-")]
         errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
         return (errors or lines or [f"ravg ended with code {self.code}"])[-1]
 

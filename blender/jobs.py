@@ -5,12 +5,13 @@ A timer follows it, and no modal operator: Blender does not save automatically w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from . import command, scenes, settings
+from . import command, frames, scenes, settings
 
 INTERVAL = 0.25  # seconds between two looks
 
@@ -21,9 +22,13 @@ class Job:
     def __init__(self, scene: bpy.types.Scene) -> None:
         self.scene = scene.name
         self.executable = command.find_command(settings.preferences().command)
+        if not scenes.is_placed(scene):
+            raise FileNotFoundError("the file is not saved: save it, or name a folder in Noisy Frames")
         self.run: command.Run | None = None
+        self.rendered = False
         self.cancelled = False
         self.error = ""
+        self.forget: Callable[[], None] = lambda: None  # removes the handlers that wait for the render
 
     def start(self) -> None:
         """Start `ravg` on the frames that are there.
@@ -32,24 +37,40 @@ class Job:
         ------
         FileNotFoundError
             If no frame of the scene is there.
+        ValueError
+            If a frame is no noisy render with the passes that ravg reads.
         OSError
             If the command cannot be started.
         """
         scene = bpy.data.scenes[self.scene]
-        there = [number for number, path in scenes.frame_files(scene).items() if path.is_file()]
-        pattern = scenes.frame_pattern(scene)
+        there = [number for number, path in scenes.noisy_files(scene).items() if path.is_file()]
+        pattern = scenes.noisy_pattern(scene)
         if not there:
-            raise FileNotFoundError(f"no frames {pattern}: render the animation first")
+            raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
+        if reason := scenes.refused(scene):
+            raise ValueError(f"{reason} ({Path(pattern).parent})")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
-        frames = ",".join(map(str, sorted(there)))
         network = ["denoise", f"--preset={chosen.preset}"]
         how = ["pseudoref", "--estimate=auto"] if chosen.preset == "average" else network
-        arguments = [self.executable, *how, pattern, f"--output={folder}", f"--frames={frames}"]
+        arguments = [self.executable, *how, pattern, f"--output={folder}", f"--frames={frames.ranges(there)}"]
+        if chosen.light_passes:
+            arguments.append("--aov=all")
         if chosen.resume:
             arguments.append("--resume")
         outputs = scenes.denoised_files(scene)
         log = Path(bpy.app.tempdir) / "ravg.log"
         self.run = command.Run(arguments, [outputs[number] for number in there], log)
+
+    def go_on(self) -> None:
+        """Give the scene its own settings back once Blender has rendered, and start `ravg`."""
+        if self.run is None and (self.rendered or self.cancelled):
+            scenes.give_back(bpy.data.scenes[self.scene])
+            if not self.cancelled:
+                try:
+                    self.start()
+                except (OSError, ValueError) as error:
+                    self.error = str(error)
+                    self.cancel()
 
     @property
     def factor(self) -> float:
@@ -84,6 +105,7 @@ def follow() -> float | None:
     if current is None:
         return None
     _redraw()
+    current.go_on()
     if not current.ended:
         return INTERVAL
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
@@ -106,25 +128,26 @@ def begin(scene: bpy.types.Scene) -> Job:
 
 
 def start_when_rendered(job: Job) -> None:
-    """Start `ravg` when Blender has rendered the animation; end the job if that is cancelled."""
+    """Let the timer start `ravg` when Blender has rendered the animation; end the job if that is cancelled."""
 
+    # Handlers run beside the interface, while Blender still reads the scene: the timer does the rest.
     def rendered(*_: Any) -> None:
         forget()
-        try:
-            if not job.cancelled:
-                job.start()
-        except OSError as error:
-            job.error = str(error)
-            job.cancel()
+        job.rendered = True
 
     def cancelled(*_: Any) -> None:
         forget()
         job.cancel()
 
     def forget() -> None:
-        bpy.app.handlers.render_complete.remove(rendered)
-        bpy.app.handlers.render_cancel.remove(cancelled)
+        for handlers, handler in (
+            (bpy.app.handlers.render_complete, rendered),
+            (bpy.app.handlers.render_cancel, cancelled),
+        ):
+            if handler in handlers:
+                handlers.remove(handler)
 
+    job.forget = forget
     bpy.app.handlers.render_complete.append(rendered)
     bpy.app.handlers.render_cancel.append(cancelled)
 
@@ -135,9 +158,34 @@ def stop_current(*_: Any) -> None:
     global current
     if current is not None:
         current.cancel()
+        current.forget()
         if current.run is not None:
             current.run.wait()
+        elif (scene := bpy.data.scenes.get(current.scene)) is not None:
+            scenes.give_back(scene)
         current = None
+
+
+@bpy.app.handlers.persistent
+def give_back_all(*_: Any) -> None:
+    """Give all scenes their own settings back: of a file that was saved, or lost, while it was rendered."""
+    for scene in bpy.data.scenes:
+        scenes.give_back(scene)
+
+
+@bpy.app.handlers.persistent
+def protect(scene: bpy.types.Scene, *_: Any) -> None:
+    """Keep the frames of ravg when a render that is not its own would write over them."""
+    if not scene.ravg.lent and (kept := scenes.would_be_written_over(scene)):
+        scenes.keep_existing(scene)
+        print(f"ravg: {len(kept)} of its frames in {kept[0].parent} are not written over: name another Output Path")
+
+
+@bpy.app.handlers.persistent
+def protected(scene: bpy.types.Scene, *_: Any) -> None:
+    """Give a scene its own settings back after a render that `protect` has changed."""
+    if current is None or current.scene != scene.name:
+        scenes.give_back(scene)
 
 
 def _redraw() -> None:

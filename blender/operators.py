@@ -7,13 +7,13 @@ from typing import Any
 
 import bpy
 
-from . import jobs, scenes
+from . import frames, jobs, scenes
 
 LOG = "ravg.log"  # the text block that holds what ravg has printed
 
 
 class SetUp(bpy.types.Operator):
-    """Switch on what ravg reads: OpenEXR MultiLayer with Denoising Data and Vector, and a seed that changes"""
+    """Switch on what ravg reads: Denoising Data and Vector, a seed that changes, and Blender's denoiser for Fast"""
 
     bl_idname = "ravg.set_up"
     bl_label = "Set Up Passes"
@@ -27,6 +27,13 @@ class SetUp(bpy.types.Operator):
         return {"FINISHED"}
 
 
+EXISTING = (
+    ("ASK", "Ask", "Render nothing where noisy frames are there already"),
+    ("KEEP", "Render Missing Frames", "Leave the noisy frames that are there"),
+    ("REPLACE", "Render All Again", "Replace the noisy frames that are there"),
+)
+
+
 class Denoise(bpy.types.Operator):
     """Denoise the rendered frames with the installed ravg, beside Blender, and load the result"""
 
@@ -36,49 +43,79 @@ class Denoise(bpy.types.Operator):
     render: bpy.props.BoolProperty(
         name="Render", description="Set up the passes and render the animation first", options={"SKIP_SAVE"}
     )
+    existing: bpy.props.EnumProperty(
+        name="Noisy Frames", description="Those that are there already", items=EXISTING, options={"SKIP_SAVE"}
+    )
+    wait: bpy.props.BoolProperty(
+        name="Wait", description="Return at the end, as scripts need it", default=True, options={"SKIP_SAVE", "HIDDEN"}
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("ravg is at work")
         return jobs.current is None
 
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask about frames that are there; then return at once, and let a timer follow."""
+        self.wait = bpy.app.background
+        if self.render and not self.wait and self._there(context.scene):
+            self.existing = "KEEP"
+            return context.window_manager.invoke_props_dialog(self, title="Noisy frames are there already")
+        return self.execute(context)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.props_enum(self, "existing")
+
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Wait for the end: in scripts, and where Blender has no window."""
+        """Denoise; with `wait` until the end, in scripts and where Blender has no window."""
         try:
-            job = jobs.begin(context.scene)
-            if self.render:
-                scenes.set_up(context.scene)
-                bpy.ops.render.render(animation=True)
-            job.start()
-            while not job.ended:
-                time.sleep(jobs.INTERVAL)
-        except OSError as error:
+            self._begin(context.scene)
+            if not self.wait:
+                bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
+                return {"FINISHED"}
+            self._follow()
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, of a render that fails
             jobs.stop_current()
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, str(error).strip().removeprefix("Error: "))
             return {"CANCELLED"}
         except BaseException:
             jobs.stop_current()
             raise
         return conclude(self, context)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Return at once, and let a timer follow."""
-        if bpy.app.background:
-            return self.execute(context)
+    def _there(self, scene: bpy.types.Scene) -> list[int]:
+        if not scenes.is_placed(scene):
+            return []
+        return [number for number, path in scenes.noisy_files(scene).items() if path.is_file()]
+
+    def _begin(self, scene: bpy.types.Scene) -> None:
+        job, there = jobs.begin(scene), self._there(scene)
+        if not self.render:
+            job.start()
+            return
+        if there and self.existing == "ASK":
+            which = f"noisy frames {frames.ranges(there)} are there already"
+            raise FileExistsError(f"{which}: render with existing='KEEP' or 'REPLACE', or denoise them")
+        scenes.set_up(scene)
+        scenes.lend(scene, replace=self.existing == "REPLACE")
+        jobs.start_when_rendered(job)
         try:
-            job = jobs.begin(context.scene)
-            if self.render:
-                scenes.set_up(context.scene)
-                jobs.start_when_rendered(job)
-                bpy.ops.render.render("INVOKE_DEFAULT", animation=True)
-            else:
-                job.start()
-        except OSError as error:
-            jobs.stop_current()
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
-        return {"FINISHED"}
+            bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
+        except BaseException:
+            job.forget()
+            raise
+
+    def _follow(self) -> None:
+        """Print what ravg prints until it has ended."""
+        job, printed = jobs.current, 0
+        job.go_on()
+        while job.run is not None:
+            ended, text = job.ended, job.run.log
+            print(text[printed:], end="", flush=True)
+            printed = len(text)
+            if ended:
+                return
+            time.sleep(jobs.INTERVAL)
 
 
 class Cancel(bpy.types.Operator):
@@ -136,6 +173,8 @@ class AddToCompositor(bpy.types.Operator):
 def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
     """Say in Blender's own places how the job has ended, and show its frames if it has made them all."""
     job, jobs.current = jobs.current, None
+    job.forget()
+    scenes.give_back(bpy.data.scenes[job.scene])
     if job.run is None:
         if job.error:
             operator.report({"ERROR"}, job.error)

@@ -29,6 +29,8 @@ class OutputPanel(bpy.types.Panel):
                 column.operator("ravg.set_up", icon="TOOL_SETTINGS")
         column = layout.column()
         column.prop(scene.ravg, "preset")
+        column.prop(scene.ravg, "light_passes")
+        column.prop(scene.ravg, "noisy", placeholder=scenes.noisy_pattern(scene))
         column.prop(scene.ravg, "folder", placeholder=str(scenes.output_folder(scene)))
         column.prop(scene.ravg, "resume")
         job = jobs.current

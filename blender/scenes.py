@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+
+from . import frames
 
 
 @dataclass(frozen=True)
@@ -19,12 +23,30 @@ class Problem:
 
 
 def problems(scene: bpy.types.Scene) -> list[Problem]:
-    """Say what would spoil the denoised frames, or make them worse, the gravest first."""
+    """Say what prevents denoising or makes the result worse, and what to do about it, the gravest first."""
+    if not is_placed(scene):
+        return [Problem("File is not saved: save it, or name a folder in Noisy Frames", False)]
+    return [*_of_frames(scene), *_of_passes(scene)]
+
+
+def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
+    """Say what is wrong with the frames on disk, and with those that a render would replace."""
+    found = []
+    if reason := refused(scene):
+        found.append(Problem(f"{reason} (Render and Denoise renders all again)", False))
+    missing = [number for number, path in noisy_files(scene).items() if not path.is_file()]
+    if 0 < len(missing) < len(frame_numbers(scene)):
+        found.append(Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False))
+    if would_be_written_over(scene):
+        found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
+    return found
+
+
+def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
+    """Say what a render of the scene as it is set lacks."""
     render, found = scene.render, []
-    if render.image_settings.file_format != "OPEN_EXR_MULTILAYER":
-        found.append(Problem("File format is not OpenEXR MultiLayer: the passes are not saved", True))
     if render.engine != "CYCLES":
-        return [*found, Problem("Engine is not Cycles: there is no noise of the kind that ravg removes", False)]
+        return [Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)]
     layers = _layers(scene)
     if any(not layer.cycles.denoising_store_passes for layer in layers):
         found.append(Problem("Denoising Data is off: textures blur, and noise that Blender removed is lost", True))
@@ -35,19 +57,19 @@ def problems(scene: bpy.types.Scene) -> list[Problem]:
         found.append(Problem("Vector pass is off: motion has to be found in the pictures", True))
     if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
         found.append(Problem("Seed is constant: noise that stands still cannot be averaged away", True))
+    if scene.ravg.preset == "fast" and not scene.cycles.use_denoising:
+        found.append(Problem("Render > Denoise is off: Fast is more accurate with Blender's own denoised frames", True))
+    if scene.ravg.light_passes and not any(_light_passes(layer) for layer in layers):
+        found.append(Problem("Light Passes: no view layer renders any, choose them in View Layer > Passes", False))
     if render.use_motion_blur and not any(vectors):
-        found.append(Problem("Motion Blur is on: without vectors motion has to be found in the pictures", False))
+        text = "Motion Blur is on: motion has to be found in the pictures, switch it off and blur afterwards"
+        found.append(Problem(text, False))
     return found
 
 
 def set_up(scene: bpy.types.Scene) -> list[str]:
     """Mend what is fixable among `problems`; return what was changed, in words."""
     render, changed = scene.render, []
-    if render.image_settings.file_format != "OPEN_EXR_MULTILAYER":
-        if hasattr(render.image_settings, "media_type"):  # Blender 5.0 and later choose the format in two steps
-            render.image_settings.media_type = "MULTI_LAYER_IMAGE"
-        render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
-        changed.append("OpenEXR MultiLayer")
     if render.engine != "CYCLES":
         return changed
     for layer in _layers(scene):
@@ -60,34 +82,157 @@ def set_up(scene: bpy.types.Scene) -> list[str]:
     if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
         scene.cycles.use_animated_seed = True
         changed.append("Animate Seed")
+    if scene.ravg.preset == "fast" and not scene.cycles.use_denoising:
+        scene.cycles.use_denoising = True
+        changed.append("Denoise")
     return changed
 
 
-def frame_files(scene: bpy.types.Scene) -> dict[int, Path]:
-    """Frame number → the file that Blender writes for it, for the frames that the scene renders."""
-    numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-    return {number: _absolute(scene.render.frame_path(frame=number)) for number in numbers}
+def frame_numbers(scene: bpy.types.Scene) -> range:
+    """The frames that the scene renders."""
+    return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
 
 
-def frame_pattern(scene: bpy.types.Scene) -> str:
-    """The files of all frames as one pattern, ``shot_####.exr``."""
-    # Blender numbers by the last run of "#" in the name, or appends four digits.
-    runs = re.findall("#+", re.split(r"[/\\]", scene.render.filepath)[-1])
-    width = len(runs[-1]) if runs else 4
-    one, two = (scene.render.frame_path(frame=int(digit * width)) for digit in "12")
-    return str(_absolute("".join("#" if a != b else a for a, b in zip(one, two, strict=True))))
+def noisy_files(scene: bpy.types.Scene) -> dict[int, Path]:
+    """Frame number → the file of its noisy render, whether it is there or not."""
+    before, width, after = _name(scene)
+    return {n: Path(f"{before}{n:0{width}d}{after}") for n in frame_numbers(scene)}
+
+
+def noisy_pattern(scene: bpy.types.Scene) -> str:
+    """The files of all noisy frames as one pattern, ``shot_####.exr``."""
+    before, width, after = _name(scene)
+    return f"{before}{'#' * width}{after}"
 
 
 def output_folder(scene: bpy.types.Scene) -> Path:
-    """Where the denoised frames go: the folder that the scene names, or ``denoised`` beside its frames."""
-    named = scene.ravg.folder
-    return _absolute(named) if named else Path(frame_pattern(scene)).parent / "denoised"
+    """The folder of the denoised frames: the one that the scene names, or ``denoised`` beside its noisy ones."""
+    if scene.ravg.folder:
+        return _absolute(scene.ravg.folder)
+    noisy = Path(noisy_pattern(scene)).parent
+    return (noisy if scene.ravg.noisy else noisy.parent) / "denoised"
 
 
 def denoised_files(scene: bpy.types.Scene) -> dict[int, Path]:
     """Frame number → the denoised file, whether it is there or not."""
     folder = output_folder(scene)
-    return {number: folder / path.name for number, path in frame_files(scene).items()}
+    return {number: folder / path.name for number, path in noisy_files(scene).items()}
+
+
+def is_placed(scene: bpy.types.Scene) -> bool:
+    """Whether the folder of the noisy frames is known: a file that was never saved has none of its own."""
+    return bool(bpy.data.filepath) or bool(scene.ravg.noisy and not scene.ravg.noisy.startswith("//"))
+
+
+def refused(scene: bpy.types.Scene) -> str:
+    """Say which of the noisy frames on disk is none, and why; empty where all are."""
+    cycles = scene.render.engine == "CYCLES"
+    for path in noisy_files(scene).values():
+        if path.is_file() and (reason := _refusal(path, path.stat().st_mtime_ns, cycles)):
+            return f"{path.name} is no noisy frame: {reason}"
+    return ""
+
+
+@functools.lru_cache(maxsize=1 << 14)
+def _refusal(path: Path, changed: int, cycles: bool) -> str:
+    """`frames.refusal`, read once for each version of a file: the panel asks whenever it is drawn."""
+    return frames.refusal(path, cycles=cycles)
+
+
+def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
+    """The noisy and denoised frames that Blender's own Render Animation would replace, as the scene is set."""
+    if not is_placed(scene):
+        return []
+    kept = {*noisy_files(scene).values(), *denoised_files(scene).values()}
+    written = {_absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
+    return sorted(path for path in kept & written if path.is_file())
+
+
+def lend(scene: bpy.types.Scene, *, replace: bool) -> None:
+    """Set the render settings for noisy frames until `give_back`: own files, every pass, nothing of the compositor.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its own settings are kept in ``scene.ravg.lent``, which a file keeps that is saved meanwhile.
+    replace : bool
+        Whether frames that are there are rendered again.
+
+    Raises
+    ------
+    OSError
+        If Blender would write other files than `noisy_files`.
+    """
+    settings: dict[str, object] = {
+        "render.filepath": noisy_pattern(scene),
+        "render.image_settings.media_type": "MULTI_LAYER_IMAGE",  # Blender 5.0 and later choose the format in two steps
+        "render.image_settings.file_format": "OPEN_EXR_MULTILAYER",
+        "render.image_settings.color_mode": "RGBA",
+        "render.image_settings.color_depth": "32",
+        "render.image_settings.exr_codec": "ZIP",
+        "render.image_settings.color_management": "FOLLOW_SCENE",
+        "render.use_file_extension": True,
+        "render.use_placeholder": False,
+        "render.use_overwrite": replace,
+        "render.use_compositing": False,
+        "render.use_sequencer": False,
+    }
+    if scene.render.use_multiview:  # both eyes in one file, which ravg denoises both
+        settings["render.image_settings.views_format"] = "MULTIVIEW"
+    _lend(scene, settings)
+    first = scene.frame_start
+    written, expected = _absolute(scene.render.frame_path(frame=first)), noisy_files(scene)[first]
+    if written != expected:
+        give_back(scene)
+        raise OSError(f"Blender would write {written}, expected {expected}: name Noisy Frames without {{ and }}")
+
+
+def keep_existing(scene: bpy.types.Scene) -> None:
+    """Have Blender's own render skip the frames that are there, until `give_back`."""
+    _lend(scene, {"render.use_overwrite": False})
+
+
+def give_back(scene: bpy.types.Scene) -> None:
+    """Give a scene its own render settings back."""
+    if scene.ravg.lent:
+        for path, value in json.loads(scene.ravg.lent).items():
+            _set(scene, path, value)
+        scene.ravg.lent = ""
+
+
+def _lend(scene: bpy.types.Scene, settings: dict[str, object]) -> None:
+    give_back(scene)
+    there = {path: value for path, value in settings.items() if hasattr(*_owner(scene, path))}
+    scene.ravg.lent = json.dumps({path: getattr(*_owner(scene, path)) for path in there})
+    try:
+        for path, value in there.items():
+            _set(scene, path, value)
+    except BaseException:
+        give_back(scene)
+        raise
+
+
+def _owner(scene: bpy.types.Scene, path: str) -> tuple[object, str]:
+    """The object that has a property of the scene, and the property's own name."""
+    owner, _, name = path.rpartition(".")
+    return (scene.path_resolve(owner), name)
+
+
+def _set(scene: bpy.types.Scene, path: str, value: object) -> None:
+    setattr(*_owner(scene, path), value)
+
+
+def _name(scene: bpy.types.Scene) -> tuple[str, int, str]:
+    """The path of the noisy frames, as absolute text before and after the number, and the number's digits."""
+    stem = bpy.path.clean_name(Path(bpy.data.filepath).stem or "untitled")
+    path = scene.ravg.noisy or f"//ravg/{stem}/noisy/{bpy.path.clean_name(scene.name)}_"
+    folder, name = re.fullmatch(r"(.*[/\\])?(.*)", path, re.DOTALL).groups()
+    name = re.sub(r"\.exr$", "", name, flags=re.IGNORECASE)
+    # As Blender: the last run of "#" in the name is the number, or four digits follow the name.
+    before, width, after = re.fullmatch(r"(.*?)(#*)([^#]*)", name, re.DOTALL).groups()
+    if not width:
+        before, after = name, ""
+    return os.path.join(_absolute(folder or "//"), before), len(width) or 4, f"{after}.exr"
 
 
 def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
@@ -103,6 +248,8 @@ def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
         raise FileNotFoundError(f"no denoised frames in {output_folder(scene)}")
     image = bpy.data.images.load(str(there[0]), check_existing=True)
     image.source = "SEQUENCE"
+    if scene.render.use_multiview:
+        image.use_multiview, image.views_format = True, "MULTIVIEW"
     image.reload()
     return image, scene.frame_end - scene.frame_start + 1
 
@@ -116,6 +263,14 @@ def show_from(user: bpy.types.ImageUser | bpy.types.Node, scene: bpy.types.Scene
 
 def _layers(scene: bpy.types.Scene) -> list[bpy.types.ViewLayer]:
     return [layer for layer in scene.view_layers if layer.use]
+
+
+def _light_passes(layer: bpy.types.ViewLayer) -> bool:
+    """Whether a view layer renders passes of parts of the light."""
+    named = [
+        name for name in dir(layer) if re.match(r"use_pass_(diffuse|glossy|transmission)_(direct|indirect)$", name)
+    ]
+    return any(getattr(layer, name) for name in [*named, "use_pass_emit", "use_pass_environment"])
 
 
 def _is_animated(scene: bpy.types.Scene, path: str) -> bool:

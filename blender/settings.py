@@ -30,10 +30,25 @@ class SceneSettings(bpy.types.PropertyGroup):
     """Saved with the scene."""
 
     preset: bpy.props.EnumProperty(name="Preset", description="Accuracy against time", items=PRESETS, default="fast")
+    light_passes: bpy.props.BoolProperty(
+        name="Light Passes",
+        description="Denoise the passes that add up to the light along, so that they still do",
+        default=False,
+    )
+    noisy: bpy.props.StringProperty(
+        name="Noisy Frames",
+        description="Where noisy frames are rendered to and read from, as Output Path; without one, beside the file",
+        subtype="FILE_PATH",
+    )
     folder: bpy.props.StringProperty(
-        name="Folder",
-        description="For the denoised frames; without one, a folder denoised beside the rendered frames",
+        name="Denoised Frames",
+        description="Folder for the denoised frames; without one, a folder denoised beside that of the noisy frames",
         subtype="DIR_PATH",
+    )
+    lent: bpy.props.StringProperty(
+        name="Lent Settings",
+        description="The render settings, as JSON, that the scene gets back when ravg's render has ended",
+        options={"HIDDEN"},
     )
     resume: bpy.props.BoolProperty(
         name="Resume",

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import stat
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,14 @@ def test_usage_errors_are_read_out_of_their_frame(tmp_path):
     assert usage.error.startswith("No such option")
 
 
+@pytest.mark.parametrize("frame", ["│{}│\n╰────╯", "| {} |\n+------+", "│ {} │\n└──────┘"])
+def test_the_frame_of_an_error_is_stripped_on_all_systems(tmp_path, frame):
+    text = frame.format("No such option: --x-y")
+    failed = run(f"import sys; print({text!r}); sys.exit(2)", tmp_path)
+    failed.wait()
+    assert failed.error == "No such option: --x-y"
+
+
 def test_warnings_are_collected(tmp_path):
     warned = run(
         "print('warning: one seed'); print('no warning: this'); print('  warning: frame 3 is missing')", tmp_path
@@ -114,31 +123,24 @@ def test_letters_of_all_kinds_reach_the_log(tmp_path, monkeypatch):
     assert spoken.log.strip() == "1920×1080 – ≈"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
-@pytest.mark.usefixtures("interrupts")
-def test_stopping_is_heard_as_ctrl_c(tmp_path):
-    ready = tmp_path / "ready"
-    code = f"""
-import pathlib, sys, time
-try:
-    pathlib.Path({str(ready)!r}).touch()
-    time.sleep(60)
-except KeyboardInterrupt:
-    print("stopped: 0 of 1 frames are finished")
-    sys.exit(130)
-"""
-    made = run(code, tmp_path)
-    while not ready.exists():
-        assert made.code is None
+LISTENS = "import os, sys; assert os.environ['RAVG_STOP_WITH_STDIN'] == '1'; "
+
+
+def test_it_stops_when_its_input_closes_and_not_before(tmp_path):
+    """As on Windows, where a process without a console gets no signal."""
+    made = run(LISTENS + "sys.stdin.read(); print('stopped: 0 of 1 frames are finished'); sys.exit(130)", tmp_path)
+    time.sleep(0.2)
+    assert made.code is None
+    made.stop()
     made.stop()
     assert made.stopped
     assert made.wait() == 130
     assert "stopped" in made.log
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
-def test_what_does_not_stop_is_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "PATIENCE", 0.0)
+@pytest.mark.parametrize("limit", ["TERMINATED_AFTER", "KILLED_AFTER"])
+def test_a_process_that_does_not_listen_is_ended(tmp_path, monkeypatch, limit):
+    monkeypatch.setattr(command, limit, 0.0)
     ready = tmp_path / "ready"
     code = "import pathlib, signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); "
     made = run(code + f"pathlib.Path({str(ready)!r}).touch(); time.sleep(60)", tmp_path)
@@ -146,6 +148,22 @@ def test_what_does_not_stop_is_killed(tmp_path, monkeypatch):
         assert made.code is None
     made.stop()
     assert made.wait() not in (None, 0)
+
+
+def test_errors_of_the_system_do_not_leave_stop(tmp_path, monkeypatch):
+    """Windows raises them for a process that has just ended."""
+    made = run(LISTENS + "sys.stdin.read()", tmp_path)
+
+    def fail() -> None:
+        raise OSError(6, "the handle is invalid")
+
+    with monkeypatch.context() as changed:
+        changed.setattr(command, "TERMINATED_AFTER", 0.0)
+        changed.setattr(made._process, "terminate", fail)
+        made.stop()
+        while made.code is None:
+            time.sleep(0.01)
+    assert made.wait() == 0
 
 
 def test_a_command_that_cannot_start_is_an_error_of_the_system(tmp_path):

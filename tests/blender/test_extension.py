@@ -59,7 +59,7 @@ scene.render.engine = "CYCLES"
 scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 4, False, False
 scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 96, 54, 100
 scene.frame_start, scene.frame_end = 4, 6
-scene.render.filepath = "//frames/shot_"
+scene.render.filepath = "//movie/shot_"
 bpy.ops.wm.save_as_mainfile(filepath=FILE)
 """
 
@@ -136,7 +136,15 @@ def blend(untouched: Path, tmp_path: Path) -> Path:
 def rendered(blender: Blender, untouched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene set up and its frames rendered; the file's path."""
     path = Path(shutil.copy(untouched, tmp_path_factory.mktemp("rendered")))
-    code = "bpy.ops.ravg.set_up(); bpy.ops.render.render(animation=True); bpy.ops.wm.save_mainfile()"
+    code = """
+    from bl_ext.user_default.ravg import scenes
+    scene.ravg.noisy = "//frames/shot_"
+    bpy.ops.ravg.set_up()
+    scenes.lend(scene, replace=False)
+    bpy.ops.render.render(animation=True)
+    scenes.give_back(scene)
+    bpy.ops.wm.save_mainfile()
+    """
     blender.run(code, blend=path)
     return path
 
@@ -154,10 +162,10 @@ def channels(path: Path) -> dict[str, np.ndarray]:
     return {name.removeprefix("ViewLayer."): pixels for name, pixels in found.items()}
 
 
-def picture(path: Path) -> np.ndarray:
-    """What a file shows, (H, W, 3)."""
+def picture(path: Path, name: str = "Combined") -> np.ndarray:
+    """One pass of a file, (H, W, 3)."""
     found = channels(path)
-    return np.stack([found[f"Combined.{c}"] for c in "RGB"], axis=-1).astype(np.float64)
+    return np.stack([found[f"{name}.{c}"] for c in "RGB"], axis=-1).astype(np.float64)
 
 
 # --- the archive ---------------------------------------------------------------------------------------
@@ -180,10 +188,11 @@ def test_blender_would_refuse_a_wrong_one(tmp_path):
 
 def test_it_comes_and_goes_without_a_trace(blender):
     code = """
+    HANDLERS = ("load_pre", "load_post", "render_init", "render_complete", "render_cancel")
     def traces():
         handlers = bpy.app.handlers
         return [hasattr(bpy.types.Scene, "ravg"), hasattr(bpy.types, "RAVG_PT_output"),
-                "denoise" in dir(bpy.ops.ravg), len(handlers.load_pre) + len(handlers.render_complete)]
+                "denoise" in dir(bpy.ops.ravg), sum(len(getattr(handlers, n)) for n in HANDLERS)]
     there = traces()
     addon_utils.disable(NAME)
     gone = traces()
@@ -192,7 +201,7 @@ def test_it_comes_and_goes_without_a_trace(blender):
     """
     there, gone, again = blender.run(code, NAME=NAME)
     assert there[:3] == [True, True, True]
-    assert gone == [False, False, False, there[3] - 1]
+    assert gone == [False, False, False, there[3] - 5]
     assert again == there
 
 
@@ -212,7 +221,7 @@ def texts():
 def test_a_new_scene_is_told_what_it_lacks_and_set_up(blender, blend):
     code = PROBLEMS + "answer = [texts(), list(bpy.ops.ravg.set_up()), texts(), scenes.set_up(scene)]"
     before, done, after, again = blender.run(code, blend=blend)
-    assert before == ["File format", "Denoising Data", "Vector pass", "Seed"]
+    assert before == ["Denoising Data", "Vector pass", "Seed", "Render > Denoise"]
     assert done == ["FINISHED"]
     assert after == again == []
 
@@ -239,7 +248,9 @@ def test_what_spoils_the_result_is_warned_of(blender, rendered, change, warned):
 
 def test_motion_blur_leaves_the_vectors_empty_as_the_panel_says(blender, shot):
     code = """
-    scene.render.use_motion_blur, scene.frame_end, scene.render.filepath = True, 4, "//blurred/"
+    from bl_ext.user_default.ravg import scenes
+    scene.render.use_motion_blur, scene.frame_end, scene.ravg.noisy = True, 4, "//blurred/"
+    scenes.lend(scene, replace=False)
     bpy.ops.render.render(animation=True)
     """
     blender.run(code, blend=shot)
@@ -265,9 +276,7 @@ def test_the_rendered_frames_hold_what_ravg_reads(rendered):
     ],
 )
 def test_frames_are_looked_for_where_blender_writes_them(blender, rendered, filepath, pattern, fifth):
-    code = (
-        PROBLEMS + "scene.render.filepath = PATH; answer = [scenes.frame_pattern(scene), scenes.frame_files(scene)[5]]"
-    )
+    code = PROBLEMS + "scene.ravg.noisy = PATH; answer = [scenes.noisy_pattern(scene), scenes.noisy_files(scene)[5]]"
     found = blender.run(code, blend=rendered, PATH=filepath)
     assert found == [str(rendered.parent / pattern), str(rendered.parent / fifth)]
 
@@ -288,23 +297,30 @@ def test_the_script_of_the_documentation_renders_denoises_and_loads(blender, ble
               [user.frame_start, user.frame_duration, user.frame_offset], bpy.data.texts["ravg.log"].as_string()]
     """
     path, source, shown, log = blender.run(code, blend=blend)
-    noisy, made = blend.parent / "frames", blend.parent / "frames" / "denoised"
-    assert Path(path) == made / "shot_0004.exr"
+    noisy, made = blend.parent / "ravg" / "shot" / "noisy", blend.parent / "ravg" / "shot" / "denoised"
+    assert Path(path) == made / "Scene_0004.exr"
     assert source == "SEQUENCE"
     assert shown == [4, 3, 3]  # frame 4 of the scene shows file 4 - 4 + 1 + 3
     assert "wrote 3 frames" in log
-    assert sorted(p.name for p in made.glob("*.exr")) == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
-    code = "scene.cycles.samples, scene.render.filepath = 256, '//clean/'; bpy.ops.render.render(animation=True)"
-    blender.run("bpy.ops.ravg.set_up(); " + code, blend=blend)
+    assert sorted(p.name for p in made.glob("*.exr")) == ["Scene_0004.exr", "Scene_0005.exr", "Scene_0006.exr"]
+    code = """
+    from bl_ext.user_default.ravg import scenes
+    scene.cycles.samples, scene.ravg.noisy = 256, "//clean/"
+    bpy.ops.ravg.set_up()
+    scene.cycles.use_denoising = False
+    scenes.lend(scene, replace=False)
+    bpy.ops.render.render(animation=True)
+    """
+    blender.run(code, blend=blend)
     for frame in (4, 5, 6):
         files = (
-            noisy / f"shot_{frame:04d}.exr",
-            made / f"shot_{frame:04d}.exr",
+            noisy / f"Scene_{frame:04d}.exr",
+            made / f"Scene_{frame:04d}.exr",
             blend.parent / f"clean/{frame:04d}.exr",
         )
-        before, after, clean = (picture(path) for path in files)
+        before, (after, clean) = picture(files[0], "Noisy Image"), (picture(path) for path in files[1:])
         assert ((after - clean) ** 2).mean() < 0.5 * ((before - clean) ** 2).mean()
-    with OpenEXR.File(str(made / "shot_0005.exr"), header_only=True) as file:
+    with OpenEXR.File(str(made / "Scene_0005.exr"), header_only=True) as file:
         assert file.header()["ravg/preset"] == "fast"
 
 
@@ -314,16 +330,7 @@ def test_the_compositor_shows_each_denoised_frame_at_its_time(blender, shot):
     code = """
     scene.ravg.preset = "average"
     bpy.ops.ravg.denoise()
-    bpy.ops.ravg.add_to_compositor()
-    tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
-    node = next(node for node in tree.nodes if node.type == "IMAGE")
-    if hasattr(scene, "compositing_node_group"):
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-        sink = tree.nodes.new("NodeGroupOutput")
-    else:
-        sink = next(node for node in tree.nodes if node.type == "COMPOSITE")
-        tree.nodes.remove(next(node for node in tree.nodes if node.type == "R_LAYERS"))
-    tree.links.new(node.outputs["Combined"], sink.inputs[0])
+    exec(COMPOSE)
     settings = scene.render.image_settings
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
@@ -331,7 +338,7 @@ def test_the_compositor_shows_each_denoised_frame_at_its_time(blender, shot):
     scene.render.filepath = "//composed/"
     bpy.ops.render.render(animation=True)
     """
-    blender.run(code, blend=shot)
+    blender.run(code, blend=shot, COMPOSE=COMPOSE)
     for frame in (4, 5, 6):
         composed = shot.parent / "composed" / f"{frame:04d}.exr"
         with OpenEXR.File(str(composed)) as file:
@@ -368,12 +375,14 @@ def test_a_timer_follows_it_to_its_end(blender, shot):
 def test_it_starts_when_blender_has_rendered(blender, shot):
     code = """
     scene.ravg.preset = "average"
-    from bl_ext.user_default.ravg import jobs
+    from bl_ext.user_default.ravg import jobs, scenes
     count = len(bpy.app.handlers.render_complete)
     job = jobs.begin(scene)
+    scenes.lend(scene, replace=True)
     jobs.start_when_rendered(job)
     waiting = [job.text, job.ended, jobs.follow() is not None]
     bpy.ops.render.render(animation=True)
+    jobs.follow()
     started = job.run is not None
     while (pause := jobs.follow()) is not None:
         time.sleep(pause)
@@ -384,7 +393,8 @@ def test_it_starts_when_blender_has_rendered(blender, shot):
 
 @needs_ravg
 def test_stop_leaves_whole_frames_and_no_process(blender, shot):
-    code = FOLLOWED.format(start="job.start()", between="bpy.ops.ravg.cancel()")
+    start = "from bl_ext.user_default.ravg import command; command.TERMINATED_AFTER = 0; job.start()"
+    code = FOLLOWED.format(start=start, between="bpy.ops.ravg.cancel()")
     _, over, free, status, finished, _ = blender.run("scene.ravg.preset = 'average'\n" + code, blend=shot)
     assert (over, free) == (True, True)
     assert status not in (None, 0)
@@ -395,7 +405,8 @@ def test_stop_leaves_whole_frames_and_no_process(blender, shot):
 @needs_ravg
 def test_another_file_stops_it_as_it_stops_a_render(blender, shot):
     code = """
-    from bl_ext.user_default.ravg import jobs
+    from bl_ext.user_default.ravg import command, jobs
+    command.TERMINATED_AFTER = 0
     job = jobs.begin(scene)
     job.start()
     bpy.ops.wm.read_homefile()
@@ -423,6 +434,208 @@ def test_resume_leaves_finished_frames_alone(blender, shot):
     assert kept == ["shot_0004.exr", "shot_0006.exr"]
 
 
+# --- nothing is written over ---------------------------------------------------------------------------
+
+# As one makes a movie: the compositor gets the denoised frames, and the animation is rendered through it.
+COMPOSE = """
+bpy.ops.ravg.add_to_compositor()
+tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
+node = next(node for node in tree.nodes if node.type == "IMAGE")
+if hasattr(scene, "compositing_node_group"):
+    if not len(tree.interface.items_tree):
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    sink = tree.nodes.new("NodeGroupOutput")
+else:
+    sink = next(node for node in tree.nodes if node.type == "COMPOSITE")
+    tree.nodes.remove(next(node for node in tree.nodes if node.type == "R_LAYERS"))
+tree.links.new(node.outputs["Combined"], sink.inputs[0])
+"""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a folder."""
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+@needs_ravg
+def test_noisy_frames_outlive_the_movie_that_is_made_of_the_denoised_ones(blender, blend):
+    """Render, denoise, composite, render the animation, denoise again: each set of frames stays whole."""
+    code = f"""
+    import shutil
+    bpy.ops.ravg.denoise(render=True)
+    shutil.copytree(bpy.path.abspath("//ravg/shot"), bpy.path.abspath("//first"))
+    exec({COMPOSE!r})
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format = "OPEN_EXR_MULTILAYER"  # what Render and Denoise used to leave behind
+    bpy.ops.render.render(animation=True)
+    bpy.ops.ravg.denoise()
+    answer = scene.render.filepath
+    """
+    assert blender.run(code, blend=blend) == "//movie/shot_"
+    first, now = blend.parent / "first", blend.parent / "ravg" / "shot"
+    assert len(contents(now / "noisy")) == 3
+    assert contents(now / "noisy") == contents(first / "noisy")
+    movie = sorted((blend.parent / "movie").iterdir())
+    assert [path.name for path in movie] == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
+    for path, again in zip(movie, sorted((now / "denoised").glob("*.exr")), strict=True):
+        before = picture(first / "denoised" / again.name)
+        assert before.mean() > 0.1
+        np.testing.assert_array_equal(picture(again), before)
+        composed = np.stack([channels(path)[f"Composite.Combined.{c}"] for c in "RGB"], axis=-1)
+        np.testing.assert_allclose(composed, before, rtol=1e-3, atol=1e-4)
+
+
+FORMATS = """
+def settings_of(scene):
+    names = ("media_type", "file_format", "color_mode", "color_depth", "exr_codec", "views_format", "color_management")
+    image, render = scene.render.image_settings, scene.render
+    return [getattr(image, name, None) for name in names] + [render.filepath, render.use_overwrite,
+            render.use_placeholder, render.use_file_extension, render.use_compositing, render.use_sequencer]
+def choose(kind, file_format, depth, mode):
+    image = scene.render.image_settings
+    if hasattr(image, "media_type"):
+        image.media_type = kind
+    image.file_format = file_format
+    if depth:
+        image.color_depth = depth
+    image.color_mode = mode
+"""
+
+
+CHOSEN = [
+    ("IMAGE", "PNG", "16", "BW"),
+    ("IMAGE", "JPEG", "", "RGB"),
+    ("IMAGE", "OPEN_EXR", "16", "RGB"),
+    ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "16", "RGBA"),
+    ("VIDEO", "FFMPEG", "", "RGB"),
+]
+# What may become of a render that was begun.
+ENDS = {
+    "finished": "bpy.ops.ravg.denoise(render=True, existing='REPLACE')",
+    "failed": "scene.camera = None; bpy.ops.ravg.denoise(render=True, existing='REPLACE')",
+    "cancelled": """
+job = jobs.begin(scene)
+scenes.lend(scene, replace=True)
+jobs.start_when_rendered(job)
+assert settings_of(scene) != before
+for handler in list(bpy.app.handlers.render_cancel): handler(scene)
+job.go_on()
+bpy.ops.ravg.conclude()
+""",
+    "reopened": """
+scenes.lend(scene, replace=True)
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+scene = bpy.context.scene
+""",
+    "switched off": """
+jobs.begin(scene)
+scenes.lend(scene, replace=True)
+jobs.stop_current()
+""",
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_the_scene_gets_its_output_settings_back(blender, blend, end):
+    code = f"""{FORMATS}
+from bl_ext.user_default.ravg import jobs, scenes
+answer = []
+for chosen in CHOSEN:
+    scene.frame_end = 4
+    scene.render.use_overwrite, scene.render.use_placeholder = False, True
+    choose(*chosen)
+    before = settings_of(scene)
+    try:
+        exec(END)
+    except RuntimeError:
+        pass
+    answer.append([before, settings_of(scene), scene.ravg.lent])
+"""
+    for before, after, lent in blender.run(code, blend=blend, command=sys.executable, CHOSEN=CHOSEN, END=ENDS[end]):
+        assert after == before
+        assert lent == ""
+
+
+def test_a_second_render_leaves_the_frames_of_the_first_until_it_is_asked_for(blender, shot):
+    code = """
+    def stamps():
+        return {p.name: p.stat().st_mtime_ns for p in Path(bpy.path.abspath("//frames")).glob("*.exr")}
+    def render(**how):
+        try:
+            bpy.ops.ravg.denoise(render=True, **how)
+        except RuntimeError as error:
+            return str(error).strip()
+    first = stamps()
+    error = render()
+    refused = stamps() == first
+    Path(bpy.path.abspath("//frames/shot_0005.exr")).unlink()
+    render(existing="KEEP")
+    kept = stamps()
+    render(existing="REPLACE")
+    replaced = stamps()
+    answer = [error, refused, [n for n in first if kept[n] != first[n]], [n for n in first if replaced[n] == kept[n]]]
+    """
+    error, refused, made, old = blender.run(code, blend=shot, command=sys.executable)
+    assert "noisy frames 4-6 are there already" in error
+    assert refused
+    assert made == ["shot_0005.exr"]
+    assert old == []
+
+
+@pytest.mark.parametrize("name", ["frames", "frames/denoised"])
+def test_blenders_own_render_does_not_write_over_the_frames_of_ravg(blender, shot, name):
+    """The output path is that of the frames: the panel says so, and the render skips those that are there."""
+    shutil.copytree(shot.parent / "frames", shot.parent / "frames" / "denoised")
+    before = contents(shot.parent / name)
+    code = f"""{FORMATS}{PROBLEMS}
+scene.render.filepath = "//{name}/shot_"
+choose("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "32", "RGBA")
+said = texts()
+bpy.ops.render.render(animation=True)
+answer = [said, scene.render.use_overwrite, scene.ravg.lent]
+"""
+    said, overwrite, lent = blender.run(code, blend=shot)
+    assert said == ["Output Path"]
+    assert contents(shot.parent / name) == before
+    assert (overwrite, lent) == (True, "")
+
+
+NO_NOISY_FRAMES = {
+    "composited": ("exec(COMPOSE)", "compositor"),
+    "black": ("exec(COMPOSE); tree.links.clear()", "compositor"),
+    "without passes": ("scene.view_layers[0].cycles.denoising_store_passes = False", "no pass Denoising Albedo"),
+    "a single layer": ("FORMAT = ('IMAGE', 'OPEN_EXR')", "no Combined pass"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_NOISY_FRAMES)
+def test_frames_that_are_no_noisy_renders_are_refused_with_the_reason(blender, shot, kind):
+    change, reason = NO_NOISY_FRAMES[kind]
+    shutil.copytree(shot.parent / "frames", shot.parent / "frames" / "denoised")
+    code = f"""{PROBLEMS}{FAILING}"""
+    script = f"""
+FORMAT = ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
+{change}
+if hasattr(scene.render.image_settings, "media_type"):
+    scene.render.image_settings.media_type = FORMAT[0]
+scene.render.image_settings.file_format = FORMAT[1]
+scene.render.filepath = "//other/shot_"
+bpy.ops.render.render(animation=True)
+scene.ravg.noisy = "//other/shot_"
+scene.render.filepath = "//movie/shot_"
+{code}
+answer += [texts()]
+"""
+    error, free, _, said = blender.run(script, blend=shot, command=sys.executable, COMPOSE=COMPOSE)
+    assert "shot_0004.exr is no noisy frame" in error
+    assert reason in error
+    assert free
+    assert said[0].startswith("shot_0004.exr")
+
+
 # --- what goes wrong -----------------------------------------------------------------------------------
 
 FAILING = """
@@ -441,7 +654,7 @@ def test_a_command_that_is_not_there_is_an_error_in_blender(blender, shot):
 
 def test_frames_that_are_not_there_are_an_error_in_blender(blender, blend):
     error, free, _ = blender.run(FAILING, blend=blend, command=sys.executable)
-    assert "render the animation first" in error
+    assert "Render and Denoise renders them" in error
     assert free
 
 
@@ -486,12 +699,13 @@ def draw():
 
 def test_the_panel_of_a_new_scene_is_that_of_the_documentation(blender, blend):
     text = (ROOT / "docs" / "blender.md").read_text(encoding="utf-8")
-    block = re.search(r"```\n(File format.*?)\n```", text, re.DOTALL)
+    block = re.search(r"```\n(Denoising Data.*?)\n```", text, re.DOTALL)
     assert block
-    assert blender.run(DRAWN + "answer = draw()", blend=blend) == block[1].splitlines()
+    code = DRAWN + "scene.cycles.use_denoising = True; answer = draw()"  # as in a new file
+    assert blender.run(code, blend=blend) == block[1].splitlines()
 
 
 def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, rendered):
     code = DRAWN + "jobs.begin(scene); answer = draw()"
     drawn = blender.run(code, blend=rendered, command=sys.executable)
-    assert drawn == ["Preset", "Folder", "Resume", "Rendering", "Stop"]
+    assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Resume", "Rendering", "Stop"]
