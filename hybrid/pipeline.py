@@ -21,7 +21,7 @@ from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
-from hybrid.plausibility import find_lost_light, find_nonfinite
+from hybrid.plausibility import find_nonfinite
 from hybrid.steady import Denoised, DenoiseWindow, Pictures
 from hybrid.timing import Timings
 
@@ -256,8 +256,8 @@ def denoise_frames(
             plan = as_run(rules.plan(*counted[0].facts), counted[0].stages, counted[0].shares)
             layers = [{"color": denoised.color, **denoised.aovs} for denoised, _ in made]
             with timings.stage("check"):
-                for aligner, images in zip(aligners, layers, strict=True):
-                    _check_picture(images, aligner, number)
+                for images in layers:
+                    _check_finite(images, number)
             others_there = _others(number, set.intersection(*({*counts.beside} for counts in counted)))
             own = {
                 "ravg/stages": " ".join(sorted(plan.stages)),
@@ -332,21 +332,11 @@ def _others(number: int, numbers: Iterable[int]) -> str:
     return " ".join(str(n) for n in sorted(numbers) if n != number)
 
 
-def _check_picture(images: Mapping[str, Array], aligner: Aligner, number: int) -> None:
-    """Raise ValueError for a picture that cannot be right: whatever made it so, no file is better than this one."""
+def _check_finite(images: Mapping[str, Array], number: int) -> None:
+    """Raise ValueError for a picture that is not finite: no file is better than this one."""
     for name, layer in images.items():
         if fault := find_nonfinite(layer):
             raise ValueError(f"frame {number}, {name}: {fault}; it was not written")
-    frame = aligner.frames.get(number)
-    if frame is None:
-        return
-
-    def around() -> float:
-        near = (aligner.frames.get(n) for n in aligner.frames.around(number, aligner.radius))
-        return max(other.mean for other in near if other is not None)
-
-    if fault := find_lost_light(images["color"], frame.radiance, frame.valid, around):
-        raise ValueError(f"frame {number}: {fault}; it was not written")
 
 
 def reach_of(estimates: Estimates | None, radius: int, rules: Rules) -> int:

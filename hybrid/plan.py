@@ -27,8 +27,9 @@ STAGES = {
     "drift": "average less of estimates whose light drifts, as samples tell that they do not know",
     "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
-    "mean": "give pictures the local mean of their samples, fireflies included",
     "steady": "average finished frames with those beside them",
+    "mean": "give pictures the local means of their samples, fireflies included, as far as these are known",
+    "samples": "blend samples into pictures where their noise is small against the difference",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
@@ -38,7 +39,7 @@ _NOT_RUN = {
     "drift": "needs estimates of five frames or more",
 }
 # Stages that only a network has.
-NEURAL_STAGES = frozenset({"mean", "steady", "alpha", "skip"})
+NEURAL_STAGES = frozenset({"steady", "alpha", "skip"})
 
 # Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
 STILL = 0.05
@@ -243,8 +244,10 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             _decide("drift", float(len(pairs)), 0, pairs_beside),
             _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
             _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
-            _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
             _decide("steady", float(len(pairs)), 0, pairs_beside),
+            _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
+            # Each pixel decides by itself; a picture is nowhere to be worse than its samples.
+            Decision("samples", True, None, 0, "each pixel is compared with its samples"),
             Decision("alpha", False, None, 0, "no alpha in the file")
             if not transparent
             else _decide("alpha", max(transparent), 0, "{:.1%} of the picture is transparent"),

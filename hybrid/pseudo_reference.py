@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.transfer import autoexposure, compress
+from hybrid.alignment.transfer import compress, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.oidn import denoise_oidn
 from hybrid.timing import Timings
 from nlm.average import average, robust_average
-from nlm.gather import gather, restore_mean
+from nlm.gather import gather
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
 
@@ -176,7 +176,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
     Notes
     -----
     G is the gated average of the estimates, b the gathered picture (`nlm.gather`), O = OIDN(b) with clean guides. The
-    result is G + 0.8 (O − G), given the local mean of b (`nlm.gather.restore_mean`). A share found by cross-validation
+    result is G + 0.8 (O − G). A share found by cross-validation
     (both made once more without the centre, whose noisy picture is then regressed on their difference) takes a third
     run of OIDN, and was worth 0.05 dB less than the constant on thirteen shots.
     """
@@ -196,9 +196,8 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
             None if albedo is None else normal,  # OIDN takes no normal alone
             prefilter="balanced" if noisy else None,
             clean=not noisy,
-            scale=autoexposure(aligned.picture),
+            scale=measure_gain(aligned.picture),
             device=device,
         )
     with timings.stage("gather"):
-        mixed = np.asarray(average + np.float32(SECOND_LOOK) * (seen - average), np.float32)
-        return restore_mean(mixed, image)
+        return np.asarray(average + np.float32(SECOND_LOOK) * (seen - average), np.float32)

@@ -1,7 +1,8 @@
-"""The picture of a frame: its window denoised, given its mean, and averaged with the finished pictures beside it.
+"""The picture of a frame: its window denoised, averaged with the pictures beside it, and corrected by its samples.
 
-Denoisers lose what shines in few samples, fireflies first, which yet belong to the light in expectation. And their
-errors change from frame to frame more than what the frames show: pictures of neighbours that show the same meet again.
+The errors of denoisers change from frame to frame more than the frames do, so pictures of neighbours that show the same
+are averaged. Denoisers and averages lose light that few samples carry, and detail that looks like noise: the samples
+bring both back last, as far as they are certain.
 """
 
 from __future__ import annotations
@@ -15,19 +16,18 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
+from hybrid.plausibility import find_lost_light, find_nonfinite
 from nlm.average import average
 from nlm.fireflies import RECURS
-from nlm.gather import restore_mean
+from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
 
-# By how much a pixel may change at most: layers that are parts of the light change with it, and a part of next to
-# nothing is not to become a light.
+# By how much a pixel may change at most where pictures are averaged, or where it has parts: these change with it, and a
+# part of next to nothing must not become a light.
 MOST = 2.0
-# The mean is restored over so many pixels (σ), by a twentieth at most; a sample counts up to 20 times the light. Limits
-# of 20 to 200 bring the mean equally near, 6 leaves 1 % where lamps are small. Without fireflies 1 to 2.7 % were lost.
-AROUND, GIVEN, TAKEN = 48.0, 0.05, 20.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Pictures:
     -----
     With d the denoised frames, W the warp to the frame t, R what puts them into its light (`nlm.relight`) and c the
     confidence of their comparison (`Aligner.align_pictures`), 1 for the frame itself, the picture of t is
-    Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1. No pixel changes by more than a factor of two. Where light drifts
+    Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1, corrected by the samples (`nlm.samples`). Where light drifts
     (`nlm.drift`), or where nothing could tell (windows of three frames, or without estimates), nothing is put into
     another light, and c is a half at most. Where the light of a whole frame drifts nothing is averaged: c is multiplied
     by how much of it stands still, from 0 (a fifth) to 1 (two fifths).
@@ -109,7 +109,7 @@ class Pictures:
         self.denoise = denoise
         self.rows = rows or aligner.shot.shape[0]
         self.keep_going = keep_going
-        self._made: dict[int, tuple[Denoised, Counts]] = {}
+        self._made: dict[int, tuple[Denoised, Counts, SampleMean | None]] = {}
 
     def make(self, number: int) -> tuple[Denoised, Counts]:
         """Make the picture of frame `number`; its window's counts.
@@ -117,7 +117,8 @@ class Pictures:
         Raises
         ------
         ValueError, OSError
-            If the frame, or one beside it, cannot be made.
+            If the frame, or one beside it, cannot be made, or its light is not that of the noisy frame
+            (`hybrid.plausibility.find_lost_light`).
         """
         beside = self.beside(number)
         self._made = {n: made for n, made in self._made.items() if n in beside}
@@ -129,9 +130,12 @@ class Pictures:
                 except (ValueError, OSError):
                     if n == number or not self.keep_going:
                         raise
-        denoised, counts = self._made[number]
+        denoised, counts, sides = self._made[number]
         if "steady" in counts.stages and len(self._made) > 1:
-            denoised = self._steady(number, denoised, {n: made.color for n, (made, _) in self._made.items()})
+            denoised = self._steady(number, denoised, {n: made.color for n, (made, _, _) in self._made.items()})
+        if (frame := self.aligner.frames.get(number)) is not None:
+            self._check_light(denoised.color, frame)
+            denoised = self._correct(denoised, frame, sides, counts.stages)
         denoised = replace(denoised, color=_with_lamps(denoised.color, self.aligner.frames.get(number)))
         return denoised, replace(counts, beside=tuple(sorted(self._made)))
 
@@ -139,8 +143,8 @@ class Pictures:
         """The frame and those beside it, whose pictures it is averaged with if they can be made."""
         return self.aligner.comparable(number) if "steady" in self.aligner.frames.allowed else [number]
 
-    def _denoise(self, number: int) -> tuple[Denoised, Counts]:
-        """Denoise a frame's own window."""
+    def _denoise(self, number: int) -> tuple[Denoised, Counts, SampleMean | None]:
+        """Denoise a frame's own window, and average the samples of the frames beside it."""
         height, width = self.aligner.shot.shape
         whole: dict[tuple[str, str], Array] = {}
         outliers = 0
@@ -154,6 +158,8 @@ class Pictures:
             named = {("color", ""): part.color}
             named |= {("aovs", name): layer for name, layer in part.aovs.items()}
             named |= {("extra", name): layer for name, layer in part.extra.items()}
+            if aligned.sides is not None:
+                named |= {("sides", name): layer for name, layer in vars(aligned.sides).items()}
             for name, layer in named.items():
                 if self.rows >= height:
                     whole[name] = layer
@@ -162,16 +168,42 @@ class Pictures:
                     whole[name] = np.empty((height, width, *layer.shape[2:]), np.float32)
                 whole[name][band] = layer[aligned.inner]
             del aligned, part, named
-        aovs, extra = (
-            {name: layer for (kind, name), layer in whole.items() if kind == wanted} for wanted in ("aovs", "extra")
+        aovs, extra, sides = (
+            {name: layer for (kind, name), layer in whole.items() if kind == wanted}
+            for wanted in ("aovs", "extra", "sides")
         )
-        denoised = Denoised(whole["color", ""], aovs, extra, parts)
-        frame = self.aligner.frames.get(number)
-        if "mean" in counts.stages and frame is not None:
+        return Denoised(whole["color", ""], aovs, extra, parts), counts, SampleMean(**sides) if sides else None
+
+    def _check_light(self, color: Array, frame: PreparedFrame) -> None:
+        """Raise ValueError for a picture that cannot be right, before its samples hide that."""
+        frames = self.aligner.frames
+
+        def around() -> float:
+            near = (frames.get(n) for n in frames.around(frame.number, self.aligner.radius))
+            return max(other.mean for other in near if other is not None)
+
+        with self.aligner.timings.stage("check"):
+            if find_nonfinite(color):
+                return  # nothing is corrected by it: the pipeline refuses it
+            if fault := find_lost_light(color, frame.radiance, frame.valid, around):
+                raise ValueError(f"frame {frame.number}: {fault}; it was not written")
+
+    def _correct(
+        self, denoised: Denoised, frame: PreparedFrame, sides: SampleMean | None, stages: frozenset[str]
+    ) -> Denoised:
+        """The denoised frame with the means of its samples, and with the samples where they are certain."""
+        color = denoised.color
+        exposure = measure_exposure(color)
+        if "mean" in stages:
             with self.aligner.timings.stage("mean"):
-                light = restore_mean(denoised.color, frame.rendered, sigma=AROUND, most=GIVEN, limit=TAKEN)
-                denoised = _changed(denoised, light)
-        return denoised, counts
+                # First without fireflies: a mean of few bright samples is not known, that of all others is.
+                for noisy in (frame.radiance, *([frame.rendered] if frame.taken else [])):
+                    color = restore_mean(color, _where_rendered(frame, noisy, color), exposure)
+        if sides is not None:
+            with self.aligner.timings.stage("samples"):
+                noisy = _where_rendered(frame, frame.radiance, color)
+                color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
+        return _changed(denoised, color) if denoised.parts else replace(denoised, color=color)
 
     def _steady(self, number: int, denoised: Denoised, pictures: Mapping[int, Array]) -> Denoised:
         """The denoised frame averaged with those beside it, and its parts changed alike."""
@@ -188,16 +220,22 @@ class Pictures:
         return [slice(top, min(top + self.rows, height)) for top in range(0, height, self.rows)]
 
 
+def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array:
+    """The noisy frame, with the picture in the place of pixels that were not finite."""
+    return noisy if frame.valid.all() else np.where(frame.valid[..., None], noisy, picture)
+
+
 def _changed(denoised: Denoised, color: Array) -> Denoised:
     """The picture with another color, and its parts changed alike: by a factor of `MOST` at most."""
     own = denoised.color
     change = np.divide(color, own, out=np.ones_like(own), where=own > 0)
+    within = (change >= 1 / MOST) & (change <= MOST)
     np.clip(change, 1 / MOST, MOST, out=change)
     aovs, extra = (
         {name: layer * change if name in denoised.parts else layer for name, layer in layers.items()}
         for layers in (denoised.aovs, denoised.extra)
     )
-    return replace(denoised, color=own * change, aovs=aovs, extra=extra)
+    return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
 
 
 def _with_lamps(color: Array, frame: PreparedFrame | None) -> Array:

@@ -180,6 +180,15 @@ def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Map
     """Write tensors in place of an empty file of `new_partial`, with its mode.
 
     safetensors replaces the file by one that only its owner may read, whatever the umask.
+
+    Parameters
+    ----------
+    path : Path
+        The empty file.
+    tensors : mapping of str to Tensor
+        By name.
+    metadata : mapping of str to str
+        For the file's header.
     """
     mode = stat.S_IMODE(path.stat().st_mode)
     save_file(dict(tensors), path, dict(metadata))

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from loops.cores import on_all_cores
 from nlm.average import check_window
-from nlm.variance import gaussian_mean
 
 Floats = NDArray[np.float32]
 
@@ -19,8 +18,6 @@ Floats = NDArray[np.float32]
 # seldom goes so far; a firefly goes hundreds of times as far, and no denoiser forgives it: at 15 to 30 samples a
 # picture made without this limit lost up to 10 dB. Limits of 4 to 8 differ by less than 0.1 dB.
 _LIMIT = np.float32(6)
-# Cells of `restore_mean` on a side of σ: what is smoothed by σ = 6 cells has nothing smaller than a cell in it.
-_CELLS = 6
 
 
 @dataclass(frozen=True)
@@ -90,66 +87,26 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
     return Gathered(average, image, samples)
 
 
-def restore_mean(
-    picture: Floats, samples: Floats, *, sigma: float = 24, most: float = 0.1, limit: float = np.inf
-) -> Floats:
-    """Give a denoised picture the local mean of the samples that it was made from.
+def hold_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
+    """Hold a picture to the range of what it was made from.
 
     Parameters
     ----------
     picture : (H, W, 3) float32
-        Denoised, linear, finite.
-    samples : (H, W, 3) float32
-        What it was made from, finite: right in the mean, and noisy.
-    sigma : float
-        Pixels, at least 6.
-    most : float
-        How much may be added or taken away, relative.
-    limit : float
-        How far from the picture a pixel of the samples may be, in units of the picture there and in the mean.
+        Finite.
+    estimates, residuals : (T, H, W, 3) float32
+        As for `gather`, in the unit of the picture.
 
     Returns
     -------
     (H, W, 3) float32
-        The picture times a smooth factor between 1 − most and 1 + most.
-
-    Notes
-    -----
-    With K a Gaussian mean of deviation σ and d = samples − picture in the mean over channels, held to the limit, the
-    factor is 1 + ρ K d / K picture, ρ = max(0, 1 − v / (K d)²): the shrinkage of James and Stein, which adds only what
-    stands out of the noise, whose variance is v = K²(d²), K² the squared weights of K. One bright sample is its own
-    noise, so that nothing is added for it. All means are of cells of σ / 6 pixels.
+        Each channel within the least and the greatest value that the estimates and the samples (estimate + residual)
+        of any frame have within 3×3 pixels. Values that are not finite do not count.
     """
-    difference, level = _gray(samples) - _gray(picture), _gray(picture)
-    if np.isfinite(limit):
-        bound = np.float32(limit) * (level + level.mean(dtype=np.float64).astype(np.float32))
-        np.clip(difference, -bound, bound, out=difference)
-    side, (height, width) = int(sigma / _CELLS), level.shape
-    deviation = sigma / side
-    square_of_difference = _cells(np.square(difference), side)
-    mean = gaussian_mean(_cells(difference, side), deviation)
-    # The squares of a Gaussian's weights are those of one narrower by √2, over 4πσ².
-    variance = gaussian_mean(square_of_difference, deviation / np.sqrt(2)) / np.float32(4 * np.pi * sigma**2)
-    square = np.square(mean)
-    share = np.divide(np.maximum(square - variance, 0), square, out=np.zeros_like(square), where=square > 0)
-    below = gaussian_mean(_cells(level, side), deviation)
-    change = np.divide(share * mean, below, out=np.zeros_like(mean), where=below > 0)
-    factor = 1 + np.clip(change, -most, most)
-    rows, columns = factor.shape
-    factor = cv2.resize(factor, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(picture * factor[:height, :width, None], np.float32)
-
-
-def _cells(image: Floats, side: int) -> Floats:
-    """Means of cells of so many pixels on a side, mirrored to whole ones."""
-    height, width = image.shape
-    whole = cv2.copyMakeBorder(image, 0, -height % side, 0, -width % side, cv2.BORDER_REFLECT)
-    rows, columns = whole.shape[0] // side, whole.shape[1] // side
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _gray(image: Floats) -> Floats:
-    return np.asarray(np.einsum("yxc->yx", image) / np.float32(image.shape[-1]), np.float32)
+    low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
+    on_all_cores(_range, len(picture), estimates, residuals, low, high)
+    box = np.ones((3, 3), np.uint8)
+    return np.clip(picture, cv2.erode(low, box).reshape(low.shape), cv2.dilate(high, box).reshape(low.shape))
 
 
 @njit(cache=True, nogil=True)
@@ -188,3 +145,21 @@ def _gather(
                     image[y, x, c] = (light[c] + noise[c]) / total
                 else:
                     average[y, x, c] = image[y, x, c] = estimates[T // 2, y, x, c]
+
+
+@njit(cache=True, nogil=True)
+def _range(first: int, last: int, estimates: Floats, residuals: Floats, low: Floats, high: Floats) -> None:
+    """Write the least and the greatest finite value of the estimates and the samples of all frames."""
+    T, _, W, C = estimates.shape
+    for y in range(first, last):
+        for x in range(W):
+            for c in range(C):
+                least, most = np.float32(np.inf), np.float32(-np.inf)
+                for t in range(T):
+                    estimate = estimates[t, y, x, c]
+                    sample = estimate + residuals[t, y, x, c]
+                    if np.isfinite(estimate):
+                        least, most = min(least, estimate), max(most, estimate)
+                    if np.isfinite(sample):
+                        least, most = min(least, sample), max(most, sample)
+                low[y, x, c], high[y, x, c] = least, most

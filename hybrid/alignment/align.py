@@ -28,6 +28,7 @@ from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import color_gate, color_gates
 from nlm.relight import relight
+from nlm.samples import average_sides
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -262,6 +263,15 @@ class Aligner:
             aligned = self._finish(
                 centre, own, window, guides, clean, window_of, estimates, beyond, confidence, seen, inner, stages
             )
+            sides = None
+            if "samples" in stages:
+                # Before the estimates are pulled to the centre's: the samples stay what they are.
+                if beyond is None or estimates is None:
+                    sides = average_sides(aligned.color, None, aligned.confidence, aligned.trust, aligned.modulation)
+                else:
+                    residual = beyond()
+                    aligned = replace(aligned, beyond=lambda: residual)
+                    sides = average_sides(estimates, residual, aligned.confidence, aligned.trust, aligned.modulation)
             if estimates is not None and "drift" in stages:
                 confidence = aligned.confidence
                 weight = drift_weights(estimates, aligned.own, confidence, aligned.exposure, first_row=outer.start)
@@ -269,7 +279,8 @@ class Aligner:
                 if "steady" in self.frames.allowed and self._shows_drift(number):
                     whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
                     whole[outer][inner] = weight[aligned.centre + 1][inner]
-        return replace(aligned, tints={name: tint[outer] for name, tint in centre.tints.items()})
+        tints = {name: tint[outer] for name, tint in centre.tints.items()}
+        return replace(aligned, tints=tints, sides=sides)
 
     def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
         """The rows of a frame that these depend on, and where these are among them; all without."""

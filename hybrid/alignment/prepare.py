@@ -136,6 +136,11 @@ class PreparedFrame:
         whole[places] = light
         return self._as_radiance(whole)
 
+    @property
+    def radiance_variance(self) -> Array | None:
+        """Variance of `radiance` (H, W, 3), where the renderer gave one."""
+        return None if self.variance is None else self._as_radiance(self._as_radiance(self.variance))
+
     def _as_radiance(self, irradiance: Array) -> Array:
         if self.albedo is None or not self.demodulated:
             return irradiance

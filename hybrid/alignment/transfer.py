@@ -13,6 +13,9 @@ Array = NDArray[np.float32]
 ALBEDO_FLOOR = 0.1
 # Mean radiance that counts as none: far below any render's, and a spark of 1e8 over it is still a float32.
 NO_LIGHT = 1e-30
+# Share of an image's exposure below which a part of it is not lit. Denoisers leave 1e-10 to 1e-4 on black beside an
+# object; the darkest hundredth of a lit picture hardly changes its mean.
+LIT = 1e-2
 
 
 def demodulate(radiance: Array, albedo: Array) -> Array:
@@ -104,11 +107,11 @@ def expand(compressed: Array, exposure: float) -> Array:
 
 
 def measure_exposure(radiance: Array) -> float:
-    """Measure the brightness of an image: its mean without the brightest hundredth.
+    """Measure the brightness of an image: the mean of what is lit, without its brightest hundredth.
 
     Parameters
     ----------
-    radiance : (..., C) array
+    radiance : (H, W, C) array
         Linear radiance; values that are not finite are left out.
 
     Returns
@@ -116,24 +119,62 @@ def measure_exposure(radiance: Array) -> float:
     float
         Positive, and proportional to the image, so that what is divided by it does not depend on the image's
         scale. 1 for an image without light, or with less than `NO_LIGHT`.
+
+    Notes
+    -----
+    The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times the result,
+    so that an object on black has the exposure of the object alone. Single pixels cannot tell: in noisy images many
+    pixels of a lit surface are black.
     """
-    level = np.einsum("...c->...", radiance).ravel() / np.float32(radiance.shape[-1])
-    level = level[np.isfinite(level)]
-    if level.size == 0:
+    if radiance.size == 0:
         return 1.0
-    # Lamps, sky seen through a window and fireflies are few and bright; they must not decide the exposure.
-    bright = np.partition(level, -1 - level.size // 100)[-1 - level.size // 100]
-    mean = float(np.minimum(level, bright).mean(dtype=np.float64))
-    return mean if mean > NO_LIGHT else 1.0
+    level = np.einsum("...c->...", radiance, dtype=np.float32) / np.float32(radiance.shape[-1])
+    level = np.where(np.isfinite(level), level, np.float32(np.nan))
+    means = _bin_means(level)
+    # Far below any surface beside the brightest lamp that a half float holds, and far above what a denoiser leaves on
+    # black: the first guess has to come without an exposure.
+    brightest = float(np.nanmax(means, initial=0.0))
+    lit = means > max(1e-9 * brightest, NO_LIGHT)
+    exposure = 0.0
+    while lit.any():
+        # Lamps, sky seen through a window and fireflies are few and bright; they must not decide the exposure.
+        inside = level[_spread(lit, level.shape)]
+        inside = inside[np.isfinite(inside)]
+        bright = np.partition(inside, -1 - inside.size // 100)[-1 - inside.size // 100]
+        exposure = float(np.minimum(inside, bright).mean(dtype=np.float64))
+        still_lit = lit & (means > LIT * exposure)
+        if (still_lit == lit).all():
+            break
+        lit = still_lit
+    return exposure if exposure > NO_LIGHT else 1.0
 
 
-def autoexposure(radiance: Array) -> float:
+def measure_gain(picture: Array) -> float:
+    """Factor that a denoised picture is multiplied by before OIDN's transfer curve: `autoexposure` of what is lit.
+
+    Parameters
+    ----------
+    picture : (H, W, 3) array
+        Linear radiance, finite. Denoisers leave tiny values on black, which are no light.
+
+    Returns
+    -------
+    float
+        Positive; ``measure_gain(a·x) = measure_gain(x) / a``.
+    """
+    exposure = measure_exposure(picture)
+    return autoexposure(picture / np.float32(exposure), dark=LIT) / exposure
+
+
+def autoexposure(radiance: Array, *, dark: float = 1e-8) -> float:
     """Factor that OIDN multiplies an image by, so that all of its parts can be given that of the whole.
 
     Parameters
     ----------
     radiance : (H, W, 3) array
-        Linear radiance, finite; what is negative counts as 0.
+        Linear radiance, finite; negative values count as 0.
+    dark : float
+        Bins of at most this luminance are left out.
 
     Returns
     -------
@@ -142,15 +183,33 @@ def autoexposure(radiance: Array) -> float:
 
     Notes
     -----
-    ``0.18 / 2^mean(log2 L)``, L the mean luminances above 1e-8 of bins of at most 16×16 pixels, as in OIDN's
+    ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
     ``training/color.py``; `network.trunk.autoexposure` is the same in torch.
     """
-    luminance = np.maximum(radiance, 0) @ np.array([0.212671, 0.715160, 0.072169])  # float64: no sum overflows
-    for axis in (0, 1):
-        length = luminance.shape[axis]
-        bins = -(-length // 16)
-        edges = np.arange(bins + 1) * length // bins
-        luminance = np.add.reduceat(luminance, edges[:-1], axis=axis)
-        luminance /= np.diff(edges).reshape((-1, 1) if axis == 0 else (1, -1))
-    lit = luminance[luminance > 1e-8]
+    # float64: no sum overflows
+    means = _bin_means(np.maximum(radiance, 0) @ np.array([0.212671, 0.715160, 0.072169]))
+    lit = means[means > dark]
     return float(0.18 / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
+
+
+def _edges(length: int) -> NDArray[np.intp]:
+    """Limits of bins of at most 16 pixels."""
+    bins = max(-(-length // 16), 1)
+    return np.asarray(np.arange(bins + 1) * length // bins, np.intp)
+
+
+def _bin_means(level: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Means over bins of at most 16×16 pixels, without NaN; NaN where a bin has nothing else."""
+    known = np.isfinite(level)
+    sums, counts = np.where(known, level, 0).astype(np.float64), known.astype(np.float64)
+    for axis in (0, 1):
+        first = _edges(level.shape[axis])[:-1]
+        sums, counts = (np.add.reduceat(part, first, axis=axis) for part in (sums, counts))
+    return np.asarray(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0), np.float64)
+
+
+def _spread(bins: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Give each pixel the value of its bin."""
+    for axis in (0, 1):
+        bins = np.repeat(bins, np.diff(_edges(shape[axis])), axis=axis)
+    return bins

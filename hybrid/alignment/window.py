@@ -13,6 +13,7 @@ from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import demodulate
+from nlm.samples import SampleMean
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
 Array = NDArray[np.float32]
@@ -76,6 +77,8 @@ class AlignedWindow:
         On what share of the picture a stage ran that runs only where it is called for, in [0, 1].
     tints : dict of str to (H, W, 3) array
         The centre's color of those of `aovs` that are light without it.
+    sides : SampleMean or None
+        The samples of the frames beside the centre, averaged at its pixels, radiance; with the stage "samples".
     """
 
     number: int
@@ -102,6 +105,7 @@ class AlignedWindow:
     stages: frozenset[str]
     shares: dict[str, float] = field(default_factory=dict)
     tints: dict[str, Array] = field(default_factory=dict)
+    sides: SampleMean | None = None
 
     @cached_property
     def color(self) -> Array:

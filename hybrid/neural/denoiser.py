@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from hybrid.alignment.prepare import ALPHA
-from hybrid.alignment.transfer import autoexposure, compress, measure_exposure
+from hybrid.alignment.transfer import compress, measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.files.layers import light_kind
@@ -29,6 +29,7 @@ from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import MIRRORED, Borders, RobustUNet
 from nlm.average import average
+from nlm.gather import hold_to_window
 from nlm.parts import add_light, adds_up, is_part, split_light
 
 Array = NDArray[np.float32]
@@ -138,6 +139,8 @@ class Denoiser:
     def _run(self, aligned: AlignedWindow) -> Denoised:
         layers = self._layers(aligned)
         irradiance, filtered, parts = self._run_tiles(aligned, layers)
+        if self.takes_estimate:
+            irradiance = hold_to_window(irradiance, layers["estimate"], layers["residual"])
         light, add_up = irradiance, set[str]()
         if self.takes_estimate:
             aovs, light, add_up = _averaged(aligned, irradiance, add=self.add_layers)
@@ -326,6 +329,4 @@ def gain_of(aligned: AlignedWindow) -> torch.Tensor:
     """What radiance is multiplied by before a trunk's transfer curve, (1,): in training and in running."""
     if aligned.picture is None:
         raise ValueError("aligned: expected a window with estimates, got none")
-    # OIDN's has a floor of 1e-8 of what it takes for light; a shot may be in any unit.
-    exposure = measure_exposure(aligned.picture)
-    return torch.tensor([autoexposure(aligned.picture / np.float32(exposure)) / exposure], dtype=torch.float32)
+    return torch.tensor([measure_gain(aligned.picture)], dtype=torch.float32)

@@ -81,7 +81,7 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
 def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, shot, monkeypatch):
     """While one is denoised, memory is at its fullest."""
     begun, read = [], {number: threading.Event() for number in shot.numbers}
-    whole, check = Shot.read, pipeline._check_picture
+    whole, check = Shot.read, pipeline._check_finite
 
     def told(self, number):
         begun.append(number)
@@ -93,13 +93,13 @@ def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, sho
         assert max(begun) <= aligned.number + 1
         return picture(aligned)
 
-    def check_late(images, aligner, number):
+    def check_late(images, number):
         if number == FIRST:
             assert read[FIRST + 2].wait(60)  # of the next window
-        check(images, aligner, number)
+        check(images, number)
 
     monkeypatch.setattr(Shot, "read", told)
-    monkeypatch.setattr(pipeline, "_check_picture", check_late)
+    monkeypatch.setattr(pipeline, "_check_finite", check_late)
     assert len(list(denoise_frames(shot, tmp_path / "out", make, ALONE, radius=1))) == 4
 
 

@@ -8,6 +8,7 @@ from hybrid.alignment.transfer import (
     demodulate,
     expand,
     measure_exposure,
+    measure_gain,
     remodulate,
 )
 
@@ -62,6 +63,29 @@ def test_exposure_ignores_fireflies_and_what_is_not_finite(radiance):
 @pytest.mark.parametrize("image", [np.zeros((4, 5, 3)), np.full((4, 5, 3), np.nan), np.zeros((0, 5, 3))])
 def test_exposure_of_an_image_without_light_is_one(image):
     assert measure_exposure(image.astype(np.float32)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("share", "left"), [(share, left) for share in (0.001, 0.01, 0.1, 1.0) for left in (0.0, 1e-10)] + [(0.1, 1e-5)]
+)
+def test_exposure_and_gain_of_an_object_on_black_are_those_of_the_object(share, left):
+    """Denoisers leave tiny values on black: these are no light, whatever share of the frame is black."""
+    side = round(np.sqrt(share) * 640)
+    item = np.random.default_rng(5).uniform(0.5, 1.5, (side, side, 3)).astype(np.float32)
+    image = np.full((640, 640, 3), left, np.float32)
+    top, start = 16 * ((640 - side) // 32), 16 * ((640 - side) // 32)
+    image[top : top + side, start : start + side] = item
+    # Bins at the border hold black pixels too: of objects of 20 pixels three quarters of all bins.
+    assert measure_exposure(image) == pytest.approx(measure_exposure(item), rel=0.65 if side < 64 else 0.2)
+    assert measure_gain(image) == pytest.approx(measure_gain(item), rel=4 if side < 64 else 0.3)
+    assert measure_gain(64 * image) == pytest.approx(measure_gain(image) / 64, rel=1e-5)
+
+
+def test_exposure_of_a_lit_image_is_its_mean_without_the_brightest_hundredth():
+    image = np.random.default_rng(6).uniform(0.1, 1, (50, 70, 3)).astype(np.float32)
+    level = np.sort(image.mean(axis=-1).ravel())
+    expected = np.minimum(level, level[-1 - level.size // 100]).mean()
+    assert measure_exposure(image) == pytest.approx(expected, rel=1e-6)
 
 
 def test_autoexposure_is_that_of_bins():

@@ -89,8 +89,8 @@ def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path
     found: list[Clip] = []
     monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
     monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    for place in (estimates, pseudo_reference):
-        monkeypatch.setattr(place, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
+    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
+    monkeypatch.setattr(pseudo_reference, "denoise_oidn", lambda color, *_, **__: 0.25 * color)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
     write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="oidn-fast")
     window = Aligner(shot, Rules(), estimates=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)

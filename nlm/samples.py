@@ -1,0 +1,323 @@
+"""The samples of a frame against a denoised picture of it: where their noise is small, the samples win.
+
+A denoiser errs by more than the noise where there is next to none, or where it mistakes detail for noise. The samples
+of a window tell where: those of one frame are independent of those of another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from loops.cores import on_all_cores
+from nlm.average import check_window
+from nlm.variance import gaussian_mean
+
+Floats = NDArray[np.float32]
+
+# A correction counts as far as it exceeds its own noise by so many deviations, and so many times the variance. At 1
+# noise that looks like detail costs up to 1.3 dB of a rendered shot at 8 samples; at 2.5 no shot at 8 to 512 samples
+# loses more than 0.03 dB.
+_DEVIATIONS = 2.5
+_VARIANCES = 2.5
+# Where no other frame tells the noise, the spatial residual does, which a renderer's filter that spreads samples over
+# its neighbours (σ = 1 pixel) makes up to 100 times too small.
+_SPREAD = 300.0
+# Deviations of the Gaussians that errors are averaged with, pixels: over 200 pixels for what frames have in common, and
+# over 50 for what one frame shows alone.
+_SIGMA_SHARED, _SIGMA_OWN = 4.0, 2.0
+# Errors are relative to the light, which is the picture's mean over σ = 2 pixels plus this share of the exposure: in
+# the dark an error is seen by its size, and not by its ratio.
+_DARK = 0.3
+# A relative error counts up to this: a firefly must not decide for all pixels around it.
+_LIMIT = np.float32(6)
+# Means are restored over Gaussians of these deviations, pixels, where their squares exceed k (1 + f / N) times their
+# variance, N being how many samples the noise comes from: (deviation, k, f). A variance that a few bright samples make
+# is not known itself. Without f a shot at 54 dB lost 2 dB to five fireflies; so no shot at 8 to 512 samples loses 0.1.
+_MEANS = (48.0, 1.0, 3000.0), (12.0, 8.0, 300.0)
+# How far a sample may lie from the picture when means are compared, in units of the light. Limits of 20 to 200 bring
+# the mean equally near; 6 leaves 1 % where lamps are small.
+_FAR = np.float32(20)
+# The light that a mean is relative to has this share of its surroundings: there is noise where a picture is black.
+_SOFT = 0.05
+# Light beyond so many exposures is a lamp's, and does not count as the light of its surroundings.
+_LAMP = 4.0
+# The least weight of a frame whose geometry is the centre's, and whose light is not.
+_OTHER_LIGHT = 0.02
+# Variance of a warped frame over that of a rendered one (`nlm.variance`).
+_WARPED = np.float32(0.7)
+
+
+@dataclass(frozen=True)
+class SampleMean:
+    """The samples of the frames beside one, averaged at its pixels.
+
+    Attributes
+    ----------
+    mean : (H, W, 3) float32
+        Radiance; 0 where no frame is trusted.
+    frames : (H, W) float32
+        How many frames it is worth, (Σ c)² / Σ c², c the confidence; 0 where no frame is trusted.
+    trust : (H, W) float32
+        In [0, 1]: whether frames of a confidence of 1 together were averaged.
+    """
+
+    mean: Floats
+    frames: Floats
+    trust: Floats
+
+
+def average_sides(
+    estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats
+) -> SampleMean:
+    """Average the samples of all frames of a window but its centre.
+
+    Parameters
+    ----------
+    estimates : (T, H, W, 3) float32
+        Denoised frames, aligned; with `residuals` None the noisy frames themselves. The centre is ``T // 2``.
+    residuals : (T, H, W, 3) float32, optional
+        Noisy frame minus estimate, aligned.
+    confidence, geometry : (T, H, W) float32
+        At least 0: trust in each pixel of each frame, and what geometry alone trusts. Where only the light differs, a
+        frame tells the noise nevertheless.
+    modulation : (H, W, 3) float32
+        Factor from the unit of the window to radiance.
+
+    Returns
+    -------
+    SampleMean
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other, or T is even.
+    """
+    weight = np.maximum(confidence, np.float32(_OTHER_LIGHT) * geometry)
+    estimates, weight = check_window(estimates, weight, "confidence")
+    if residuals is not None and residuals.shape != estimates.shape:
+        raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
+    mean, frames = np.zeros(estimates.shape[1:], np.float32), np.zeros(weight.shape[1:], np.float32)
+    given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
+    on_all_cores(_average, len(mean), *given, residuals is not None, weight, modulation, mean, frames)
+    middle = len(weight) // 2
+    trust = np.minimum(np.maximum(confidence, geometry).sum(axis=0) - np.maximum(confidence, geometry)[middle], 1)
+    return SampleMean(mean, frames, np.where(frames > 0, trust, 0))
+
+
+def blend_samples(
+    picture: Floats, noisy: Floats, sides: SampleMean, exposure: float, variance: Floats | None = None
+) -> Floats:
+    """Blend samples into a denoised picture, as far as they are certain that it is wrong.
+
+    Parameters
+    ----------
+    picture : (H, W, 3) float32
+        Denoised, linear, finite.
+    noisy : (H, W, 3) float32
+        The frame as rendered, finite.
+    sides : SampleMean
+        The samples of the frames beside it.
+    exposure : float
+        Radiance of middle brightness; it scales with the picture.
+    variance : (H, W, 3) float32, optional
+        Of `noisy`, where the renderer gives it; it is used where no frame beside is trusted.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        `noisy` where it has no noise, `picture` where the noise exceeds what both differ by.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other.
+
+    Notes
+    -----
+    With p the picture, n the noisy frame and m the mean of the frames beside it, times K[n m] / K[m²] where the light
+    has changed, all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
+
+        β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = K[((n − m)(m − p))²] / 4πσ²,
+
+    held to [0, 1]: the noise of n and that of m are independent, so that only what both show beyond p counts. Then p
+    becomes p + w (n − p), w = max(0, 1 − 2.5 K v / K (n − p)²): the shrinkage of James and Stein, with 2.5 times the
+    variance v = (n − m)² / (1 + 0.7 / frames). Where frames beside are not trusted v is the renderer's, or else 300
+    times what `spatial_variance` finds.
+
+    References
+    ----------
+    Firmino, Frisvad and Jensen, Progressive Denoising of Monte Carlo Rendered Images, 2022, doi:10.1111/cgf.14454
+    """
+    if not picture.shape == noisy.shape == sides.mean.shape:
+        raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
+    # Radiance per unit of relative error.
+    light = gaussian_mean(_gray(picture), 2.0) + np.float32(_DARK * exposure)
+    rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
+    mean = sides.mean * _relative_light(noisy, sides, rate)[..., None]
+    sums = np.zeros((4, *light.shape), np.float32)
+    on_all_cores(_compare, len(light), picture, noisy, mean, sides.frames, sides.trust, rate, sums)
+    together, squares, products, temporal = sums
+    # Over as many pixels as a Gaussian averages, 1 / Σ weight².
+    noise = gaussian_mean(products, _SIGMA_SHARED) / np.float32(4 * np.pi * _SIGMA_SHARED**2)
+    found = gaussian_mean(together, _SIGMA_SHARED) - np.float32(_DEVIATIONS) * np.sqrt(noise)
+    shared = np.clip(_ratio(found, gaussian_mean(squares, _SIGMA_SHARED)), 0, 1) * sides.trust
+    blended = picture + shared[..., None] * (mean - picture)
+    if variance is None:
+        alone = np.float32(_SPREAD) * spatial_variance(noisy, blended, rate)
+    else:
+        alone = np.asarray(variance.sum(axis=-1) * np.square(rate), np.float32)
+    own = np.where(sides.trust >= 1, temporal, alone + sides.trust * (temporal - alone))
+    apart = np.square(np.clip((noisy - blended) * rate[..., None], -_LIMIT, _LIMIT)).sum(axis=-1)
+    apart, own = gaussian_mean(apart, _SIGMA_OWN), gaussian_mean(np.minimum(own, 3 * _LIMIT**2), _SIGMA_OWN)
+    share = np.clip(_ratio(apart - np.float32(_VARIANCES) * own, apart), 0, 1)
+    return np.asarray(blended + share[..., None] * (noisy - blended), np.float32)
+
+
+def _relative_light(noisy: Floats, sides: SampleMean, rate: Floats) -> Floats:
+    """The light of a frame over that of the frames beside it, (H, W): by least squares around each pixel."""
+    weight = np.square(rate) * sides.trust
+    together, alone = (
+        gaussian_mean(np.einsum("yxc,yxc->yx", image, sides.mean) * weight, _SIGMA_SHARED)
+        for image in (noisy, sides.mean)
+    )
+    return np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2)
+
+
+def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
+    """Variance of the noise of one frame, relative to the light, summed over channels.
+
+    Parameters
+    ----------
+    noisy, picture : (H, W, 3) float32
+        The frame as rendered, and a denoised picture of it.
+    rate : (H, W) float32
+        One over the light.
+
+    Returns
+    -------
+    (H, W) float32
+        The lesser of what `noisy` and ``noisy − picture`` have after a high-pass filter: detail of the frame adds to
+        the first, and detail that the picture has lost or invented to the second (Immerkær, as
+        `nlm.variance.variance_from_residual`).
+    """
+    kernel = np.array([1, -2, 1], np.float32)
+    found = []
+    for image in (noisy, noisy - picture):
+        left = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101).reshape(image.shape)
+        found.append(gaussian_mean(np.square(left * rate[..., None]).sum(axis=-1) / np.float32(36), _SIGMA_SHARED))
+    return np.minimum(*found)
+
+
+def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
+    """Give a denoised picture the local means of the samples, as far as these are known.
+
+    Parameters
+    ----------
+    picture : (H, W, 3) float32
+        Denoised, linear, finite.
+    noisy : (H, W, 3) float32
+        The frame as rendered, fireflies included, finite: right in the mean.
+    exposure : float
+        Radiance of middle brightness; it scales with the picture.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        The corrected picture; nowhere below 0 where the picture is not.
+
+    Notes
+    -----
+    With K a Gaussian mean, a that of the picture in the mean over channels (of lamps four exposures count), l the
+    picture plus 5 % of a and 0.1 % of the exposure, u = 1 / max(l, a) and d = u (noisy − picture), of noisy − picture
+    at most 20 l, the picture becomes picture + s l K d / K(u l),
+
+        s = max(0, 1 − k (1 + f / N) v / (K d)²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
+
+    in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make the
+    noise: five fireflies tell neither a mean nor its variance. The weight u keeps the light of all pixels but those
+    much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
+    nothing around it. The means over σ = 48 pixels come first (k = 1, f = 3000), then those over 12 (8, 300).
+    """
+    for sigma, certain, few in _MEANS:
+        level = np.maximum(_gray(picture), 0)
+        around = gaussian_mean(np.minimum(level, np.float32(_LAMP * exposure)), sigma)
+        light = level + np.float32(_SOFT) * around + np.float32(1e-3 * exposure)
+        weight = 1 / np.maximum(light, around)
+        lit = gaussian_mean(weight * light, sigma)
+        reach = _FAR * light[..., None]
+        difference = weight[..., None] * np.clip(noisy - picture, -reach, reach)
+        mean = np.dstack([gaussian_mean(difference[..., c], sigma) for c in range(3)])
+        square = np.square(difference).mean(axis=-1)
+        # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
+        pixels = np.float32(min(4 * np.pi * sigma**2, square.size))
+        noise, fourth = (gaussian_mean(power, sigma) for power in (square, np.square(square)))
+        unsure = np.float32(certain) * (1 + _ratio(np.float32(few) * fourth, pixels * np.square(noise)))
+        known = np.square(mean).mean(axis=-1)
+        share = np.clip(_ratio(known - unsure * noise / pixels, known), 0, 1)
+        picture = np.maximum(picture + mean * (share * light / lit)[..., None], np.minimum(picture, 0))
+    return np.asarray(picture, np.float32)
+
+
+def _ratio(a: Floats, b: Floats) -> Floats:
+    return np.divide(a, b, out=np.zeros_like(b), where=b > 0)
+
+
+def _gray(image: Floats) -> Floats:
+    return np.asarray(np.einsum("yxc->yx", image) / np.float32(image.shape[-1]), np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average(
+    first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, modulation: Floats,
+    mean: Floats, frames: Floats,
+) -> None:  # fmt: skip
+    T, _, W, C = estimates.shape
+    for y in range(first, last):
+        for x in range(W):
+            total, squares = np.float64(0), np.float64(0)  # the square of a small confidence must not vanish
+            for t in range(T):
+                weight = confidence[t, y, x]
+                if t == T // 2 or not weight > 0:
+                    continue
+                level = np.float32(0)
+                for c in range(C):
+                    level += estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
+                if not np.isfinite(level):
+                    continue
+                total += weight
+                squares += np.float64(weight) ** 2
+                for c in range(C):
+                    value = estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
+                    mean[y, x, c] += weight * value * modulation[y, x, c]
+            if total > 0:
+                frames[y, x] = total * total / squares
+                for c in range(C):
+                    mean[y, x, c] /= np.float32(total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compare(
+    first: int, last: int, picture: Floats, noisy: Floats, sides: Floats, frames: Floats, trust: Floats, rate: Floats,
+    sums: Floats,
+) -> None:  # fmt: skip
+    """Sum over channels, where sides are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
+    _, W, C = picture.shape
+    for y in range(first, last):
+        for x in range(W):
+            if not trust[y, x] > 0:
+                continue
+            scale, product = rate[y, x], np.float32(0)
+            for c in range(C):
+                own = min(max(scale * (noisy[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
+                side = min(max(scale * (sides[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
+                apart = min(max(scale * (noisy[y, x, c] - sides[y, x, c]), -_LIMIT), _LIMIT)
+                sums[0, y, x] += own * side
+                sums[1, y, x] += side * side
+                product += apart * side
+                sums[3, y, x] += apart * apart / (1 + _WARPED / frames[y, x])
+            sums[2, y, x] = product * product

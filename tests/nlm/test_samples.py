@@ -1,0 +1,219 @@
+"""Samples correct a picture as far as they are certain: nothing else moves it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nlm.samples import SampleMean, average_sides, blend_samples, restore_mean
+
+SHAPE = (96, 128)
+ONES = np.ones((*SHAPE, 3), np.float32)
+
+
+def lines(seed: int = 1) -> np.ndarray:
+    """Detail that a denoiser loses: lines of one pixel over a soft gradient."""
+    image = np.linspace(0.2, 1, SHAPE[1], dtype=np.float32)[None, :, None] * ONES
+    image[::7] *= 3
+    image[:, ::11] *= 0.3
+    return image * np.random.default_rng(seed).uniform(0.9, 1.1, image.shape).astype(np.float32)
+
+
+def noisy(truth: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Skewed, unbiased, multiplicative noise."""
+    if noise == 0:
+        return truth.copy()
+    grain = np.random.default_rng(seed).gamma(1 / noise**2, noise**2, truth.shape[:2])[..., None]
+    return (truth * grain).astype(np.float32)
+
+
+def window(truth: np.ndarray, noise: float, frames: int = 5) -> tuple[np.ndarray, SampleMean]:
+    """The noisy centre, and the mean of the frames beside it."""
+    all_frames = np.stack([noisy(truth, noise, 10 + t) for t in range(frames)])
+    confidence = np.ones(all_frames.shape[:3], np.float32)
+    return all_frames[frames // 2], average_sides(all_frames, None, confidence, confidence, np.ones_like(truth))
+
+
+def error(image: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(image - truth, dtype=np.float64))))
+
+
+def test_the_mean_of_the_sides_is_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    estimates = rng.random((5, 9, 11, 3), np.float32)
+    residuals = rng.normal(0, 1, estimates.shape).astype(np.float32)
+    confidence = rng.random((5, 9, 11), np.float32)
+    confidence[:, 3] = 0
+    estimates[0, 5] = np.nan
+    modulation = rng.uniform(0.1, 1, (9, 11, 3)).astype(np.float32)
+    found = average_sides(estimates, residuals, confidence, np.zeros_like(confidence), modulation)
+    for y, x in np.ndindex(9, 11):
+        sides = [t for t in (0, 1, 3, 4) if confidence[t, y, x] > 0 and np.isfinite(estimates[t, y, x]).all()]
+        weights = confidence[sides, y, x].astype(np.float64)
+        if not sides:
+            assert not found.mean[y, x].any()
+            assert found.frames[y, x] == found.trust[y, x] == 0
+            continue
+        mean = (weights[:, None] * (estimates + residuals)[sides, y, x]).sum(axis=0) / weights.sum() * modulation[y, x]
+        np.testing.assert_allclose(found.mean[y, x], mean, rtol=1e-5, atol=1e-6)
+        assert found.frames[y, x] == pytest.approx(weights.sum() ** 2 / np.square(weights).sum(), rel=1e-5)
+        assert found.trust[y, x] == pytest.approx(min(confidence[[0, 1, 3, 4], y, x].sum(), 1), rel=1e-5)
+
+
+@pytest.mark.parametrize("blurred", [True, False])
+def test_samples_without_noise_win(blurred: bool) -> None:
+    truth = lines()
+    own, sides = window(truth, 0)
+    wrong = 0.5 * truth + 0.5 * truth.mean() if blurred else 1.3 * truth
+    # The share of the samples is 1 but for what float32 rounds.
+    np.testing.assert_allclose(blend_samples(wrong, own, sides, 0.5), truth, rtol=1e-5)
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001])
+@pytest.mark.parametrize("wrong", [0.0, 0.02, 0.2])
+def test_the_picture_is_never_worse_than_the_samples_or_itself(noise: float, wrong: float) -> None:
+    """A ladder of noise: where the samples are better they win, and a right picture stays."""
+    truth = lines()
+    own, sides = window(truth, noise)
+    smooth = truth + np.float32(wrong) * (truth.mean(axis=(0, 1)) - truth)
+    result = blend_samples(smooth.astype(np.float32), own, sides, 0.5)
+    # Noise that looks like detail by chance costs a thirtieth of itself.
+    assert error(result, truth) <= 1.02 * min(error(own, truth), error(smooth, truth)) + 0.03 * error(own, truth)
+
+
+def test_a_firefly_of_one_frame_is_no_reason() -> None:
+    truth = lines()
+    own, sides = window(truth, 0.05)
+    own[40, 50] = 80
+    result = blend_samples(truth, own, sides, 0.5)
+    assert np.abs(result[35:46, 45:56] - truth[35:46, 45:56]).max() < 0.1
+
+
+def test_a_side_frame_that_shows_something_else_is_no_reason() -> None:
+    """The samples of the centre have a veto: trusted neighbours that are wrong change nothing."""
+    truth = lines()
+    own = noisy(truth, 0.2, 3)
+    other = np.ascontiguousarray(truth[::-1, ::-1])
+    sides = SampleMean(other, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32))
+    assert error(blend_samples(truth, own, sides, 0.5), truth) < 0.03 * error(other, truth)
+
+
+def test_side_frames_in_another_light_tell_the_noise_nevertheless() -> None:
+    truth = lines()
+    own, sides = window(truth, 0.01)
+    dim = SampleMean(np.float32(0.7) * sides.mean, sides.frames, sides.trust)
+    smooth = np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape).astype(np.float32)
+    assert error(blend_samples(smooth, own, dim, 0.5), truth) < 1.5 * error(own, truth)
+
+
+def test_a_frame_alone_that_is_flat_has_no_noise() -> None:
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    flat = np.full_like(ONES, 0.5)
+    textured = flat * np.random.default_rng(4).uniform(0.8, 1.1, flat.shape).astype(np.float32)
+    np.testing.assert_allclose(blend_samples(textured, flat, alone, 0.5), flat, rtol=1e-5)
+
+
+@pytest.mark.parametrize("spread", [1, 3])
+def test_a_frame_alone_with_noise_is_left_to_the_picture(spread: int) -> None:
+    """Filters of a renderer may spread samples over several pixels: smooth noise is noise nevertheless."""
+    import cv2
+
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    own = cv2.GaussianBlur(noisy(ONES, 0.5, 5), (0, 0), 0.8) if spread > 1 else noisy(ONES, 0.5, 5)
+    assert np.abs(blend_samples(ONES, own, alone, 1.0) - ONES).max() < 0.02
+
+
+def test_the_variance_of_the_renderer_counts_where_no_frame_beside_does() -> None:
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    truth = lines()
+    own = noisy(truth, 0.01, 6)
+    known = np.square(np.float32(0.01) * truth)
+    smooth = np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape).astype(np.float32)
+    assert error(blend_samples(smooth, own, alone, 0.5, known), truth) < 0.1 * error(smooth, truth)
+    unsure = np.full_like(truth, 10)
+    np.testing.assert_array_equal(blend_samples(smooth, own, alone, 0.5, unsure), smooth)
+
+
+@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
+def test_both_corrections_scale_with_the_light(scale: float) -> None:
+    truth = lines()
+    own, sides = window(truth, 0.1)
+    bright = SampleMean(np.float32(scale) * sides.mean, sides.frames, sides.trust)
+    smooth = np.float32(0.9) * truth
+    more = np.float32(scale)
+    np.testing.assert_allclose(
+        blend_samples(more * smooth, more * own, bright, scale * 0.5), more * blend_samples(smooth, own, sides, 0.5),
+        rtol=1e-4,
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        restore_mean(more * smooth, more * own, scale * 0.5), more * restore_mean(smooth, own, 0.5), rtol=1e-4
+    )
+
+
+def test_black_stays_black() -> None:
+    black = np.zeros_like(ONES)
+    sides = SampleMean(black, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32))
+    np.testing.assert_array_equal(blend_samples(black, black, sides, 1.0), black)
+    np.testing.assert_array_equal(restore_mean(black, black, 1.0), black)
+
+
+def test_lost_light_comes_back_and_noise_stays_out() -> None:
+    truth = np.linspace(0.4, 1.2, 160, dtype=np.float32)[:, None, None] * np.ones((160, 160, 3), np.float32)
+    own = noisy(truth, 0.5, 7)
+    dark = restore_mean(np.float32(0.97) * truth, own, 0.8)
+    # 25 600 pixels with a deviation of a half: their mean is known to 0.3 %, and counts nearly in full.
+    assert abs(dark.mean() / truth.mean() - 1) < 0.006
+    # What is right already moves by no more than its noise, and most of it hardly at all.
+    right = np.abs(restore_mean(truth, own, 0.8) / truth - 1)
+    assert right.max() < 0.04
+    assert np.median(right) < 0.005
+
+
+def test_light_of_one_channel_comes_back_in_that_channel() -> None:
+    own = noisy(ONES, 0.3, 8)
+    result = restore_mean(ONES * np.float32([0.95, 1, 1]), own, 1.0)
+    np.testing.assert_allclose(result.mean(axis=(0, 1)), own.mean(axis=(0, 1)), rtol=0.004)
+
+
+def test_dark_places_beside_bright_ones_have_a_mean_of_their_own() -> None:
+    truth = np.where(np.arange(SHAPE[1])[None, :, None] < 64, np.float32(0.002), np.float32(0.7)) * ONES
+    own = noisy(truth, 0.3, 9)
+    wrong = truth * np.where(truth < 0.1, np.float32(1.4), np.float32(1))
+    result = restore_mean(wrong, own, 0.35)
+    assert abs(result[:, :40].mean() / truth[:, :40].mean() - 1) < 0.05
+    assert abs(result[:, 90:].mean() / truth[:, 90:].mean() - 1) < 0.01
+
+
+@pytest.mark.parametrize("lamp", [30.0, 1000.0, 65504.0])
+def test_a_lamp_that_is_too_bright_darkens_nothing_around_it(lamp: float) -> None:
+    truth = np.full_like(ONES, 0.3)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    inside = np.hypot(y - 48, x - 64) < 4
+    truth[inside] = lamp
+    own = noisy(truth, 0.2, 11)
+    own[inside] = lamp
+    picture = truth.copy()
+    picture[inside] *= 1.1
+    room = ~inside
+    assert abs(restore_mean(picture, own, 0.3)[room].mean() / own[room].mean() - 1) < 0.005
+
+
+def test_a_few_fireflies_glow_over_nothing() -> None:
+    truth = np.full_like(ONES, 0.3)
+    own = noisy(truth, 0.02, 12)
+    rng = np.random.default_rng(13)
+    own[rng.integers(0, SHAPE[0], 6), rng.integers(0, SHAPE[1], 6)] = 6
+    assert np.abs(restore_mean(truth, own, 0.3) / truth - 1).max() < 0.002
+
+
+def test_negative_light_is_no_less_than_it_was() -> None:
+    picture = np.full_like(ONES, -0.05)
+    assert restore_mean(picture, picture - 1, 1.0).min() >= -0.05
+
+
+def test_shapes_must_fit() -> None:
+    own, sides = window(lines(), 0.1)
+    with pytest.raises(ValueError, match="noisy: expected shape"):
+        blend_samples(lines()[1:], own, sides, 1.0)
+    with pytest.raises(ValueError, match="residuals: expected shape"):
+        average_sides(np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), np.ones((4, 5, 3)))
