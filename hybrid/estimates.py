@@ -277,7 +277,7 @@ def _choose(
 
 def _bundled(mode: str, run: Callable[..., Array], reason: str) -> EstimateSource:
     quality = OIDN_MODES[mode]["quality"]
-    return EstimateSource("bundled", OfFrames(partial(estimate_oidn, denoise=run, quality=quality), HOLDS), reason)
+    return EstimateSource("bundled", OfFrames(partial(estimate_oidn, denoise=run, quality=quality)), reason)
 
 
 def _oidn(
@@ -292,7 +292,8 @@ def _oidn(
     kept = None if keep is None else keep(mode, quicker is not None, device)
     if kept is not None:
         run = partial(kept.read_or_run, run=run)
-    estimates = OfGuidedFrames(run, HOLDS) if mode == "oidn-clean" else OfFrames(run, HOLDS)
+    holds = HOLDS if quicker is None else 0  # networks in torch work on a strip at a time
+    estimates = OfGuidedFrames(run, holds) if mode == "oidn-clean" else OfFrames(run, holds)
     places = () if kept is None else tuple(kept.places.values())
     return EstimateSource(mode, estimates, reason, kept=places, device=device)
 

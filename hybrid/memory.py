@@ -17,11 +17,14 @@ from hybrid.oidn import HOLDS
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
 # What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
-BASE, BASE_NEURAL = 230 * 2**20, 720 * 2**20
+BASE, BASE_NEURAL = 220 * 2**20, 470 * 2**20
+# What OIDN takes for itself: its code, which is there beside torch anyway; and for each pixel, up to its limit.
+OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 270 * 2**20, 80 * 2**20, 240
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
-SHARE = 0.92
-# Planes that come and go while a frame is prepared, and while rows of a window are filtered.
-PREPARING, FILTERING = 14, 40
+SHARE = 0.97
+# Planes that come and go while a frame is prepared, while rows of a window are filtered, and while they are given to a
+# network.
+PREPARING, FILTERING, GIVING = 14, 40, 12
 # And while TV-L1 solves for a flow.
 REFINING = 45
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -50,7 +53,7 @@ def plan_rows(
     estimates: Estimates | None = None,
     *,
     radius: int = 2,
-    neural: bool,
+    network: int | None = None,
     gathers: bool = False,
 ) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
@@ -67,8 +70,8 @@ def plan_rows(
         Where the estimates of single frames come from.
     radius : int
         Frames on each side of the centre.
-    neural : bool
-        Whether the network runs.
+    network : int, optional
+        Bytes that the network takes while it runs; None where none does.
     gathers : bool
         Whether samples are gathered, and denoised by OIDN.
 
@@ -88,11 +91,13 @@ def plan_rows(
     is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
     """
     height, width = shot.shape
-    kept, passing, worked = _planes(shot, stages, estimates, radius, neural)
+    kept, passing, worked = _planes(shot, stages, estimates, radius, network is not None)
     plane = 4 * height * width
-    base = (BASE_NEURAL if neural else BASE) + (0 if estimates is None else estimates.holds)
+    base, oidn = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
+    base += min(
+        HOLDS if gathers else 0 if estimates is None else estimates.holds, oidn + OIDN_OF_PIXEL * height * width
+    )
     if gathers:
-        base += HOLDS - min(HOLDS, 0 if estimates is None else estimates.holds)
         worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
 
     def needed(rows: int) -> int:
@@ -125,7 +130,9 @@ def _planes(
     kept = frames * frame + _planes_of_flows(layers, stages, frames, radius) + pictures * _planes_written(layers)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = max(len(header.channel_names) + frame + PREPARING, REFINING if _can_refine(stages) else 0)
-    worked = 2.0 * window + FILTERING + (window if neural else 0)
+    # Estimates that come from windows are filtered beside a network too.
+    filtered = not neural or (estimates is not None and reach > radius)
+    worked = 2.0 * window + (FILTERING if filtered else GIVING)
     return kept, passing, worked
 
 

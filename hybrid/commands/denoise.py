@@ -361,7 +361,7 @@ def denoise(
         judgement=judgement,
         others=beside,
         radius=denoiser.radius,
-        neural=True,
+        network=denoiser.holds(opened.shape),
     )
     counted = Breakdown()
     with _last_pass(job, passes) as last:
@@ -503,7 +503,7 @@ class Job:
     judgement: Judgement
     others: Sequence[tuple[Shot, EstimateSource]] = ()
     radius: int = 2
-    neural: bool = False
+    network: int | None = None  # bytes that the network takes while it runs, if one does
     gathers: bool = False  # samples of the window, which OIDN then denoises
     before: SourcesOf | None = None  # what the shot was made from, if a pass has made it
 
@@ -614,7 +614,7 @@ def _denoise(job: Job, record: Record) -> None:
             rules.allowed,
             source.estimates,
             radius=job.radius,
-            neural=job.neural,
+            network=job.network,
             gathers=job.gathers,
         )
     taken = shot.layers(shot.numbers[0])
@@ -626,7 +626,7 @@ def _denoise(job: Job, record: Record) -> None:
     # Not where things lie: what was read from there is told by the files and layers that each picture was made from.
     elsewhere = ("profile", "estimate" if source.files else "")
     settings = {name: value for name, value in job.settings.items() if name not in elsewhere}
-    attributes = describe_run(job.command, job.preset, source, rules, settings, neural=job.neural)
+    attributes = describe_run(job.command, job.preset, source, rules, settings, neural=job.network is not None)
     judged = list(job.judgement.findings)
     judgement = [vars(finding) for finding in judged]
     record.write(timings, layers=layers, warnings=shot.warnings, judged=judgement)
@@ -689,7 +689,7 @@ def _denoise(job: Job, record: Record) -> None:
     means_of_shot = {"with_fireflies": with_fireflies, "without": without}
     record.write(timings, plan=[vars(decision) for decision in plan], mean=means_of_shot)
     for decision in plan:
-        if job.neural or decision.stage not in NEURAL_STAGES:
+        if job.network is not None or decision.stage not in NEURAL_STAGES:
             LOG.info(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
     table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
     for row in timings.rows(pixels):

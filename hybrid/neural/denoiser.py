@@ -39,6 +39,9 @@ HALO = 48
 # Sides of a tile: what predicts kernels, what makes pictures, which needs less memory for a pixel and more around it
 # (1920×1080 is one tile); and where memory is short.
 TILE, TILE_OF_TRUNK, SMALL_TILE = 640, 2048, 384
+# Bytes that a network takes for each pixel of a tile while it runs in bfloat16, by measurement: of what makes pictures,
+# by the size of its trunk; of what predicts kernels. float32 takes twice as much.
+SCRATCH_OF_TRUNK, SCRATCH = {"small": 100, "base": 100, "large": 500}, 2500
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 
@@ -119,6 +122,13 @@ class Denoiser:
     def halo(self) -> int:
         """Pixels of context around a tile."""
         return HALO_OF_TRUNK if self.takes_estimate else HALO
+
+    def holds(self, shape: tuple[int, int]) -> int:
+        """Bytes that the network takes while it runs on frames of this height and width, beside its weights."""
+        model = self.model
+        each = SCRATCH_OF_TRUNK[model.config.size] if isinstance(model, RobustUNet) else SCRATCH
+        height, width = (min(side, self.tile + 2 * self.halo) for side in shape)
+        return each * height * width * (1 if self.precision == "bfloat16" else 2)
 
     @property
     def radius(self) -> int:

@@ -420,14 +420,14 @@ def test_the_network_in_parts_is_the_network(tall, rows):
 
 def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
     shot = open_shot(tall)
-    assert plan_rows(2**40, shot, STAGES, None, neural=False) is None
+    assert plan_rows(2**40, shot, STAGES, None) is None
     assert draft(tall, tmp_path / "out", "--max-memory", "10M") == 1
     assert "expected at least" in capsys.readouterr().err
     monkeypatch.setattr(type(shot), "shape", (2160, 3840))
     rows = []
     for size in range(2, 33):
         with suppress(ValueError):  # too little
-            rows.append(plan_rows(size * 2**30, shot, STAGES, None, neural=False) or 2160)
+            rows.append(plan_rows(size * 2**30, shot, STAGES, None) or 2160)
     assert rows == sorted(rows)  # more memory, more rows
     assert len(set(rows)) > 2
     assert rows[-1] == 2160
