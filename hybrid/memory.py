@@ -6,6 +6,7 @@ times as much, only for some rows. So memory has a lower bound, and what is aske
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection
 
@@ -94,9 +95,8 @@ def plan_rows(
     kept, passing, worked = _planes(shot, stages, estimates, radius, network is not None)
     plane = 4 * height * width
     base, oidn = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
-    base += min(
-        HOLDS if gathers else 0 if estimates is None else estimates.holds, oidn + OIDN_OF_PIXEL * height * width
-    )
+    holds = HOLDS if gathers else 0 if estimates is None else estimates.holds
+    base += min(holds, oidn + OIDN_OF_PIXEL * height * width)
     if gathers:
         worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
 
@@ -107,9 +107,9 @@ def plan_rows(
     if needed(height) <= budget:
         return None
     if needed(STRIP) > budget:
-        least = needed(STRIP) / SHARE / 2**30
+        least = math.ceil(100 * needed(STRIP) / SHARE / 2**30) / 100  # so much is enough
         raise ValueError(
-            f"max-memory is {limit / 2**30:.1f} GiB, expected at least {least:.1f} GiB for {width}x{height} pixels"
+            f"max-memory is {limit / 2**30:.2f} GiB, expected at least {least:.2f} GiB for {width}x{height} pixels"
         )
     rows = STRIP
     while needed(rows + STRIP) <= budget:
@@ -131,7 +131,7 @@ def _planes(
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = max(len(header.channel_names) + frame + PREPARING, REFINING if _can_refine(stages) else 0)
     # Estimates that come from windows are filtered beside a network too.
-    filtered = not neural or (estimates is not None and reach > radius)
+    filtered = not neural or (estimates is not None and estimates.from_noisy)
     worked = 2.0 * window + (FILTERING if filtered else GIVING)
     return kept, passing, worked
 

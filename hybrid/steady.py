@@ -228,9 +228,9 @@ def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array
 def _changed(denoised: Denoised, color: Array) -> Denoised:
     """The picture with another color, and its parts changed alike: by a factor of `MOST` at most."""
     own = denoised.color
-    change = np.divide(color, own, out=np.ones_like(own), where=own > 0)
-    within = (change >= 1 / MOST) & (change <= MOST)
-    np.clip(change, 1 / MOST, MOST, out=change)
+    bounded = np.clip(color, own / MOST, own * MOST)  # before the division, which may exceed float32
+    change = np.divide(bounded, own, out=np.ones_like(own), where=own > 0)
+    within = (own <= 0) | (bounded == color)
     aovs, extra = (
         {name: layer * change if name in denoised.parts else layer for name, layer in layers.items()}
         for layers in (denoised.aovs, denoised.extra)

@@ -18,13 +18,14 @@ import pytest
 
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
-from hybrid.estimates import OfWindows
+from hybrid.estimates import OfFrames, OfWindows
 from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.interrupt import interruptible
 from hybrid.memory import parse_size, plan_rows
-from hybrid.plan import STAGES
+from hybrid.oidn import HOLDS
+from hybrid.plan import STAGES, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.hard_cases.test_hard_files import ROOT, run_alone
 from tests.scenes import Scene
@@ -431,6 +432,42 @@ def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
     assert rows == sorted(rows)  # more memory, more rows
     assert len(set(rows)) > 2
     assert rows[-1] == 2160
+
+
+PEAKS = [
+    # Size, bytes of a pixel that the network takes, OIDN; peak memory of the command with a limit that it is far below.
+    ((180, 320), None, 0, 0.27),  # pseudoref --preset draft
+    ((540, 960), None, 0, 0.81),
+    ((540, 960), None, HOLDS, 1.17),  # with --estimate oidn-best
+    ((180, 320), 100, 0, 0.51),  # denoise --preset fast
+    ((540, 960), 100, 0, 1.02),
+    ((1080, 1920), 100, 0, 2.47),
+]
+
+
+@pytest.mark.parametrize(("size", "scratch", "holds", "peak"), PEAKS)
+def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size, scratch, holds, peak):
+    """320×180 was refused "at least 2.3 GiB" for a run that peaks at 0.54 GiB."""
+    shot = open_shot(Scene(frames=5).write(tmp_path))
+    monkeypatch.setattr(type(shot), "shape", size)
+    side = min(size[0], 608), min(size[1], 608)
+    network = None if scratch is None else scratch * side[0] * side[1]
+    estimates = OfFrames(lambda frame: frame.color, holds)
+
+    def plan(gibibytes):
+        return plan_rows(round(gibibytes * 2**30), shot, Rules().allowed, estimates, network=network)
+
+    assert plan(1.15 * peak) is None
+    with suppress(ValueError):
+        assert plan(0.95 * peak) is not None  # a part of the frame at a time
+
+
+def test_the_least_memory_that_a_refusal_names_is_enough(tall):
+    shot = open_shot(tall)
+    with pytest.raises(ValueError, match=r"max-memory is 0\.10 GiB, expected at least (\d\.\d\d) GiB") as error:
+        plan_rows(parse_size("0.1G"), shot, STAGES)
+    least = str(error.value).split("at least ")[1].split()[0]
+    assert plan_rows(parse_size(f"{least}G"), shot, STAGES) in (None, 64)
 
 
 def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from hybrid.files.sources import MADE_FROM
 from hybrid.pipeline import BESIDE, denoise_frames
 from hybrid.plan import Rules, decide, plan_shot
 from hybrid.records import read_records
-from hybrid.steady import MOST, Denoised, Pictures
+from hybrid.steady import MOST, Denoised, Pictures, _changed
 from tests.scenes import Scene
 
 MOVING = Scene(frames=7, noise=0.1)
@@ -374,6 +374,16 @@ class TestInFiles:
         )
         *_, last = self.run(shot, tmp_path / "out", nearly(MOVING), estimates=estimates)
         assert read_exr(last.path).parts[0].header[BESIDE] == f"{MIDDLE - 1}"
+
+
+def test_the_change_of_a_pixel_that_was_nearly_black_does_not_overflow():
+    """numpy warned of it in the terminal."""
+    own = np.float32([[[1e-42, 0.0, 1.0]]])
+    color = np.float32([[[1.0, 0.5, 1.2]]])
+    with np.errstate(all="raise", under="ignore"):
+        found = _changed(Denoised(own, {"part": own}, {}, frozenset({"part"})), color)
+    np.testing.assert_allclose(found.color, [[[MOST * 1e-42, 0.5, 1.2]]], rtol=1e-2)
+    np.testing.assert_allclose(found.aovs["part"], [[[MOST * 1e-42, 0.0, 1.2]]], rtol=1e-2)
 
 
 @pytest.mark.neural
