@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
-from hybrid.oidn import HOLDS, denoise_oidn, find_device, why_no_oidn
+from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
 from hybrid.plausibility import LOST, find_lost_light, find_other_frame
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
@@ -292,7 +292,8 @@ def _oidn(
     kept = None if keep is None else keep(mode, quicker is not None, device)
     if kept is not None:
         run = partial(kept.read_or_run, run=run)
-    holds = HOLDS if quicker is None else 0  # networks in torch work on a strip at a time
+    most = HOLDS_FAST if mode == "oidn-fast" else HOLDS
+    holds = most if quicker is None else 0  # networks in torch work on a strip at a time
     estimates = OfGuidedFrames(run, holds) if mode == "oidn-clean" else OfFrames(run, holds)
     places = () if kept is None else tuple(kept.places.values())
     return EstimateSource(mode, estimates, reason, kept=places, device=device)

@@ -13,14 +13,17 @@ from collections.abc import Collection
 from hybrid.alignment.align import MARGIN, Estimates
 from hybrid.files.frames import Shot
 from hybrid.files.layers import Layers
-from hybrid.oidn import HOLDS
+from hybrid.oidn import HOLDS, HOLDS_FAST
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
 # What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
 BASE, BASE_NEURAL = 220 * 2**20, 470 * 2**20
-# What OIDN takes for itself: its code, which is there beside torch anyway; and for each pixel, up to its limit.
-OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 270 * 2**20, 80 * 2**20, 240
+# What OIDN takes: its code, most of which is there beside torch anyway; and for each pixel, up to its limit, while it
+# runs in its slowest mode.
+OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 230 * 2**20, 80 * 2**20, 750
+# And of that, what stays when it has run.
+CODE = 64 * 2**20
 # Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
 SHARE = 0.97
 # Planes that come and go while a frame is prepared, while rows of a window are filtered, and while they are given to a
@@ -94,14 +97,18 @@ def plan_rows(
     height, width = shot.shape
     kept, passing, worked = _planes(shot, stages, estimates, radius, network is not None)
     plane = 4 * height * width
-    base, oidn = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
-    holds = HOLDS if gathers else 0 if estimates is None else estimates.holds
-    base += min(holds, oidn + OIDN_OF_PIXEL * height * width)
+    base, code = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
+    holds = 0 if estimates is None else estimates.holds
     if gathers:
+        holds = max(holds, HOLDS_FAST)
         worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
+    oidn = min(holds, code + OIDN_OF_PIXEL * height * width * holds // HOLDS)
 
     def needed(rows: int) -> int:
-        return base + round(plane * (kept + max(passing, worked * min(rows + 2 * MARGIN, height) / height)))
+        share = min(rows + 2 * MARGIN, height) / height
+        # Estimates are made while frames are prepared; what is gathered is denoised while rows are worked on.
+        at_once = max(plane * passing + oidn, plane * worked * share + (oidn if gathers else min(oidn, CODE)))
+        return base + round(plane * kept + at_once)
 
     budget = round(SHARE * limit)
     if needed(height) <= budget:

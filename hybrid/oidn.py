@@ -18,8 +18,8 @@ Quality = Literal["high", "balanced", "fast"]
 # or its pictures would depend on the memory that somebody happens to allow. Its small networks take no longer with half
 # of it, at 1920×1080 and to the same bits; the others a quarter longer.
 MEMORY_MB = {"high": 1024, "balanced": 1024, "fast": 512}
-# Bytes that it then takes at most, its code and buffers included, by measurement.
-HOLDS = 1400 * 2**20
+# Bytes that it then takes at most, its code and buffers included, by measurement; and with quality fast.
+HOLDS, HOLDS_FAST = 1400 * 2**20, 700 * 2**20
 # In the order in which "auto" takes them.
 DEVICES = ("cuda", "hip", "sycl", "metal", "cpu")
 

@@ -24,7 +24,7 @@ from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.interrupt import interruptible
 from hybrid.memory import parse_size, plan_rows
-from hybrid.oidn import HOLDS
+from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.plan import STAGES, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.hard_cases.test_hard_files import ROOT, run_alone
@@ -439,6 +439,7 @@ PEAKS = [
     ((180, 320), None, 0, 0.27),  # pseudoref --preset draft
     ((540, 960), None, 0, 0.81),
     ((540, 960), None, HOLDS, 1.17),  # with --estimate oidn-best
+    ((540, 960), None, HOLDS_FAST, 0.86),  # with --estimate oidn-fast
     ((180, 320), 100, 0, 0.51),  # denoise --preset fast
     ((540, 960), 100, 0, 1.02),
     ((1080, 1920), 100, 0, 2.47),
