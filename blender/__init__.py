@@ -9,6 +9,7 @@ CLASSES = (
     settings.SceneSettings,
     operators.SetUp,
     operators.Denoise,
+    operators.Install,
     operators.Cancel,
     operators.Conclude,
     operators.Show,

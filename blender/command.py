@@ -13,6 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+WHERE = "press Install ravg, or name its path in Preferences > Add-ons > ravg"
+ANSWER_WITHIN = 60.0  # seconds for `ravg --version`: a cold disk or a virus scanner may take many
 # Seconds after the request to stop: `ravg` needs about one. A version that does not watch its input is terminated, and
 # a process that does not end is killed.
 TERMINATED_AFTER = 3.0
@@ -33,8 +35,59 @@ def find_command(named: str) -> str:
     """
     found = shutil.which(os.path.expanduser(named.strip() or "ravg"))
     if found is None:
-        raise FileNotFoundError(f"no command {named!r}: name the path of ravg in Preferences > Add-ons > ravg")
+        raise FileNotFoundError(f"no command {named or 'ravg'!r}: {WHERE}")
     return found
+
+
+class Version:
+    """The version of a command, asked for in a process of its own: a panel cannot wait for it."""
+
+    def __init__(self, executable: str) -> None:
+        self.executable = executable
+        self._text = ""
+        try:
+            self._process: subprocess.Popen[str] | None = subprocess.Popen(
+                [executable, "--version"],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                encoding="utf-8",
+                errors="replace",
+                env={**os.environ, **_PLAIN},
+                **_windowless(),
+            )
+        except OSError as error:
+            self._process = None
+            self._text = str(error)
+
+    @property
+    def known(self) -> bool:
+        """Whether the command has answered."""
+        return self._process is None or self._process.poll() is not None
+
+    def problem(self, expected: str) -> str:
+        """Wait for the answer; return why a command of this version cannot be used, or nothing.
+
+        Parameters
+        ----------
+        expected : str
+            The first two numbers of the version, such as ``0.1``.
+        """
+        if self._process is not None:
+            try:
+                self._text = self._process.communicate(timeout=ANSWER_WITHIN)[0]
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._text = f"no answer in {ANSWER_WITHIN:g} s"
+            self._process = None
+        found = re.search(r"^ravg (\d+\.\d+)\S*$", self._text, re.MULTILINE)
+        if found is None:
+            lines = [line.strip() for line in self._text.splitlines() if line.strip()]
+            return f"{self.executable} does not start as ravg ({(lines or ['no output'])[-1]}): {WHERE}"
+        if found[1] != expected:
+            return f"{found[0]} is not of this extension's version, {expected}: {WHERE}"
+        return ""
 
 
 class Run:
@@ -60,9 +113,6 @@ class Run:
         self._before = {path: _version(path) for path in outputs}
         self._log = log
         self._stopped_at: float | None = None
-        own: dict[str, Any] = {"start_new_session": True}  # Ctrl-C in Blender's terminal is Blender's
-        if sys.platform == "win32":
-            own = {"creationflags": subprocess.CREATE_NO_WINDOW}
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
                 list(arguments),
@@ -70,7 +120,7 @@ class Run:
                 stdout=sink,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **_PLAIN, **_STOPPABLE},
-                **own,
+                **_windowless(),
             )
 
     @property
@@ -139,6 +189,13 @@ class Run:
         lines = [line for line in lines if line.strip("-")]
         errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
         return (errors or lines or [f"ravg ended with code {self.code}"])[-1]
+
+
+def _windowless() -> dict[str, Any]:
+    """How a process is started that has no console of its own, nor Blender's."""
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NO_WINDOW}
+    return {"start_new_session": True}  # Ctrl-C in Blender's terminal is Blender's
 
 
 def _version(path: Path) -> tuple[int, int] | None:

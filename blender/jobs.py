@@ -5,23 +5,26 @@ A timer follows it, and no modal operator: Blender does not save automatically w
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from . import command, frames, scenes, settings
+from . import command, frames, install, scenes, settings
 
 INTERVAL = 0.25  # seconds between two looks
+LOG = "ravg.log"  # the text block that holds what ravg has printed
 
 
 class Job:
     """A scene being denoised; `run` is None while Blender renders its frames."""
 
     def __init__(self, scene: bpy.types.Scene) -> None:
-        self.scene = scene.name
-        self.executable = command.find_command(settings.preferences().command)
+        self._scene = scene.session_uid  # a name may change
+        if reason := ravg_problem(wait=True):
+            raise FileNotFoundError(reason)
         if not scenes.is_placed(scene):
             raise FileNotFoundError("the file is not saved: save it, or name a folder in Noisy Frames")
         self.run: command.Run | None = None
@@ -30,19 +33,26 @@ class Job:
         self.error = ""
         self.forget: Callable[[], None] = lambda: None  # removes the handlers that wait for the render
 
+    @property
+    def scene(self) -> bpy.types.Scene | None:
+        """The scene, unless it was removed meanwhile."""
+        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene), None)
+
     def start(self) -> None:
         """Start `ravg` on the frames that are there.
 
         Raises
         ------
         FileNotFoundError
-            If no frame of the scene is there.
+                If no frame of the scene is there, or the scene is not.
         ValueError
             If a frame is no noisy render with the passes that ravg reads.
         OSError
             If the command cannot be started.
         """
-        scene = bpy.data.scenes[self.scene]
+        scene = self.scene
+        if scene is None:
+            raise FileNotFoundError("the scene was removed")
         there = [number for number, path in scenes.noisy_files(scene).items() if path.is_file()]
         pattern = scenes.noisy_pattern(scene)
         if not there:
@@ -52,19 +62,20 @@ class Job:
         chosen, folder = scene.ravg, scenes.output_folder(scene)
         network = ["denoise", f"--preset={chosen.preset}"]
         how = ["pseudoref", "--estimate=auto"] if chosen.preset == "average" else network
-        arguments = [self.executable, *how, pattern, f"--output={folder}", f"--frames={frames.ranges(there)}"]
+        arguments = [settings.executable(), *how, pattern, f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")
         if chosen.resume:
             arguments.append("--resume")
         outputs = scenes.denoised_files(scene)
+        self._folder = folder
         log = Path(bpy.app.tempdir) / "ravg.log"
         self.run = command.Run(arguments, [outputs[number] for number in there], log)
 
     def go_on(self) -> None:
         """Give the scene its own settings back once Blender has rendered, and start `ravg`."""
         if self.run is None and (self.rendered or self.cancelled):
-            scenes.give_back(bpy.data.scenes[self.scene])
+            self._give_back()
             if not self.cancelled:
                 try:
                     self.start()
@@ -96,8 +107,129 @@ class Job:
         """Whether there is no more to wait for."""
         return self.cancelled if self.run is None else self.run.code is not None
 
+    def conclude(self, report: Report) -> bool:
+        """Give the scene back what it has lent, and report how it has ended; return whether all frames are made."""
+        self.forget()
+        self._give_back()
+        if self.run is None:
+            if self.error:
+                report({"ERROR"}, self.error)
+            return False
+        for warning in self.run.warnings:
+            report({"WARNING"}, warning)
+        if self.run.stopped:
+            report({"WARNING"}, f"Stopped: {self.run.finished} of {self.run.total} frames are finished")
+            return False
+        if self.run.code != 0:
+            report({"ERROR"}, f"{self.run.error} (all of it in the text {LOG})")
+            return False
+        report({"INFO"}, f"Denoised {self.run.total} frames into {self._folder}")
+        return True
 
-current: Job | None = None
+    def _give_back(self) -> None:
+        if self.scene is not None:
+            scenes.give_back(self.scene)
+
+
+class Install:
+    """ravg being installed into an environment of its own, step by step."""
+
+    scene = None
+
+    def __init__(self, wheel: str) -> None:
+        path = Path(bpy.path.abspath(wheel)) if wheel else None
+        source = install.Source(settings.version(), path, bpy.app.online_access)
+        self._online = source.online
+        self._home = settings.home()
+        self._home.mkdir(parents=True, exist_ok=True)
+        self._environment = install.new_environment(self._home)
+        self._steps = install.steps(self._environment, source)
+        self._step = 0
+        self._error = ""
+        self.run = self._start()
+
+    def _start(self) -> command.Run:
+        log = Path(bpy.app.tempdir) / f"ravg-install-{self._step}.log"
+        return command.Run(self._steps[self._step], [], log)
+
+    def go_on(self) -> None:
+        """Start the next step when one has succeeded."""
+        if self.run.code == 0 and not self.run.stopped and self._step < len(self._steps) - 1:
+            self._step += 1
+            try:
+                self.run = self._start()
+            except OSError as error:
+                self._error = str(error)
+
+    @property
+    def factor(self) -> float:
+        """How much is done, from 0 to 1; how long a download takes is not known."""
+        return self._step / len(self._steps)
+
+    @property
+    def text(self) -> str:
+        """What is being done, in a few words: pip's last line."""
+        lines = [line.strip() for line in self.run.log.splitlines() if line.strip()]
+        return f"Installing ravg: {lines[-1][:80]}" if lines else "Installing ravg"
+
+    def cancel(self) -> None:
+        """Ask pip to stop; an earlier installation stays."""
+        self.run.stop()
+
+    def forget(self) -> None:
+        """No handlers wait for it."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is no more to wait for."""
+        code = self.run.code
+        last = self._step == len(self._steps) - 1
+        return code is not None and (code != 0 or self.run.stopped or bool(self._error) or last)
+
+    def conclude(self, report: Report) -> bool:
+        """Use the new environment if it is complete, else remove it; return whether it is complete."""
+        if self.run.code == 0 and not self.run.stopped and not self._error:
+            install.finish(self._home, self._environment)
+            report({"INFO"}, f"Installed {self.run.log.strip()}")
+            return True
+        install.remove(self._environment)
+        if self.run.stopped:
+            report({"WARNING"}, "Stopped: ravg is not installed")
+        else:
+            why = self._error or install.explain(self.run.log, online=self._online)
+            report({"ERROR"}, f"ravg is not installed: {why} (all of it in the text {LOG})")
+        return False
+
+
+Report = Callable[[set[str], str], None]
+current: Job | Install | None = None
+_version: command.Version | None = None
+
+
+def ravg_problem(*, wait: bool) -> str:
+    """Say why ravg cannot be run, and what to do; empty where it can, or where that is not known yet.
+
+    Parameters
+    ----------
+    wait : bool
+        Whether to wait for its answer. A panel does not, and is drawn again.
+    """
+    global _version
+    try:
+        executable = settings.executable()
+    except FileNotFoundError as error:
+        return str(error)
+    if _version is None or _version.executable != executable:
+        _version = command.Version(executable)
+        bpy.app.timers.register(_redraw_when_known, first_interval=INTERVAL)
+    return _version.problem(install.series(settings.version())) if wait or _version.known else ""
+
+
+def _redraw_when_known() -> float | None:
+    if _version is not None and not _version.known:
+        return INTERVAL
+    _redraw()
+    return None
 
 
 def follow() -> float | None:
@@ -114,16 +246,45 @@ def follow() -> float | None:
     return None
 
 
+def wait() -> None:
+    """Follow the job to its end, and print what it prints."""
+    current.go_on()
+    run, printed = None, 0
+    while current.run is not None:
+        if current.run is not run:
+            run, printed = current.run, 0
+        ended, text = current.ended, run.log
+        print(text[printed:], end="", flush=True)
+        printed = len(text)
+        if ended:
+            return
+        time.sleep(INTERVAL)
+        current.go_on()
+
+
 def begin(scene: bpy.types.Scene) -> Job:
     """Make the current job.
 
     Raises
     ------
     FileNotFoundError
-        If the command is not there.
+        If the command is not there, or the frames have no folder.
     """
     global current
     current = Job(scene)
+    return current
+
+
+def begin_install(wheel: str) -> Install:
+    """Begin to install ravg.
+
+    Raises
+    ------
+    ValueError, OSError
+        If there is nothing to install it from, or no environment can be made.
+    """
+    global current, _version
+    current, _version = Install(wheel), None
     return current
 
 
@@ -161,8 +322,7 @@ def stop_current(*_: Any) -> None:
         current.forget()
         if current.run is not None:
             current.run.wait()
-        elif (scene := bpy.data.scenes.get(current.scene)) is not None:
-            scenes.give_back(scene)
+        current.conclude(lambda *_: None)
         current = None
 
 
@@ -184,7 +344,7 @@ def protect(scene: bpy.types.Scene, *_: Any) -> None:
 @bpy.app.handlers.persistent
 def protected(scene: bpy.types.Scene, *_: Any) -> None:
     """Give a scene its own settings back after a render that `protect` has changed."""
-    if current is None or current.scene != scene.name:
+    if current is None or current.scene != scene:
         scenes.give_back(scene)
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from typing import Any
 
 import bpy
 
-from . import frames, jobs, scenes
-
-LOG = "ravg.log"  # the text block that holds what ravg has printed
+from . import compositor, frames, jobs, scenes
 
 
 class SetUp(bpy.types.Operator):
@@ -68,20 +66,7 @@ class Denoise(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Denoise; with `wait` until the end, in scripts and where Blender has no window."""
-        try:
-            self._begin(context.scene)
-            if not self.wait:
-                bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
-                return {"FINISHED"}
-            self._follow()
-        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, of a render that fails
-            jobs.stop_current()
-            self.report({"ERROR"}, str(error).strip().removeprefix("Error: "))
-            return {"CANCELLED"}
-        except BaseException:
-            jobs.stop_current()
-            raise
-        return conclude(self, context)
+        return _follow(self, context, lambda: self._begin(context.scene))
 
     def _there(self, scene: bpy.types.Scene) -> list[int]:
         if not scenes.is_placed(scene):
@@ -99,23 +84,44 @@ class Denoise(bpy.types.Operator):
         scenes.set_up(scene)
         scenes.lend(scene, replace=self.existing == "REPLACE")
         jobs.start_when_rendered(job)
-        try:
-            bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
-        except BaseException:
-            job.forget()
-            raise
+        bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
 
-    def _follow(self) -> None:
-        """Print what ravg prints until it has ended."""
-        job, printed = jobs.current, 0
-        job.go_on()
-        while job.run is not None:
-            ended, text = job.ended, job.run.log
-            print(text[printed:], end="", flush=True)
-            printed = len(text)
-            if ended:
-                return
-            time.sleep(jobs.INTERVAL)
+
+class Install(bpy.types.Operator):
+    """Install ravg for Blender alone, beside its configuration, from the package index or from a wheel file"""
+
+    bl_idname = "ravg.install"
+    bl_label = "Install ravg"
+
+    wheel: bpy.props.StringProperty(
+        name="Wheel",
+        description="A wheel file of ravg, with those of its requirements beside it; without one, from the index",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+    wait: bpy.props.BoolProperty(default=True, options={"SKIP_SAVE", "HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("ravg is at work")
+        return jobs.current is None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the wheel; then return at once, and let a timer follow."""
+        self.wait = bpy.app.background
+        if self.wait:
+            return self.execute(context)
+        return context.window_manager.invoke_props_dialog(self, title="Install ravg", confirm_text="Install")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column()
+        column.label(text="With torch, some gigabytes are downloaded")
+        column.prop(self, "wheel", placeholder="from the package index")
+        if not bpy.app.online_access:
+            column.label(text="Online Access is off: a wheel file is needed", icon="ERROR")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return _follow(self, context, lambda: jobs.begin_install(self.wheel))
 
 
 class Cancel(bpy.types.Operator):
@@ -151,50 +157,54 @@ class Show(bpy.types.Operator):
     bl_label = "Show"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return _load(self, lambda image, count: show(context, image, count))
+        scene = context.scene
+        return _load(self, scene, lambda image, count: show(context, scene, image, count))
 
 
 class AddToCompositor(bpy.types.Operator):
-    """Add an image node with the denoised frames to the compositor's nodes"""
+    """Put the denoised frames in the place of the Render Layers nodes, so that the scene is not rendered again"""
 
     bl_idname = "ravg.add_to_compositor"
     bl_label = "Add to Compositor"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        def add(image: bpy.types.Image, count: int) -> None:
-            node = _compositor(context.scene).nodes.new("CompositorNodeImage")
-            node.image, node.label = image, "Denoised"
-            scenes.show_from(node, context.scene, count)
+        scene = context.scene
+        return _load(self, scene, lambda image, count: compositor.add(scene, image, count))
 
-        return _load(self, add)
+
+def _follow(operator: bpy.types.Operator, context: bpy.types.Context, begin: Callable[[], Any]) -> set[str]:
+    """Begin a job, and follow it to its end where the operator waits; else let a timer do so."""
+    try:
+        begin()
+        if not operator.wait:
+            bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
+            return {"FINISHED"}
+        jobs.wait()
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, of a render that fails
+        jobs.stop_current()
+        operator.report({"ERROR"}, str(error).strip().removeprefix("Error: "))
+        return {"CANCELLED"}
+    except BaseException:
+        jobs.stop_current()
+        raise
+    return conclude(operator, context)
 
 
 def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
     """Say in Blender's own places how the job has ended, and show its frames if it has made them all."""
     job, jobs.current = jobs.current, None
-    job.forget()
-    scenes.give_back(bpy.data.scenes[job.scene])
-    if job.run is None:
-        if job.error:
-            operator.report({"ERROR"}, job.error)
+    if job.run is not None:
+        text = bpy.data.texts.get(jobs.LOG) or bpy.data.texts.new(jobs.LOG)
+        text.from_string(job.run.log)
+    if not job.conclude(operator.report):
         return {"CANCELLED"}
-    text = bpy.data.texts.get(LOG) or bpy.data.texts.new(LOG)
-    text.from_string(job.run.log)
-    for warning in job.run.warnings:
-        operator.report({"WARNING"}, warning)
-    if job.run.stopped:
-        operator.report({"WARNING"}, f"Stopped: {job.run.finished} of {job.run.total} frames are finished")
-        return {"CANCELLED"}
-    if job.run.code != 0:
-        operator.report({"ERROR"}, f"{job.run.error} (all of it in the text {LOG})")
-        return {"CANCELLED"}
-    scene = bpy.data.scenes[job.scene]
-    operator.report({"INFO"}, f"Denoised {job.run.total} frames into {scenes.output_folder(scene)}")
-    return _load(operator, lambda image, count: show(context, image, count))
+    if job.scene is None:  # nothing to show: ravg was installed, or the scene was removed
+        return {"FINISHED"}
+    return _load(operator, job.scene, lambda image, count: show(context, job.scene, image, count))
 
 
-def show(context: bpy.types.Context, image: bpy.types.Image, count: int) -> None:
+def show(context: bpy.types.Context, scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
     """Show a sequence in the image editor that is open, or else in a new window."""
     areas = [area for window in context.window_manager.windows for area in window.screen.areas]
     editor = next((area for area in areas if area.type == "IMAGE_EDITOR"), None)
@@ -205,23 +215,13 @@ def show(context: bpy.types.Context, image: bpy.types.Image, count: int) -> None
         editor = context.window_manager.windows[-1].screen.areas[0]
         editor.type = "IMAGE_EDITOR"
     editor.spaces.active.image = image
-    scenes.show_from(editor.spaces.active.image_user, context.scene, count)
+    scenes.show_from(editor.spaces.active.image_user, scene, count)
 
 
-def _load(operator: bpy.types.Operator, use: Any) -> set[str]:
+def _load(operator: bpy.types.Operator, scene: bpy.types.Scene, use: Any) -> set[str]:
     try:
-        use(*scenes.load_denoised(bpy.context.scene))
-    except (OSError, RuntimeError) as error:  # RuntimeError is what Blender raises for a file that it cannot read
+        use(*scenes.load_denoised(scene))
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, for a file that it cannot read
         operator.report({"ERROR"}, str(error).strip())
         return {"CANCELLED"}
     return {"FINISHED"}
-
-
-def _compositor(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The nodes of the scene's compositor, made where there are none."""
-    if hasattr(scene, "compositing_node_group"):  # Blender 5.0 and later
-        if scene.compositing_node_group is None:
-            scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
-        return scene.compositing_node_group
-    scene.use_nodes = True
-    return scene.node_tree

@@ -13,6 +13,9 @@ import bpy
 
 from . import frames
 
+# Seen with Blender 5.0.1: the left view of a multi-view OpenEXR image in all views.
+STEREO = "Blender's compositor shows the left eye's image in both: composite the frames in another program"
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -37,6 +40,13 @@ def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
     missing = [number for number, path in noisy_files(scene).items() if not path.is_file()]
     if 0 < len(missing) < len(frame_numbers(scene)):
         found.append(Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False))
+    if scene.render.use_multiview:
+        found.append(Problem(f"Stereo: both eyes are denoised, but {STEREO}", False))
+    if scene.render.use_sequencer and scene.sequence_editor is not None and _strips(scene):
+        text = (
+            "Sequencer has strips: Render Animation renders those, switch Post Processing > Sequencer off for the movie"
+        )
+        found.append(Problem(text, False))
     if would_be_written_over(scene):
         found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
     return found
@@ -122,6 +132,12 @@ def denoised_files(scene: bpy.types.Scene) -> dict[int, Path]:
 def is_placed(scene: bpy.types.Scene) -> bool:
     """Whether the folder of the noisy frames is known: a file that was never saved has none of its own."""
     return bool(bpy.data.filepath) or bool(scene.ravg.noisy and not scene.ravg.noisy.startswith("//"))
+
+
+def count_noisy(scene: bpy.types.Scene) -> tuple[int, int]:
+    """How many noisy frames are there, of how many."""
+    files = noisy_files(scene).values() if is_placed(scene) else []
+    return sum(path.is_file() for path in files), len(frame_numbers(scene))
 
 
 def refused(scene: bpy.types.Scene) -> str:
@@ -248,8 +264,6 @@ def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
         raise FileNotFoundError(f"no denoised frames in {output_folder(scene)}")
     image = bpy.data.images.load(str(there[0]), check_existing=True)
     image.source = "SEQUENCE"
-    if scene.render.use_multiview:
-        image.use_multiview, image.views_format = True, "MULTIVIEW"
     image.reload()
     return image, scene.frame_end - scene.frame_start + 1
 
@@ -263,6 +277,11 @@ def show_from(user: bpy.types.ImageUser | bpy.types.Node, scene: bpy.types.Scene
 
 def _layers(scene: bpy.types.Scene) -> list[bpy.types.ViewLayer]:
     return [layer for layer in scene.view_layers if layer.use]
+
+
+def _strips(scene: bpy.types.Scene) -> bool:
+    editor = scene.sequence_editor
+    return bool(editor.strips_all if hasattr(editor, "strips_all") else editor.sequences_all)  # before Blender 4.4
 
 
 def _light_passes(layer: bpy.types.ViewLayer) -> bool:

@@ -1,6 +1,11 @@
 """What a user chooses: where the command is, and how a scene is denoised."""
 
+import tomllib
+from pathlib import Path
+
 import bpy
+
+from . import command, install
 
 PRESETS = (
     ("fast", "Fast", "The network on OIDN's fast pictures"),
@@ -17,13 +22,13 @@ class Preferences(bpy.types.AddonPreferences):
 
     command: bpy.props.StringProperty(
         name="Command",
-        description="The command ravg: a path, or a name that PATH knows",
-        default="ravg",
+        description="A path, or a name that PATH knows; without one, what Install ravg has installed, or ravg on PATH",
         subtype="FILE_PATH",
     )
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "command")
+        self.layout.operator("ravg.install", icon="IMPORT")
 
 
 class SceneSettings(bpy.types.PropertyGroup):
@@ -60,3 +65,26 @@ class SceneSettings(bpy.types.PropertyGroup):
 def preferences() -> Preferences:
     """The preferences of this extension."""
     return bpy.context.preferences.addons[__package__].preferences
+
+
+def home() -> Path:
+    """The folder that this extension may write to; updates leave it alone."""
+    return Path(bpy.utils.extension_path_user(__package__))
+
+
+def version() -> str:
+    """The version of this extension."""
+    manifest = Path(__file__).parent / "blender_manifest.toml"
+    return tomllib.loads(manifest.read_text(encoding="utf-8"))["version"]
+
+
+def executable() -> str:
+    """The path of the command ravg: the one that is named, else the installed one, else that on PATH.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    """
+    named = preferences().command.strip()
+    return command.find_command(named or install.installed(home()))

@@ -119,6 +119,15 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> Blender:
 
 
 @pytest.fixture(scope="module")
+def stub(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A command that says it is ravg, and makes nothing."""
+    path = tmp_path_factory.mktemp("stub") / "ravg"
+    path.write_text(f"#!{sys.executable}\nprint('ravg 0.1.0')\n", encoding="utf-8")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
 def untouched(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of somebody who has never heard of passes."""
     path = tmp_path_factory.mktemp("scene") / "shot.blend"
@@ -440,15 +449,6 @@ def test_resume_leaves_finished_frames_alone(blender, shot):
 COMPOSE = """
 bpy.ops.ravg.add_to_compositor()
 tree = getattr(scene, "compositing_node_group", None) or scene.node_tree
-node = next(node for node in tree.nodes if node.type == "IMAGE")
-if hasattr(scene, "compositing_node_group"):
-    if not len(tree.interface.items_tree):
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    sink = tree.nodes.new("NodeGroupOutput")
-else:
-    sink = next(node for node in tree.nodes if node.type == "COMPOSITE")
-    tree.nodes.remove(next(node for node in tree.nodes if node.type == "R_LAYERS"))
-tree.links.new(node.outputs["Combined"], sink.inputs[0])
 """
 
 
@@ -539,7 +539,7 @@ jobs.stop_current()
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_the_scene_gets_its_output_settings_back(blender, blend, end):
+def test_the_scene_gets_its_output_settings_back(blender, stub, blend, end):
     code = f"""{FORMATS}
 from bl_ext.user_default.ravg import jobs, scenes
 answer = []
@@ -554,12 +554,12 @@ for chosen in CHOSEN:
         pass
     answer.append([before, settings_of(scene), scene.ravg.lent])
 """
-    for before, after, lent in blender.run(code, blend=blend, command=sys.executable, CHOSEN=CHOSEN, END=ENDS[end]):
+    for before, after, lent in blender.run(code, blend=blend, command=stub, CHOSEN=CHOSEN, END=ENDS[end]):
         assert after == before
         assert lent == ""
 
 
-def test_a_second_render_leaves_the_frames_of_the_first_until_it_is_asked_for(blender, shot):
+def test_a_second_render_leaves_the_frames_of_the_first_until_it_is_asked_for(blender, stub, shot):
     code = """
     def stamps():
         return {p.name: p.stat().st_mtime_ns for p in Path(bpy.path.abspath("//frames")).glob("*.exr")}
@@ -578,7 +578,7 @@ def test_a_second_render_leaves_the_frames_of_the_first_until_it_is_asked_for(bl
     replaced = stamps()
     answer = [error, refused, [n for n in first if kept[n] != first[n]], [n for n in first if replaced[n] == kept[n]]]
     """
-    error, refused, made, old = blender.run(code, blend=shot, command=sys.executable)
+    error, refused, made, old = blender.run(code, blend=shot, command=stub)
     assert "noisy frames 4-6 are there already" in error
     assert refused
     assert made == ["shot_0005.exr"]
@@ -603,16 +603,101 @@ answer = [said, scene.render.use_overwrite, scene.ravg.lent]
     assert (overwrite, lent) == (True, "")
 
 
+# What an artist's file may have: nodes on two view layers, a File Output node, a strip in the sequencer.
+NODES = """
+layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
+tree = bpy.data.node_groups.new("Mine", "CompositorNodeTree")
+scene.compositing_node_group = tree
+tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+renders = []
+for name in layers:
+    renders.append(tree.nodes.new("CompositorNodeRLayers"))
+    renders[-1].layer = name
+tree.links.new(renders[0].outputs["Image"], tree.nodes.new("NodeGroupOutput").inputs[0])
+files = tree.nodes.new("CompositorNodeOutputFile")
+files.directory, files.file_name = "//extra/", "fog_"
+files.format.media_type, files.format.file_format, files.format.color_depth = "IMAGE", "OPEN_EXR", "32"
+files.file_output_items.new("RGBA", "Image")
+tree.links.new(renders[1].outputs["Image"], files.inputs[0])
+scene.sequence_editor.strips.new_effect(name="red", type="COLOR", channel=1, frame_start=1, length=20)
+"""
+
+
+@needs_ravg
+def test_a_file_with_nodes_view_layers_and_strips_is_rendered_denoised_and_composited_right(blender, blend):
+    code = f"""{PROBLEMS}
+exec(NODES)
+scene.frame_end = 5
+bpy.ops.ravg.denoise(render=True)
+early = Path(bpy.path.abspath("//extra")).exists()
+said = texts()
+scene.render.use_sequencer = False
+bpy.ops.ravg.add_to_compositor()
+started = time.monotonic()
+settings = scene.render.image_settings
+settings.media_type, settings.file_format, settings.color_depth = "IMAGE", "OPEN_EXR", "32"
+bpy.ops.render.render(animation=True)
+answer = [early, said, texts(), [node.mute for node in renders]]
+"""
+    early, said, after, muted = blender.run(code, blend=blend, NODES=NODES)
+    assert not early, "File Output nodes run with the movie, not with the noisy frames"
+    assert (said, after, muted) == (["Sequencer has strips"], [], [True, True])
+    for frame in (4, 5):
+        noisy, denoised = (
+            channels(blend.parent / f"ravg/shot/{x}/Scene_{frame:04d}.exr") for x in ("noisy", "denoised")
+        )
+        assert not [name for name in noisy if name.startswith("Composite.")]
+        extra = next(path for path in (blend.parent / "extra").iterdir() if f"{frame:04d}" in path.name)
+        for path, layer in ((blend.parent / f"movie/shot_{frame:04d}.exr", ""), (extra, "fog bank.")):
+            names = [f"{layer}Combined.{c}" for c in "RGB"]
+            assert not any(np.array_equal(noisy[name], denoised[name]) for name in names)
+            seen, expected = channels(path), np.stack([denoised[name] for name in names], axis=-1)
+            assert expected.mean() > 0.1
+            np.testing.assert_allclose(np.stack([seen[c] for c in "RGB"], axis=-1), expected, rtol=1e-5, atol=1e-6)
+
+
+def eyes(path: Path, name: str) -> list[np.ndarray]:
+    """A channel of the left and of the right view."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        parts = [part for part in file.parts if name in part.channels]
+        return [
+            part.channels[name].pixels for view in ("left", "right") for part in parts if part.header["view"] == view
+        ]
+
+
+@needs_ravg
+def test_both_eyes_of_a_stereo_scene_are_denoised_and_the_compositor_is_refused(blender, blend):
+    code = """
+    scene.render.use_multiview, scene.frame_end = True, 5
+    bpy.ops.ravg.denoise(render=True)
+    try:
+        bpy.ops.ravg.add_to_compositor()
+    except RuntimeError as error:
+        from bl_ext.user_default.ravg import scenes
+        answer = [str(error), [problem.text for problem in scenes.problems(scene)]]
+    """
+    refused, said = blender.run(code, blend=blend)
+    assert "shows the left eye's image in both" in refused
+    assert [text.partition(":")[0] for text in said] == ["Stereo"]
+    for frame in (4, 5):
+        noisy, denoised = (blend.parent / f"ravg/shot/{x}/Scene_{frame:04d}.exr" for x in ("noisy", "denoised"))
+        left, right = eyes(denoised, "ViewLayer.Combined.R")
+        assert not np.array_equal(left, right)
+        for before, after in zip(eyes(noisy, "ViewLayer.Noisy Image.R"), (left, right), strict=True):
+            assert not np.array_equal(before, after)
+            assert abs(before.mean() - after.mean()) < 0.05 * before.mean()
+
+
 NO_NOISY_FRAMES = {
     "composited": ("exec(COMPOSE)", "compositor"),
-    "black": ("exec(COMPOSE); tree.links.clear()", "compositor"),
+    "black": ("exec(COMPOSE); tree.nodes.clear(); tree.nodes.new('NodeGroupOutput')", "compositor"),
     "without passes": ("scene.view_layers[0].cycles.denoising_store_passes = False", "no pass Denoising Albedo"),
     "a single layer": ("FORMAT = ('IMAGE', 'OPEN_EXR')", "no Combined pass"),
 }
 
 
 @pytest.mark.parametrize("kind", NO_NOISY_FRAMES)
-def test_frames_that_are_no_noisy_renders_are_refused_with_the_reason(blender, shot, kind):
+def test_frames_that_are_no_noisy_renders_are_refused_with_the_reason(blender, stub, shot, kind):
     change, reason = NO_NOISY_FRAMES[kind]
     shutil.copytree(shot.parent / "frames", shot.parent / "frames" / "denoised")
     code = f"""{PROBLEMS}{FAILING}"""
@@ -629,11 +714,130 @@ scene.render.filepath = "//movie/shot_"
 {code}
 answer += [texts()]
 """
-    error, free, _, said = blender.run(script, blend=shot, command=sys.executable, COMPOSE=COMPOSE)
+    error, free, _, said = blender.run(script, blend=shot, command=stub, COMPOSE=COMPOSE)
     assert "shot_0004.exr is no noisy frame" in error
     assert reason in error
     assert free
     assert said[0].startswith("shot_0004.exr")
+
+
+# --- installing ravg -----------------------------------------------------------------------------------
+
+
+def wheel(folder: Path, name: str, version: str, code: str, extra: str = "") -> Path:
+    """A wheel of one module, and of a command of the same name."""
+    info, path = f"{name}-{version}.dist-info", folder / f"{name}-{version}-py3-none-any.whl"
+    files = {
+        f"{name}_stub.py": code,
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n{extra}",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        f"{info}/entry_points.txt": f"[console_scripts]\n{name} = {name}_stub:main\n",
+    }
+    with zipfile.ZipFile(path, "w") as archive:
+        for inside, text in files.items():
+            archive.writestr(inside, text)
+        archive.writestr(f"{info}/RECORD", "".join(f"{inside},,\n" for inside in [*files, f"{info}/RECORD"]))
+    return path
+
+
+@pytest.fixture
+def wheels(tmp_path: Path) -> Path:
+    """A wheel of ravg that does nothing but say its version, with one for its requirement beside it."""
+    code = "def main(): print('ravg 0.1.0')\n"
+    wheel(tmp_path, "pyoidn", "2.5.1", code)
+    return wheel(tmp_path, "ravg", "0.1.0", code, "Provides-Extra: neural\n")
+
+
+INSTALLING = """
+from bl_ext.user_default.ravg import jobs, settings
+def install(**how):
+    try:
+        return sorted(bpy.ops.ravg.install(**how))
+    except RuntimeError as error:
+        return str(error).strip()
+def there():
+    return sorted(path.name for path in settings.home().iterdir())
+def ran():
+    return subprocess.run([settings.executable(), "--version"], capture_output=True, text=True).stdout.strip()
+import os, subprocess
+os.environ["PIP_CONFIG_FILE"] = os.devnull
+"""
+
+
+def test_ravg_is_installed_from_a_wheel_replaced_and_kept_where_that_fails(blender, wheels, tmp_path):
+    bad = tmp_path / "bad"
+    bad.mkdir()
+    shutil.copy(wheels.parent / "pyoidn-2.5.1-py3-none-any.whl", bad)
+    wheel(bad, "ravg", "0.1.0", "", "Provides-Extra: neural\nRequires-Dist: gone-for-good\n")
+    code = (
+        INSTALLING
+        + """
+bpy.context.preferences.system.use_online_access = False
+answer = [install(wheel=GOOD), there(), ran(), jobs.ravg_problem(wait=True), install(wheel=GOOD), there(),
+          install(wheel=BAD), there(), ran()]
+"""
+    )
+    first, one, version, problem, second, two, failed, left, still = blender.run(
+        code, command="", GOOD=str(wheels), BAD=str(bad / "ravg-0.1.0-py3-none-any.whl")
+    )
+    assert (first, one) == (["FINISHED"], ["current.txt", "environment-1"])
+    assert (version, problem) == ("ravg 0.1.0", "")
+    assert (second, two) == (["FINISHED"], ["current.txt", "environment-2"])
+    assert "ravg is not installed: " in failed
+    assert "gone-for-good" in failed
+    assert "Online Access is off" in failed
+    assert (left, still) == (["current.txt", "environment-2"], "ravg 0.1.0")
+
+
+def test_without_a_network_the_error_says_so(blender):
+    code = (
+        INSTALLING
+        + """
+before = there() if settings.home().exists() else []
+offline = install()
+bpy.context.preferences.system.use_online_access = True
+os.environ["PIP_INDEX_URL"] = "http://127.0.0.1:9/"
+answer = [offline, install(), before, there()]
+"""
+    )
+    offline, failed, before, left = blender.run(code, command="")
+    assert "allow Online Access in Preferences" in offline
+    assert "the package index cannot be reached: check the network" in failed
+    assert left == before
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("gone.whl", "no wheel file"), ("torch-2-py3-none-any.whl", "no wheel of ravg")]
+)
+def test_a_file_that_is_no_wheel_of_ravg_is_refused(blender, tmp_path, name, reason):
+    path = tmp_path / name
+    if reason != "no wheel file":
+        path.touch()
+    assert reason in blender.run(INSTALLING + "answer = install(wheel=PATH)", command="", PATH=str(path))
+
+
+@pytest.mark.parametrize(
+    ("says", "reason"),
+    [
+        ("ravg 0.2.5", "ravg 0.2.5 is not of this extension's version, 0.1"),
+        ("Python 3", "does not start as ravg (Python 3)"),
+    ],
+)
+def test_another_version_is_seen_before_the_button_and_refused(blender, shot, tmp_path, says, reason):
+    tool = tmp_path / "ravg"
+    tool.write_text(f"#!{sys.executable}\nprint({says!r})\n", encoding="utf-8")
+    tool.chmod(0o755)
+    code = f"""{DRAWN}{FAILING}
+draw()
+while not jobs._version.known:
+    time.sleep(0.05)
+answer += [draw()]
+"""
+    error, free, _, drawn = blender.run(code, blend=shot, command=str(tool))
+    assert reason in error
+    assert free
+    assert any(reason in text for text in drawn)
+    assert "Install ravg" in drawn
 
 
 # --- what goes wrong -----------------------------------------------------------------------------------
@@ -648,12 +852,12 @@ except RuntimeError as error:
 
 def test_a_command_that_is_not_there_is_an_error_in_blender(blender, shot):
     error, free, _ = blender.run(FAILING, blend=shot, command="no-such-ravg")
-    assert error.endswith("no command 'no-such-ravg': name the path of ravg in Preferences > Add-ons > ravg")
+    assert "no command 'no-such-ravg': press Install ravg, or name its path in Preferences" in error
     assert free
 
 
-def test_frames_that_are_not_there_are_an_error_in_blender(blender, blend):
-    error, free, _ = blender.run(FAILING, blend=blend, command=sys.executable)
+def test_frames_that_are_not_there_are_an_error_in_blender(blender, stub, blend):
+    error, free, _ = blender.run(FAILING, blend=blend, command=stub)
     assert "Render and Denoise renders them" in error
     assert free
 
@@ -705,7 +909,7 @@ def test_the_panel_of_a_new_scene_is_that_of_the_documentation(blender, blend):
     assert blender.run(code, blend=blend) == block[1].splitlines()
 
 
-def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, rendered):
+def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, stub, rendered):
     code = DRAWN + "jobs.begin(scene); answer = draw()"
-    drawn = blender.run(code, blend=rendered, command=sys.executable)
+    drawn = blender.run(code, blend=rendered, command=stub)
     assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Resume", "Rendering", "Stop"]

@@ -1,0 +1,128 @@
+"""An environment of its own for ravg, made with Blender's Python and pip. Knows nothing of Blender."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+_CURRENT = "current.txt"  # names the environment that is complete
+# What pip prints, after its retries, when it has reached no package index.
+_NO_NETWORK = re.compile(
+    "NewConnectionError|ConnectTimeout|ReadTimeout|ProxyError|SSLError|Failed to establish a new connection"
+    "|[Nn]ame resolution|getaddrinfo failed|Network is unreachable|Connection refused|No address associated"
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where ravg is installed from.
+
+    Attributes
+    ----------
+    version : str
+        The version of this extension, such as ``0.1.0``.
+    wheel : Path or None
+        A wheel file of ravg; its requirements are taken from wheels beside it first. None: the package index.
+    online : bool
+        Whether the package index may be asked.
+    """
+
+    version: str
+    wheel: Path | None
+    online: bool
+
+    def requirements(self) -> list[str]:
+        """Return pip's arguments: what to install, and where from.
+
+        Raises
+        ------
+        FileNotFoundError
+            If the wheel is not there.
+        ValueError
+            If it is no wheel of ravg, or if there is no source at all.
+        """
+        if self.wheel is None:
+            if not self.online:
+                raise ValueError("allow Online Access in Preferences > System > Network, or choose a wheel file")
+            return [f"ravg[neural]=={series(self.version)}.*", "pyoidn"]
+        if not self.wheel.is_file():
+            raise FileNotFoundError(f"no wheel file {self.wheel}")
+        if not re.fullmatch(r"ravg-[^-]+-.+\.whl", self.wheel.name):
+            raise ValueError(f"{self.wheel.name} is no wheel of ravg, expected a name like ravg-{self.version}-….whl")
+        found = [f"--find-links={self.wheel.parent}", f"ravg[neural] @ {self.wheel.absolute().as_uri()}", "pyoidn"]
+        return found if self.online else ["--no-index", *found]
+
+
+def series(version: str) -> str:
+    """The first two numbers of a version: those of the extension and of ravg are to be the same."""
+    return ".".join(version.split(".")[:2])
+
+
+def new_environment(home: Path) -> Path:
+    """A folder for a new environment: the one in use stays until the new one is complete."""
+    numbers = [int(name.rpartition("-")[2]) for name in _environments(home)]
+    return home / f"environment-{max(numbers, default=0) + 1}"
+
+
+def steps(environment: Path, source: Source) -> list[list[str]]:
+    """The commands that make an environment, in their order.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `Source.requirements`.
+    """
+    pip = [_program(environment, "python"), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
+    pip += ["--progress-bar=off", "--retries=1", "--timeout=15", *source.requirements()]
+    make = [sys.executable, "-m", "venv", os.fspath(environment)]
+    return [make, pip, [_program(environment, "ravg"), "--version"]]
+
+
+def finish(home: Path, environment: Path) -> None:
+    """Use an environment from now on, and remove all others."""
+    mark = home / f"{_CURRENT}.new"
+    mark.write_text(environment.name, encoding="utf-8")
+    os.replace(mark, home / _CURRENT)
+    for name in _environments(home):
+        if name != environment.name:
+            remove(home / name)
+
+
+def remove(environment: Path) -> None:
+    """Remove an environment as far as the system lets go of it."""
+    shutil.rmtree(environment, ignore_errors=True)
+
+
+def installed(home: Path) -> str:
+    """The command ravg of the environment that is in use; empty where there is none."""
+    try:
+        name = (home / _CURRENT).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+    found = _program(home / name, "ravg")
+    return found if os.path.isfile(found) else ""
+
+
+def explain(log: str, *, online: bool) -> str:
+    """Say in one line why pip has failed."""
+    errors = re.findall(r"^ERROR: (.*)", log, re.MULTILINE)
+    if online and _NO_NETWORK.search(log):
+        return "the package index cannot be reached: check the network, or choose a wheel file"
+    lines = errors or [line for line in log.splitlines() if line.strip()] or ["no message"]
+    missing = "" if online else " (Online Access is off: only wheels beside the chosen file were used)"
+    return f"{lines[0]}{missing}"
+
+
+def _environments(home: Path) -> list[str]:
+    if not home.is_dir():
+        return []
+    return [path.name for path in home.iterdir() if re.fullmatch(r"environment-\d+", path.name)]
+
+
+def _program(environment: Path, name: str) -> str:
+    folder, suffix = ("Scripts", ".exe") if sys.platform == "win32" else ("bin", "")
+    return os.fspath(environment / folder / f"{name}{suffix}")
