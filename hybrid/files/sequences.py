@@ -6,6 +6,7 @@ import glob
 import os
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -15,7 +16,7 @@ from fileseq.frameset import FrameSet
 
 # Where a number goes: #### (Nuke, RV), @@@@, %04d (ffmpeg, Nuke), $F4 (Houdini), <frame04> and <F4> (Maya, Karma).
 _PLACE = re.compile(r"(#+|@+)|%(\d*)d|\$(?:F(\d*)|\{F(\d*)\})|<(?:frame|f)(\d*)>", re.IGNORECASE)
-_RANGE = r"\d+(?:-\d+(?:[x:y]\d+)?)?(?:,\d+(?:-\d+(?:[x:y]\d+)?)?)*"
+_RANGE = r"\d+(?:--?\d+(?:[x:y]\d+)?)?(?:,-?\d+(?:--?\d+(?:[x:y]\d+)?)?)*"
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,12 @@ class Pattern:
 
     def path(self, number: int) -> Path:
         """The file of a frame."""
-        return self.folder / f"{self.before}{number:0{self.digits}d}{self.after}" if self.digits else self.single
+        return self._names(number)[0] if self.digits else self.single
+
+    def _names(self, number: int) -> list[Path]:
+        """The names that a frame can have: the sign is one of the digits (``%04d``: -002), or not (Blender: -0002)."""
+        texts = [f"{number:0{self.digits}d}", f"{'-' * (number < 0)}{abs(number):0{self.digits}d}"]
+        return [self.folder / f"{self.before}{text}{self.after}" for text in dict.fromkeys(texts)]
 
     @property
     def single(self) -> Path:
@@ -40,15 +46,32 @@ class Pattern:
         """Frame number → file, of those that are there, whatever the width of their numbers.
 
         Where widths are mixed, that of the pattern decides. A name without a number is frame 1.
+
+        Raises
+        ------
+        ValueError
+            If two files have one number, or a hyphen may be a sign or a part of the name.
         """
         if not self.digits:
             return {1: self.single} if self.single.is_file() else {}
         found = [(n, path) for path in _names(self.folder) if (n := self.number(path.name)) is not None]
         shortest = min((len(path.name) for _, path in found), default=0) - len(self.before) - len(self.after)
         padded = replace(self, digits=max(shortest, 1))
-        if any(path != padded.path(n) for n, path in found):
-            found = [(n, path) for n, path in found if path == self.path(n)]
-        return dict(sorted(found))
+        if any(path not in padded._names(n) for n, path in found):
+            found = [(n, path) for n, path in found if path in self._names(n)]
+        files: dict[int, Path] = {}
+        for number, path in sorted(found):
+            if number in files:
+                raise ValueError(
+                    f"{self}: frame {number} is {files[number].name} and {path.name}, expected one of them"
+                )
+            files[number] = path
+        plain = replace(self, before=self.before.removesuffix("-"))
+        signed = replace(self, before=f"{plain.before}-")
+        if not _sign(plain.before) and plain.path(0).exists() and signed.path(1).exists():
+            said = f"{signed.path(1).name} may be frame -1 of {plain} or frame 1 of {signed}"
+            raise ValueError(f"{self.folder}: {said}, expected a dot before the numbers, or two folders")
+        return files
 
     def number(self, name: str) -> int | None:
         """The number in a file's name; None where it has none, or is of another sequence."""
@@ -82,7 +105,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
     FileNotFoundError
         If nothing matches; says what the folder has.
     ValueError
-        If several sequences do, or it is both a file and the pattern of others.
+        If several sequences do, it is both a file and the pattern of others, or a hyphen in it would be a sign.
     """
     path = Path(spec)
     if path.is_dir():
@@ -94,10 +117,13 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
         return {1 if number is None else number: path}, None
     pattern, frames = parse_pattern(spec)
     if pattern.digits:
+        bare = replace(pattern, before=pattern.before.removesuffix("-"))
+        if bare != pattern and _sign(bare.before):
+            raise ValueError(f"{spec}: the hyphen is the sign of negative numbers, expected the pattern {bare}")
         if files := pattern.files():
             return files, frames
         # The range within the name, unless that is the name.
-        match = re.fullmatch(rf"(.*?)({_RANGE})", pattern.before)
+        match = re.fullmatch(rf"(.*?)((?:(?<![^._])-)?{_RANGE})", pattern.before)
         if match and "-" in match[2]:
             bare = Pattern(pattern.folder, match[1], pattern.digits, pattern.after)
             if files := bare.files():
@@ -114,7 +140,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
 
 def parse_pattern(spec: str) -> tuple[Pattern, str | None]:
     """Split a pattern at the last place for a number in its name; and from the range that stands behind it."""
-    match = re.fullmatch(rf"(.*\S)\s+({_RANGE})", spec)
+    match = re.fullmatch(rf"(.*\S)\s+(-?{_RANGE})", spec)
     frames = match[2] if match and _PLACE.search(Path(match[1]).name) else None
     path = Path(match[1] if match and frames else spec)
     places = list(_PLACE.finditer(path.name))
@@ -148,7 +174,7 @@ def find_views(spec: str) -> list[str]:
     called = f"{pattern.folder / pattern.before}"
     expression = re.escape(called).replace("%V", "(?P<long>[A-Za-z]{2,})", 1).replace("%v", "(?P<short>[A-Za-z])", 1)
     expression = expression.replace("%V", "(?P=long)").replace("%v", "(?P=short)")
-    expression += (r"\d+" if pattern.digits else "") + re.escape(pattern.after)
+    expression += (rf"{_sign(pattern.before)}\d+" if pattern.digits else "") + re.escape(pattern.after)
     loose = glob.escape(called).replace("%V", "*").replace("%v", "?")
     paths = glob.glob(loose + ("*" if pattern.digits else "") + glob.escape(pattern.after))
     matches = [match for path in paths if (match := re.fullmatch(expression, path))]
@@ -192,7 +218,7 @@ def _patterns(paths: Iterable[Path]) -> list[Pattern]:
     found: set[Pattern] = set()
     for group in groups.values():
         least = min((pattern for pattern, _ in group), key=lambda pattern: pattern.digits)
-        same = all(least.path(least.number(path.name) or 0) == path for _, path in group)
+        same = all(path in least._names(least.number(path.name) or 0) for _, path in group)
         # Numbers that are padded differently are of different sequences.
         found |= {least} if same else {pattern for pattern, _ in group}
     return sorted(found, key=str)
@@ -210,8 +236,8 @@ def pattern_of(path: Path) -> Pattern:
 
 
 def _sign(before: str) -> str:
-    """A hyphen is a sign where something else separates name and number already: in a.-001.exr, not in a-001.exr."""
-    return "-?" if before.endswith((".", "_")) else ""
+    """A hyphen is a sign where it separates no name from its number: in a.-001.exr and -001.exr, not in a-001.exr."""
+    return "-?" if not before or before.endswith((".", "_")) else ""
 
 
 def _only(patterns: list[Pattern], spec: str, folder: Path) -> Pattern:
@@ -226,9 +252,16 @@ def _listing(folder: Path) -> str:
     """What a folder has, for an error message; shortened if there is much of it."""
     if not folder.is_dir():
         return f"there is no folder {str(folder)!r}"
-    names = [f"{p} {format_frames(p.files())}" if p.digits else str(p) for p in _patterns(_names(folder))]
+    names = [_describe(pattern) for pattern in _patterns(_names(folder))]
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
     return f"{str(folder)!r} has {', '.join(sorted(names)[:8]) or 'no EXR files'}{more}"
+
+
+def _describe(pattern: Pattern) -> str:
+    """A pattern with the range of its frames; without it where their numbers are ambiguous."""
+    with suppress(ValueError):
+        return f"{pattern} {format_frames(pattern.files())}" if pattern.digits else str(pattern)
+    return str(pattern)
 
 
 def parse_frames(frames: str) -> list[int]:

@@ -145,6 +145,58 @@ def test_negative_numbers_are_padded_with_their_sign(tmp_path, form):
     assert [path.name for path in files.values()] == [f"a.{form.format(number)}.exr" for number in numbers]
 
 
+def test_negative_numbers_with_nothing_before_them(tmp_path):
+    """Of -0002 to 0001 half was left out, or the order was reversed: the hyphen was taken for a name."""
+    names = ["-0002.exr", "-0001.exr", "0000.exr", "0001.exr"]
+    for name in names:
+        (tmp_path / name).touch()
+    for spec in (str(tmp_path), f"{tmp_path}/####.exr", f"{tmp_path}/%04d.exr", f"{tmp_path}/*.exr"):
+        files, _ = find_files(spec)
+        assert [(number, path.name) for number, path in files.items()] == [*zip(range(-2, 2), names, strict=True)]
+    assert list(find_files(f"{tmp_path}/-0001.exr")[0]) == [-1]
+    for spec in (f"{tmp_path}/####.exr -2--1", f"{tmp_path}/-2--1####.exr", f"{tmp_path}/-*.exr"):
+        assert parse_frames(find_files(spec)[1] or "") == [-2, -1]
+    (tmp_path / "other.0001.exr").touch()
+    with pytest.raises(ValueError, match=r" ####\.exr -2-1, other\.####\.exr 1"):
+        find_files(str(tmp_path))
+    with pytest.raises(ValueError, match=r"the hyphen is the sign of negative numbers, expected the pattern ####\.exr"):
+        find_files(f"{tmp_path}/-####.exr")
+
+
+@pytest.mark.parametrize("before", ["a.", "shot_", "", "v2_"])
+@pytest.mark.parametrize("form", ["-{:04d}", "-{:03d}", "-{:d}"])
+@pytest.mark.parametrize("least", [0, 1, 9])
+def test_signs_beside_numbers_of_any_width(tmp_path, before, form, least):
+    """Blender pads the number and puts the sign before it; most others count the sign as a digit."""
+    expected = {-n: f"{before}{form.format(n)}.exr" for n in (12, 2, 1)}
+    expected |= {n: f"{before}{n:0{4 if '0' in form else 1}d}.exr" for n in (least, least + 1)}
+    for name in expected.values():
+        (tmp_path / name).touch()
+    files, _ = find_files(f"{tmp_path}/{before}####.exr")
+    assert {number: path.name for number, path in files.items()} == expected
+    assert find_files(str(tmp_path))[0] == files
+
+
+def test_two_files_of_one_negative_frame_are_refused(tmp_path):
+    for name in ("a.-001.exr", "a.-0001.exr", "a.0000.exr"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"frame -1 is a\.-0*1\.exr and a\.-0*1\.exr, expected one of them"):
+        find_files(f"{tmp_path}/a.####.exr")
+
+
+def test_a_hyphen_that_may_be_a_sign_is_refused(tmp_path):
+    """Blender writes shot-0001.exr before shot0000.exr; of either pattern half was left out without a word."""
+    for name in ("shot-0002.exr", "shot-0001.exr", "shot0000.exr", "shot0001.exr"):
+        (tmp_path / name).touch()
+    for spec in ("shot####.exr", "shot-####.exr"):
+        with pytest.raises(ValueError, match=r"shot-0001\.exr may be frame -1 of shot####\.exr or frame 1 of"):
+            find_files(f"{tmp_path}/{spec}")
+    with pytest.raises(ValueError, match=r"several sequences.*shot####\.exr"):
+        find_files(str(tmp_path))
+    (tmp_path / "shot0000.exr").unlink()
+    assert list(find_files(f"{tmp_path}/shot-####.exr")[0]) == [1, 2]
+
+
 @pytest.mark.parametrize("frames", ["1-" + "9" * 400, "1-2x" + "9" * 400, "9" * 400 + "-1x-" + "9" * 400])
 def test_ranges_of_hundreds_of_digits_are_none(frames):
     with pytest.raises(ValueError, match="is not a range") as caught:
