@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import Annotated
 
 import typer
+from typer.core import TyperCommand
 
 from hybrid.commands.compare import compare
 from hybrid.commands.denoise import denoise, pseudoref
@@ -23,6 +24,27 @@ from hybrid.threads import check_thread_counts, let_waiting_threads_sleep
 
 # Where numba looks for a folder for compiled loops: its own list, and after that ours.
 FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.compiled.Fallback"
+
+
+class Command(TyperCommand):
+    """A command that says what to do where a shell has replaced a pattern by the names of files."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; of several files where one was expected, say that the pattern is to be quoted."""
+        files = [argument for argument in args if argument.lower().endswith(".exr")]
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter:
+            raise
+        except Exception as error:
+            if len(files) > 1 and (message := getattr(error, "message", "")).startswith(
+                "Got unexpected extra argument"
+            ):
+                said = f"{len(files)} files, of which {files[1]}"
+                raise typer.BadParameter(f"expected one pattern in quotes, such as '*.exr', got {said}") from None
+            raise
+
+
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -39,7 +61,7 @@ for command, panel in (
     (train, "Networks"),
     (simulate, "Networks"),
 ):
-    app.command(rich_help_panel=panel)(logged(command))
+    app.command(cls=Command, rich_help_panel=panel)(logged(command))
 
 
 def _show_version(asked: bool) -> None:

@@ -21,7 +21,7 @@ from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_e
 from hybrid.files.layers import Layers, find_colors, find_layers, samples_of, summarize_layers
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
-from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern
+from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern, pattern_of
 from hybrid.files.sources import Source, identify
 from nlm.variance import variance_from_halves
 
@@ -685,7 +685,7 @@ def open_shot(
     known, companions = beside or find_companions(files)
     own = [open_apart(role, value) for role, value in said.items()]
     apart = [other for other in companions if other.role not in {*(layers or {})}]
-    return Shot(
+    shot = Shot(
         files,
         frames=named if frames is None else frames,
         layers={role: value for role, value in (layers or {}).items() if role not in said},
@@ -696,6 +696,12 @@ def open_shot(
         keep=keep,
         max_pixels=max_pixels,
     )
+    if Path(spec).is_file() and (sequence := pattern_of(Path(spec))).digits:
+        with suppress(ValueError):  # whose numbers are ambiguous is no sequence
+            if len(there := sequence.files()) > 1:
+                others = f"{sequence.folder / str(sequence)} {format_frames(there)}"
+                shot.warnings.append(f"{spec} is taken alone; {others} would take its neighbours too")
+    return shot
 
 
 def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list[Apart]] | None]:
@@ -757,10 +763,13 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
     Raises
     ------
     ValueError
-        If several frames would get one name, or an input file would be overwritten.
+        If several frames would get one name, an input file would be overwritten, or a name with a place for the number
+        does not end in ``.exr``.
     """
     pattern = str(pattern)
     names, _ = parse_pattern(pattern)
+    if names.digits and not names.after.lower().endswith(".exr") and not Path(pattern).is_dir():
+        raise ValueError(f"output {pattern!r} does not end in .exr, expected {pattern}.exr, or a folder without ####")
     if Path(pattern).is_dir() or names.path(number).suffix.lower() != ".exr":
         path = Path(pattern) / shot.path(number).name
     else:

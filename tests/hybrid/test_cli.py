@@ -100,6 +100,17 @@ def test_an_option_of_one_name_stands_in_one_group_of_every_help():
     assert {option for option, named in groups.items() if len(named) > 1} <= SAID_BY_EACH
 
 
+@pytest.mark.parametrize("command", [["denoise", "-o", "x"], ["pseudoref", "-o", "x"], ["inspect"]])
+def test_a_pattern_that_the_shell_has_replaced_is_to_be_quoted(shot_folder, capsys, command):
+    """The error named the other files alone."""
+    files = sorted(shot_folder.glob("*.exr"))
+    code, _, error = run(capsys, *command, *files)
+    assert code == 2
+    said = " ".join(re.sub("[│╭╮╰╯─]", " ", error).split())
+    assert "expected one pattern in quotes, such as '*.exr', got 3 files" in said
+    assert "in quotes" not in run(capsys, *command, files[0], "more")[2]
+
+
 def test_inspect_as_json(shot_folder, capsys):
     code, out, _ = run(capsys, "inspect", shot_folder, "--json", "--no-stages", "warp")
     document = json.loads(out)

@@ -55,7 +55,13 @@ def test_one_file_is_a_shot_of_one_frame(tmp_path):
     shot = open_shot(save(tmp_path, [8, 9]) / "shot.0009.exr")
     assert shot.numbers == (9,)
     assert neighbours(shot, 9, 1) == [None, 9, None]
+    (warning,) = shot.warnings
+    assert (
+        warning
+        == f"{tmp_path}/shot.0009.exr is taken alone; {tmp_path}/shot.####.exr 8-9 would take its neighbours too"
+    )
     save(tmp_path, [1], "still.exr")
+    assert open_shot(tmp_path / "still.exr").warnings == []
     assert open_shot(tmp_path / "still.exr").numbers == (1,)
 
 
@@ -376,6 +382,16 @@ def test_write_replaces_what_is_named_and_nothing_else(tmp_path):
 def test_output_path(tmp_path, pattern, expected):
     shot = open_shot(save(tmp_path, [8, 9]))
     assert output_path(tmp_path / pattern, shot, 9) == tmp_path / expected
+
+
+@pytest.mark.parametrize("pattern", ["OUT.####", "OUT.%04d", "OUT.####.tif", "new/####"])
+def test_an_output_with_a_place_for_a_number_ends_in_exr(tmp_path, pattern):
+    """A folder was made of that name."""
+    shot = open_shot(save(tmp_path, [8, 9]))
+    with pytest.raises(ValueError, match=rf"does not end in \.exr, expected .*{pattern}\.exr"):
+        output_path(tmp_path / pattern, shot, 9)
+    (tmp_path / pattern).mkdir(parents=True)
+    assert output_path(tmp_path / pattern, shot, 9) == tmp_path / pattern / "shot.0009.exr"
 
 
 def test_output_of_several_frames_needs_a_placeholder_and_may_not_be_the_input(tmp_path):
