@@ -268,7 +268,7 @@ def _choose(
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
-    other = find_other_frame(shot, lambda number: _denoised(sequence, number) if sequence.has(number) else None)
+    other = find_other_frame(shot, lambda number: read_denoised(sequence, number) if sequence.has(number) else None)
     if other is not None:
         raise ValueError(f"estimate {spec}: each picture belongs to {other}, expected those of the shot's own frames")
     read = OfFrames(partial(_read_sequence, sequence), files=sequence)
@@ -414,10 +414,28 @@ def estimate_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **m
 
 def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:
     # Neighbours outside the frames that were asked for may be missing: they then count for nothing.
-    return _denoised(sequence, frame.number) if sequence.has(frame.number) else None
+    return read_denoised(sequence, frame.number) if sequence.has(frame.number) else None
 
 
-def _denoised(sequence: Shot, number: int) -> Array:
-    """A finished frame; where Cycles has denoised, the file's color is the noisy image beside it."""
+def read_denoised(sequence: Shot, number: int) -> Array:
+    """Read the denoised picture of a frame, wherever its file has it.
+
+    Parameters
+    ----------
+    sequence : Shot
+        Finished frames.
+    number : int
+        Of a frame that is there.
+
+    Returns
+    -------
+    (H, W, 3) array of float32
+        Linear radiance: the estimate, where the color is the noisy picture beside it; else the color, as in every file
+        that ravg has written over it.
+    """
     found = sequence.read(number)
-    return found.color if found.estimate is None else found.estimate
+    if found.estimate is None:
+        return found.color
+    layers = sequence.layers(number)
+    replaced = layers.target == layers.color and MADE_FROM in sequence.header(number).parts[0].header
+    return found.color if replaced else found.estimate

@@ -21,7 +21,7 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.alignment.window import AlignedWindow
-from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn
+from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn, read_denoised
 from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
@@ -89,7 +89,7 @@ def noisy(shot: Shot) -> Iterator[tuple[int, Array]]:
 
 
 def finished(shot: Shot, *, other: Shot) -> Iterator[tuple[int, Array]]:
-    """The frames that another denoiser has left in files, as they are.
+    """The frames that a denoiser has left in files (`hybrid.estimates.read_denoised`).
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def finished(shot: Shot, *, other: Shot) -> Iterator[tuple[int, Array]]:
     """
     for number in shot.numbers:
         if other.has(number):
-            yield number, other.read(number).color
+            yield number, read_denoised(other, number)
 
 
 def external(other: Shot) -> Method:

@@ -13,7 +13,9 @@ from hybrid.alignment.align import Aligner
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
+from hybrid.files.exr import write_layers
 from hybrid.files.frames import Shot, open_shot
+from hybrid.files.sources import MADE_FROM
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import filter_window
 from nlm.average import average
@@ -38,6 +40,28 @@ def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) ->
     assert image.shape == noisy.shape
     assert np.isfinite(image).all()
     assert psnr(image, truth) > psnr(noisy, truth)
+
+
+@pytest.mark.parametrize(("names", "value"), [("Combined", 2), ("Image", 2), ("denoised", 2), ("other", 1)])
+def test_of_a_finished_sequence_the_denoised_layer_is_read(
+    shot: Shot, tmp_path: Path, names: str, value: float
+) -> None:
+    """The Noisy Image of Blender's files, which ravg leaves in its own, was measured."""
+    size = shot.shape
+    noisy = "Noisy Image" if names != "denoised" else "color"
+    for number in shot.numbers:
+        layers = {noisy: np.full((*size, 3), 1, np.float32), names: np.full((*size, 3), 2, np.float32)}
+        write_layers(tmp_path / f"a.{number:04d}.exr", layers)
+    pictures = dict(methods.finished(shot, other=open_shot(tmp_path)))
+    assert [picture.mean() for picture in pictures.values()] == [value] * len(shot)
+
+
+def test_of_ravg_s_own_files_what_it_has_written_is_read(shot: Shot, tmp_path: Path) -> None:
+    """Another denoiser's picture beside it was read instead of the color that ravg has replaced."""
+    layers = {"color": np.full((*shot.shape, 3), 1, np.float32), "denoised": np.full((*shot.shape, 3), 2, np.float32)}
+    write_layers(tmp_path / f"a.{SCENE.first}.exr", layers, attributes={MADE_FROM: "{}"})
+    pictures = dict(methods.finished(shot, other=open_shot(tmp_path)))
+    assert pictures[SCENE.first].mean() == 1
 
 
 def test_noise_of_a_tone_mapped_frame_is_found() -> None:
