@@ -135,11 +135,9 @@ class ExrImage:
         """The name of a channel in the whole file; the same for single-part and multi-part stereo."""
         if len(self.parts) == 1:
             return name
-        base = part.name
-        if part.view:
-            # Part names are unique, so writers add the view to them: Blender "ViewLayer.Combined-left",
-            # with channels "ViewLayer.Combined.R"; others "rgba_left", with channels "R".
-            base = re.sub(rf"[-_.]{re.escape(part.view)}$", "", base)
+        # Part names are unique, so writers add the view to them: Blender "ViewLayer.Combined-left", with channels
+        # "ViewLayer.Combined.R"; others "rgba_left", with channels "R". Where there is one view, Nuke calls it main.
+        base = re.sub(rf"[-_.]{re.escape(part.view or 'main')}$", "", part.name)
         *layer, component = name.split(".")
         own = ".".join(layer)
         layer = [own] if own == base or own.startswith(base + ".") else [base, *layer]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from flow.motion import MotionConvention
@@ -13,6 +13,17 @@ from hybrid.files.profile import ROLES, Profile, find_profile, plain_name
 
 # Blender's name for what its compositor has made of the view layers: graded, blurred, glowing.
 COMPOSITE = "Composite"
+# What Blender calls the picture that it has denoised, beside its Noisy Image: in a render, and in the files of a File
+# Output node.
+_DENOISED = ("combined", "image")
+# Words in the names of layers that may be a guide, of up to two letters whole names; and words in names of no guide.
+_LOOKS_LIKE = {
+    "albedo": re.compile("albedo|basecolor|diff(?:use)?filter|reflectance"),
+    "normal": re.compile("normal|nrml|n"),
+    "depth": re.compile("depth|z"),
+    "motion": re.compile("motion|velocity|vector|mvec|mv"),
+}
+_NO_GUIDE = re.compile("variance|mse|error|deviation|crypto")
 # What stands for every layer that is known to be a part of the light.
 ALL = "all"
 # One lobe's direct or indirect light, as Cycles and others name it; and names of parts that are there as a whole.
@@ -118,8 +129,8 @@ def find_layers(
 
     Notes
     -----
-    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate. The
-    other layers are taken from the color's own view layer and stereo view only.
+    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate (``Image`` in files of
+    Blender's File Output node). The other layers are taken from the color's own view layer and stereo view only.
 
     What could be the color twice over (two view layers; ``beauty`` beside bare R, G, B) is refused: whichever was
     taken, the other would stay noisy in the file. What a known renderer calls its color goes before names that
@@ -149,7 +160,8 @@ def find_layers(
         whole = [x for x in image.layers if x.part == color.part and set(color.channels) <= set(x.channels)]
         found["alpha"] = _fit(image, "alpha", whole[0], named=False) if whole else None
     if "estimate" not in overrides and "noisyimage" in _tails(image, color):
-        combined = [x for x in _same_group(image, color) if "combined" in _tails(image, x)]
+        near = _same_group(image, color)
+        combined = [x for name in _DENOISED for x in near if name in _tails(image, x) and _group(x) == _group(color)]
         found["estimate"] = _fit(image, "estimate", combined[0], named=True) if combined else None
         found["target"] = found["estimate"] or color
     for role in ROLES[1:]:
@@ -159,6 +171,7 @@ def find_layers(
     view = color.view or (image.views[0] if image.views else None)
     if len(image.views) > 1 and not isinstance(overrides.get("color"), Layer):
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
+    notes += _find_unused(image, color, {**found, "motion": found["motion"] or found["motion_next"]})
     convention, samples = _convention(found, taken), samples_of(image, taken)
     written = [layer for layer in (found["target"], found["alpha"]) if layer is not None]
     further = _find_aovs(image, aovs, color, written)
@@ -271,7 +284,8 @@ def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: lis
         chosen: list[Layer] = []
         for group in sorted(groups):
             own = {layer: fitted for layer, fitted in fitting.items() if _group(layer) == group}
-            if sorted(_tails(image, layer)[0] for layer in own) == ["combined", "noisyimage"]:
+            plain = {_tails(image, layer)[0] for layer in own}
+            if "noisyimage" in plain and plain <= {"noisyimage", *_DENOISED}:
                 own = {x: fitted for x, fitted in own.items() if "noisyimage" in _tails(image, x)}
             chosen += own.values()
         return chosen
@@ -295,6 +309,19 @@ def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> L
             if fitting:
                 return _only(image, role, fitting)
     return None
+
+
+def _find_unused(image: ExrImage, color: Layer, found: Mapping[str, Layer | None]) -> Iterator[str]:
+    """Name the layers that look like a guide that was not found; a line each."""
+    taken = {channel for layer in found.values() if layer is not None for channel in layer.channels}
+    for role, words in _LOOKS_LIKE.items():
+        if found.get(role) is not None:
+            continue
+        for layer in _same_group(image, color):
+            names = [tail for tail in _tails(image, layer) if not _NO_GUIDE.search(tail)]
+            alike = any(len(m[0]) > 2 or m[0] == name for name in names for m in words.finditer(name))
+            if alike and not taken & {*layer.channels}:
+                yield f"{layer} is not used; if it is the {role}: --layer {role}={layer.name or layer}"
 
 
 def light_kind(name: str) -> str | None:

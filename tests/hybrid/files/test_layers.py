@@ -48,6 +48,45 @@ def test_where_cycles_has_denoised_combined_is_the_estimate_and_is_replaced(tmp_
     assert str(layers.estimate) == str(layers.target) == "ViewLayer.Combined.RGB"
 
 
+@pytest.mark.parametrize("group", ["", "ViewLayer."])
+def test_of_a_file_output_node_the_image_is_replaced(tmp_path, group):
+    """The Noisy Image was, which nobody opens."""
+    names = cycles_names({**CYCLES, "Image": "RGBA", "Noisy Image": "RGBA"}, group)
+    names = [name for name in names if "Combined" not in name]
+    layers = find_layers(headers(tmp_path, names))
+    assert str(layers.color) == f"{group}Noisy Image.RGB"
+    assert str(layers.estimate) == str(layers.target) == f"{group}Image.RGB"
+    alone = find_layers(headers(tmp_path, [name for name in names if "Noisy" not in name]))
+    assert str(alone.color) == str(alone.target) == f"{group}Image.RGB"
+    with pytest.raises(ExrError, match=r"color can be .*Combined.RGB, .*Image.RGB"):
+        find_layers(headers(tmp_path, cycles_names({**CYCLES, "Image": "RGBA"}, group)))
+
+
+@pytest.mark.parametrize("end", [".main", "_main", "-main"])
+def test_parts_that_are_named_after_the_only_view(tmp_path, end):
+    parts = {f"rgba{end}": "RGBA", f"albedo{end}": "RGB", f"N{end}": "XYZ", f"depth{end}": "Z", f"motion{end}": "XY"}
+    image = read_exr(save_parts(tmp_path / "a.exr", {n: planes([*c]) for n, c in parts.items()}), pixels=False)
+    layers = find_layers(image)
+    found = {role: str(getattr(layers, role)) for role in ("color", "albedo", "normal", "depth", "motion")}
+    assert found == {
+        "color": "rgba.RGB", "albedo": "albedo.RGB", "normal": "N.XYZ", "depth": "depth.Z", "motion": "motion.XY"
+    }  # fmt: skip
+    assert find_layers(image, {"color": f"rgba{end}"}).color == layers.color
+
+
+def test_layers_that_look_like_guides_and_are_not_taken_are_named(tmp_path):
+    """They were left unused without a word."""
+    names = "R G B N_mine.X N_mine.Y N_mine.Z myAlbedo.R myAlbedo.G myAlbedo.B Z_mine.Z world_velocity.X albedo_mse.R"
+    notes = find_layers(headers(tmp_path, names.split())).notes
+    assert notes == (
+        "myAlbedo.RGB is not used; if it is the albedo: --layer albedo=myAlbedo",
+        "world_velocity.X is not used; if it is the motion: --layer motion=world_velocity",
+    )
+    names = "R G B A Z albedo.R albedo.G albedo.B second_albedo.R depth_mine.Z N.X N.Y N.Z normal_mine.X"
+    assert find_layers(headers(tmp_path, names.split())).notes == ()
+    assert find_layers(headers(tmp_path, cycles_names())).notes == ()
+
+
 @pytest.mark.parametrize("qualified", [True, False])
 def test_multi_part_file_has_the_same_names_as_single_part(tmp_path, qualified):
     single = read_exr(save(tmp_path / "a.exr", planes(cycles_names())), pixels=False)

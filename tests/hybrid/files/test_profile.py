@@ -109,6 +109,24 @@ def taken(layers: Layers) -> dict[str, str]:
             {"color": "RGB", "alpha": "A", "motion": "backward.uv", "motion_next": "forward.uv", "depth": "depth.Z"},
         ),
         (
+            "Arnold", "RGB denoise_albedo_noice.RGB N_noice.XYZ Z_noice motionvector.RG", {"arnold__version": "7"},
+            {"color": "RGB", "albedo": "denoise_albedo_noice.RGB", "normal": "N_noice.XYZ", "depth": "Z_noice",
+             "motion": "motionvector.RG"},
+        ),
+        (
+            "Arnold", "RGB N_noice.XYZ Z_noice.R", {},
+            {"color": "RGB", "normal": "N_noice.XYZ", "depth": "Z_noice.R"},
+        ),
+        (
+            "Karma", "RGBA denoise_albedo.RGB N_denoise.RGB Z_denoise", {"husk:render_time": "1"},
+            {"color": "RGB", "alpha": "A", "albedo": "denoise_albedo.RGB", "normal": "N_denoise.RGB",
+             "depth": "Z_denoise"},
+        ),
+        (
+            "Octane", "RGBA DifF.RGB ShN.XYZ MV.RGB Z", {},
+            {"color": "RGB", "alpha": "A", "albedo": "DifF.RGB", "normal": "ShN.XYZ", "motion": "MV.RGB", "depth": "Z"},
+        ),
+        (
             "common names", "color.RGB albedo.RGB motion.XY", {},
             {"color": "color.RGB", "albedo": "albedo.RGB", "motion": "motion.XY"},
         ),
