@@ -9,6 +9,12 @@ import os
 # The pictures are small: threads gain nothing, and on a busy machine they wait for each other, ten times as long.
 for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+# Neither the terminal of whoever runs the tests nor defaults of the commands decide what these print and do.
+for _name in [name for name in os.environ if name.startswith("RAVG_") and name != "RAVG_COMMAND"]:
+    del os.environ[_name]
+for _name in ("COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "PY_COLORS"):
+    os.environ.pop(_name, None)
+os.environ["TERM"] = "xterm"
 
 import shutil
 import signal
