@@ -109,7 +109,8 @@ def replace_file(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             if _is(temporary, descriptor):
                 temporary.unlink()
-        if isinstance(error, OSError) and error.filename == str(temporary):
+        # What fails in the middle of writing, as on a full disk, names no file at all.
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
         raise
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import stat
@@ -88,6 +89,18 @@ def test_files_have_the_rights_that_others_have(tmp_path):
     (tmp_path / "plain").touch()
     write_file(tmp_path / "ours", b"")
     assert stat.S_IMODE((tmp_path / "ours").stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_an_error_while_writing_names_the_file(tmp_path, named):
+    """A full disk was told of as "[Errno 28] No space left on device", and no more."""
+    with (
+        pytest.raises(OSError, match="cannot write: No space left") as error,
+        replace_file(tmp_path / "a") as temporary,
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device", *([str(temporary)] if named else []))
+    assert error.value.filename == str(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_long_name_is_no_obstacle(tmp_path):
