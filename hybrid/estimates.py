@@ -19,12 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
+from hybrid.alignment.loading import REACH
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
 from hybrid.plausibility import LOST, find_lost_light, find_other_frame
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
+from nlm.fireflies import Lights, hold_lights
 
 Array = NDArray[np.float32]
 
@@ -74,7 +76,8 @@ class OfFrames:
 
         def seen(frame: Frame) -> None:
             with aligner.timings.stage("estimate"):
-                aligner.estimates[frame.number] = _checked(self.function(frame), frame)
+                lamps = aligner.frames[frame.number].lamps
+                aligner.estimates[frame.number] = _checked(self.function(frame), frame, lamps)
 
         aligner.load(numbers, seen)
 
@@ -333,7 +336,7 @@ class Kept:
         self._shot = shot
         self._facts = {"estimate": mode, "quicker": quicker, "device": device, "forced": forced, **versions("pyoidn")}
         # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.
-        self._reach = 1 + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
+        self._reach = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
 
     def read_or_run(self, frame: Frame, *known: bool, run: Callable[..., Array]) -> Array:
         """What an earlier run has left of this frame, if it would be the same now; else what is left there now.
@@ -368,8 +371,8 @@ def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Ca
     return estimate_oidn(frame, denoise, **settings)
 
 
-def _checked(found: Array | None, frame: Frame) -> Array | None:
-    """An estimate that fits its frame and is finite."""
+def _checked(found: Array | None, frame: Frame, lamps: Lights | None = None) -> Array | None:
+    """An estimate that fits its frame and is finite, without lamps that are not in the frame, and their halos."""
     if found is None:
         return None
     what = f"the estimate of frame {frame.number}"
@@ -381,6 +384,8 @@ def _checked(found: Array | None, frame: Frame) -> Array | None:
     if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
         raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
     filled = np.maximum(filled, 0)
+    if lamps is not None:
+        filled = hold_lights(filled, lamps.pixels)
     if fault := find_lost_light(filled, noisy, ~bad):
         raise ValueError(f"{what}: {fault}")
     return filled

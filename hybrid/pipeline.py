@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
+from hybrid.alignment.loading import REACH
 from hybrid.alignment.window import AlignedWindow
 from hybrid.beside import ReadAhead
 from hybrid.estimates import OIDN_MODES, EstimateSource
@@ -226,7 +227,7 @@ def denoise_frames(
         def expect(number: int) -> None:
             """Have the frames read ahead that the picture of a frame needs."""
             # The outermost are read only where something shines in the one beside them, or by a later window.
-            near = shot.near(number, reach - 1) if beside else ()
+            near = shot.near(number, reach - REACH) if beside else ()
             for frames in readers:
                 frames.expect(near)
 
@@ -342,7 +343,7 @@ def _check_finite(images: Mapping[str, Array], number: int) -> None:
 def reach_of(estimates: Estimates | None, radius: int, rules: Rules) -> int:
     """Count the frames on each side of one that it depends on.
 
-    Its window, one for what shines in a frame alone, and one for the pictures beside it, which have windows too.
+    Its window, two for what shines in a frame alone, and one for the pictures beside it, which have windows too.
 
     Parameters
     ----------
@@ -353,7 +354,7 @@ def reach_of(estimates: Estimates | None, radius: int, rules: Rules) -> int:
     rules : Rules
         What decides which stages run.
     """
-    return 1 + ("steady" in rules.allowed) + (radius if estimates is None else estimates.reach(radius))
+    return REACH + ("steady" in rules.allowed) + (radius if estimates is None else estimates.reach(radius))
 
 
 def sources_of(

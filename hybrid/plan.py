@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid.alignment.loading import LoadedFrames
-from hybrid.alignment.measure import FrameFacts, PairFacts
+from hybrid.alignment.measure import FIXED_NOISE_ABOVE, FrameFacts, PairFacts
 from hybrid.files.frames import Frames
 from hybrid.files.sequences import format_frames
 
@@ -49,8 +49,6 @@ REFINE_ABOVE = 0.01
 GATE_ABOVE = 0.002
 # One firefly in a hundred thousand pixels is twenty in a 1080p frame: visible.
 OUTLIERS_ABOVE = 1e-5
-# How much of the noise is the same at equal pixels (`hybrid.alignment.measure.fixed_noise`).
-FIXED_NOISE_ABOVE = 0.25
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003

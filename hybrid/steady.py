@@ -20,7 +20,7 @@ from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
 from hybrid.plausibility import find_lost_light, find_nonfinite
 from nlm.average import average
-from nlm.fireflies import RECURS
+from nlm.fireflies import Lights, add_lights
 from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
@@ -136,7 +136,8 @@ class Pictures:
         if (frame := self.aligner.frames.get(number)) is not None:
             self._check_light(denoised.color, frame)
             denoised = self._correct(denoised, frame, sides, counts.stages)
-        denoised = replace(denoised, color=_with_lamps(denoised.color, self.aligner.frames.get(number)))
+            if frame.lamps is not None:
+                denoised = _with_lamps(denoised, frame.lamps)
         return denoised, replace(counts, beside=tuple(sorted(self._made)))
 
     def beside(self, number: int) -> list[int]:
@@ -238,12 +239,12 @@ def _changed(denoised: Denoised, color: Array) -> Denoised:
     return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
 
 
-def _with_lamps(color: Array, frame: PreparedFrame | None) -> Array:
-    """The picture, with the lamps of a pixel that estimates have lost as they were rendered.
-
-    Denoisers of single frames take them for fireflies; that the next frame shows them too they cannot know.
-    """
-    if frame is None or frame.lamps is None:
-        return color
-    lost = frame.lamps & (color.mean(axis=-1) < RECURS * frame.radiance.mean(axis=-1))
-    return np.where(lost[..., None], frame.radiance, color)
+def _with_lamps(denoised: Denoised, lamps: Lights) -> Denoised:
+    """The picture with the lamps of a pixel, which were taken out of what it was made of; its parts changed alike."""
+    color = add_lights(denoised.color, lamps)
+    ratio = np.divide(color, denoised.color, out=np.ones_like(color), where=denoised.color > 0)
+    aovs, extra = (
+        {name: layer * ratio if name in denoised.parts else layer for name, layer in layers.items()}
+        for layers in (denoised.aovs, denoised.extra)
+    )
+    return replace(denoised, color=color, aovs=aovs, extra=extra)

@@ -4,16 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Protocol
 
 import numpy as np
 
-from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
+from hybrid.alignment.measure import (
+    MOVED_NOISE,
+    FrameFacts,
+    PairFacts,
+    SmallFrame,
+    equal_noise,
+    measure_frame,
+    measure_pair,
+    repeats,
+    same_noise_at,
+    shrink,
+)
 from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
 from hybrid.files.frames import Frame, Frames
 from hybrid.timing import Timings
-from nlm.fireflies import find_fireflies, recurring, replace_fireflies
+from nlm.fireflies import (
+    Lights,
+    Mask,
+    Places,
+    Points,
+    bright_near,
+    find_lights,
+    follow,
+    in_calm,
+    mean_light,
+    measure_lights,
+    nearest,
+    replace_fireflies,
+    same_light,
+    take_lights,
+)
+
+# A lamp of a pixel is known by so many frames beside its own, of these on each side.
+WITNESSES, REACH = 2, 2
 
 
 class Decide(Protocol):
@@ -72,7 +101,7 @@ class LoadedFrames:
         """
         # What no window from here on needs is dropped, so that memory does not grow with the shot.
         kept = {*numbers, *hold}
-        near = {n + k * self.shot.step for n in numbers for k in (-1, 0, 1)}
+        near = {n + k * self.shot.step for n in numbers for k in range(-REACH, REACH + 1)}
         self._read = {n: pair for n, pair in self._read.items() if n in near}
         self._frames = {n: frame for n, frame in self._frames.items() if n in kept}
         self._small = {n: small for n, small in self._small.items() if n in kept}
@@ -86,7 +115,7 @@ class LoadedFrames:
                 if frame is not None:
                     seen(frame)
         # As they were before fireflies were taken out, frames are asked only by those after them.
-        last = max(self._frames, default=0)
+        last = max(self._frames, default=0) - (REACH - 1) * self.shot.step
         self._read = {n: pair for n, pair in self._read.items() if n >= last}
 
     def __getitem__(self, number: int) -> PreparedFrame:
@@ -150,28 +179,78 @@ class LoadedFrames:
         return self._read[number]
 
     def _without_fireflies(self, frame: Frame | None, prepared: PreparedFrame) -> tuple[Frame | None, PreparedFrame]:
-        """Take out the single bright samples that neither neighbour shows: before anything is made of the frame."""
+        """Take out the single bright samples, before anything is made of the frame; those that are lamps are kept."""
         with self.timings.stage("prepare"):
-            places = find_fireflies(prepared.irradiance)
+            places, isolated = find_lights(prepared.irradiance)
         if not len(places):
             return frame, prepared
-        # A lamp shines in every frame; noise, where there is much of it, now and then in two.
-        known, everywhere = np.zeros(len(places), bool), np.ones(len(places), bool)
-        for neighbour in (prepared.number - self.shot.step, prepared.number + self.shot.step):
-            if self.shot.has(neighbour):
-                _, there = self._read_once(neighbour)
-                flow, valid = rendered_flow(prepared, there) or (None, None)
-                shown = recurring(places, prepared.irradiance, there.irradiance, flow, valid)
-                known, everywhere = known | shown, everywhere & shown
-        lasting = places[known & everywhere]
-        lamps = replace_fireflies(prepared.irradiance, lasting)[1] if len(lasting) else None
-        places = places[~known]
-        clean, replaced, _ = replace_fireflies(prepared.irradiance, places)
-        rendered, where = prepared.mean, np.nonzero(replaced)
-        taken = (where, prepared.irradiance[where]) if len(places) else None
-        prepared = replace(prepared, irradiance=clean, fireflies=len(places), lamps=lamps, taken=taken)
-        prepared = replace(prepared, burnt=max(rendered - prepared.mean, 0.0))
+        lamps, alone = self._tell_apart(prepared, places)
+        with self.timings.stage("prepare"):
+            whole, fireflies = prepared.irradiance, places[isolated & alone]
+            if len(lamps.pixels):
+                whole = take_lights(whole, lamps.pixels)
+                prepared = replace(prepared, irradiance=whole, lamps=lamps)
+            if len(fireflies):
+                rendered = prepared.mean
+                clean, replaced, _ = replace_fireflies(whole, fireflies)
+                where = np.nonzero(replaced)
+                prepared = replace(prepared, irradiance=clean, fireflies=len(fireflies), taken=(where, whole[where]))
+                prepared = replace(prepared, burnt=max(rendered - prepared.mean, 0.0))
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
+
+    def _tell_apart(self, prepared: PreparedFrame, places: Places) -> tuple[Lights, Mask]:
+        """Find which bright places are lamps, and which nothing beside the frame is like.
+
+        Of a lamp the two nearest frames whose noise is their own have to show the same light at the same place along
+        the motion, or the one that there is.
+        """
+        rough = measure_lights(prepared.irradiance, places)
+        own = measure_lights(prepared.irradiance, nearest(rough.points), prepared.divisor)
+        asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
+        alone = np.ones(len(places), bool)
+        still = np.zeros_like(own.points)
+        moved, last = {-1: still, 1: still}, {-1: prepared, 1: prepared}
+        others: list[tuple[Lights, Points, Mask]] = []
+        used = [(prepared, still)]
+        for distance, side in product(range(1, REACH + 1), (-1, 1)):
+            number = prepared.number + distance * side * self.shot.step
+            undecided = (shown == asked) & (asked < WITNESSES)
+            if side not in moved or not (distance == 1 or undecided.any()):
+                continue
+            if not self.shot.has(number):
+                del moved[side]
+                continue
+            _, there = self._read_once(number)
+            with self.timings.stage("prepare"):
+                moved[side] = moved[side] + _motion(last[side], there, nearest(own.points + moved[side]))
+                last[side] = there
+                pixels = follow(own, moved[side])
+                lights = measure_lights(there.irradiance, pixels, there.divisor)
+                fresh = np.isfinite(lights.light).all(axis=1)
+                for frame, before in used:
+                    noise = equal_noise(frame.irradiance, there.irradiance)
+                    unmoved = np.abs(moved[side] - before).max(axis=1) < MOVED_NOISE
+                    fresh &= not repeats(*noise)
+                    fresh &= ~(unmoved & same_noise_at(*noise, pixels))
+                if distance == 1:
+                    alone &= ~(fresh & bright_near(places, prepared.irradiance, pixels, there.irradiance))
+                same = fresh & undecided & same_light(own, moved[side], lights)
+                same[same] = in_calm(own[same], prepared.irradiance, pixels[same], there.irradiance)
+            asked, shown = asked + (fresh & undecided), shown + same
+            others.append((lights, moved[side], same))
+            used.append((there, moved[side]))
+        lasting = (asked > 0) & (shown == asked)
+        return mean_light(own, others)[lasting], alone & ~lasting
+
+
+def _motion(here: PreparedFrame, there: PreparedFrame, pixels: Places) -> Points:
+    """Rows and columns that pixels of a frame move by to another one; 0 where nothing tells."""
+    flow, valid = rendered_flow(here, there) or (None, None)
+    if flow is None or valid is None:
+        return np.zeros(pixels.shape)
+    rows, columns = (np.clip(pixels[:, axis], 0, flow.shape[axis] - 1) for axis in (0, 1))
+    moved = flow[rows, columns, ::-1].astype(np.float64)
+    return np.where(valid[rows, columns, None] & np.isfinite(moved), moved, 0)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,12 @@ GUIDE_CHANGE = 0.02
 # Noise hides in 9×9 pixels what means of larger areas show: where they differ by more than a twentieth, and by eight
 # times what noise makes them differ by; samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
+# Noise is one for two frames where more than this share of it is the same at equal pixels.
+FIXED_NOISE_ABOVE = 0.25
+# A frame repeats another where no less than this share is: all but what is burned into the picture.
+REPEATED = 0.99
+# Noise around a place is that of so many pixels on a side, or that of the whole frame where so few of them hold any.
+NOISE_AROUND, FEW = 33, 32
 # A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32
@@ -289,6 +295,43 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
         shares.append(int(moved.sum()))
         figures.append(2 * _correlation(*d))
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
+
+
+def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
+    """Find where two frames hold noise or detail, and where that is the same sample at equal pixels.
+
+    Parameters
+    ----------
+    here, there : (H, W, 3) array
+        Irradiance, as rendered.
+
+    Returns
+    -------
+    grainy : (H, W) array
+        1 where both differ from the median of the 5×5 pixels around by more than half floats are rounded, else 0.
+    equal : (H, W) array
+        1 where also their values are equal to that rounding, else 0.
+    """
+    a, b = _level(here), _level(there)
+    most = np.maximum(np.abs(a), np.abs(b))
+    grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
+    grainy = grain > 4 * SAME * most
+    return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= SAME * most)).astype(np.float32)
+
+
+def repeats(grainy: Array, equal: Array) -> bool:
+    """Whether a frame is another once more, by their `equal_noise`; never where there is hardly any."""
+    count = np.count_nonzero(grainy)
+    return bool(count >= FEW and np.count_nonzero(equal) >= REPEATED * count)
+
+
+def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
+    """Tell around which pixels (K, 2), rows and columns, two frames have the same noise, by their `equal_noise`."""
+    share = float(equal.sum() / max(grainy.sum(), 1))
+    rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))
+    side = (NOISE_AROUND, NOISE_AROUND)
+    count, same = (cv2.boxFilter(m, -1, side, normalize=False)[rows, columns] for m in (grainy, equal))
+    return np.asarray(np.where(count >= FEW, same / np.maximum(count, 1), share) > FIXED_NOISE_ABOVE)
 
 
 def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:

@@ -13,6 +13,7 @@ from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame
 from nlm.average import reject_outliers, replace_nonfinite
+from nlm.fireflies import Lights, add_lights
 from nlm.guided import guided_filter, measure_guide
 
 Array = NDArray[np.float32]
@@ -73,8 +74,9 @@ class PreparedFrame:
         Mean radiance that went with them: what fireflies carry belongs to the picture in expectation.
     taken : (tuple of index arrays, (K, 3) array) or None
         Where `irradiance` is not as rendered as fireflies were taken out, and what was there.
-    lamps : (H, W) bool array or None
-        Single bright pixels that a neighbour shows as well; None where there are none.
+    lamps : Lights or None
+        Lights of a pixel that other frames show as well, in the mean of these frames: they are not in `irradiance`, and
+        are added to the picture once it is finished. None where there are none.
     """
 
     number: int
@@ -93,7 +95,7 @@ class PreparedFrame:
     fireflies: int = 0
     burnt: float = 0.0
     taken: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
-    lamps: Mask | None = None
+    lamps: Lights | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -123,13 +125,25 @@ class PreparedFrame:
         return np.concatenate(guides, axis=-1) if guides else None
 
     @property
+    def divisor(self) -> Array | None:
+        """The radiance that an irradiance of 1 is (H, W, 3); None where that is 1 as well."""
+        if self.albedo is None or not self.demodulated:
+            return None
+        return remodulate(np.ones_like(self.irradiance), self.albedo)
+
+    @property
     def radiance(self) -> Array:
-        """The noisy radiance (H, W, 3), without fireflies."""
+        """The noisy radiance (H, W, 3), without fireflies and lamps."""
         return self._as_radiance(self.irradiance)
 
     @property
+    def with_lamps(self) -> Array:
+        """The noisy radiance (H, W, 3), without fireflies, with lamps."""
+        return self.radiance if self.lamps is None else add_lights(self.radiance, self.lamps)
+
+    @property
     def rendered(self) -> Array:
-        """The noisy radiance (H, W, 3), with fireflies: right in the mean."""
+        """The noisy radiance (H, W, 3), with fireflies, without lamps: right in the mean but for these."""
         if self.taken is None:
             return self.radiance
         whole, (places, light) = self.irradiance.copy(), self.taken
@@ -148,8 +162,8 @@ class PreparedFrame:
 
     @cached_property
     def mean(self) -> float:
-        """Mean radiance of all pixels and channels."""
-        return float(self.radiance.mean(dtype=np.float64))
+        """Mean radiance of all pixels and channels, lamps included."""
+        return float(self.with_lamps.mean(dtype=np.float64))
 
     @property
     def removed(self) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from hybrid.alignment.loading import LoadedFrames
@@ -26,20 +29,107 @@ def test_frames_are_forgotten_but_those_that_are_held(tmp_path):
     assert frames[1001] is held
 
 
-@pytest.mark.parametrize(("shining", "lamp"), [((4, 5), False), ((4, 5, 6), True)])
-def test_what_one_neighbour_shows_too_is_kept_and_what_both_show_is_a_lamp(tmp_path, shining, lamp):
+PLACE = np.s_[20, 30]
+
+
+def shining(*indices, place=PLACE, light=500):
+    def shine(index, layers):
+        if index in indices:
+            layers["ViewLayer.Combined"][place] = light
+
+    return shine
+
+
+def load(shot, numbers):
+    frames = LoadedFrames(shot, Rules())
+    frames.load(numbers)
+    return frames
+
+
+@pytest.mark.parametrize(("seen", "lamp"), [((4, 5), False), ((5, 6), False), ((4, 5, 6), True)])
+def test_what_one_neighbour_shows_too_is_kept_and_what_both_show_is_a_lamp(tmp_path, seen, lamp):
     """Noise with long tails is bright in two frames by chance; it was put back into pictures as it was rendered."""
+    frame = load(open_shot(CALM.write(tmp_path, edit=shining(*seen))), range(1004, 1009))[1006]
+    assert frame.fireflies == 0
+    assert (frame.lamps is not None) == lamp
+    # A lamp is added to the finished picture: what that is made of does not show it.
+    assert (frame.radiance[PLACE].mean() > 400) == (not lamp)
+    assert frame.with_lamps[PLACE].mean() == pytest.approx(500, rel=0.01)
+
+
+def test_a_lamp_is_the_mean_of_the_frames_that_show_it(tmp_path):
+    """It was one sample, as rendered."""
 
     def shine(index, layers):
-        if index in shining:
-            layers["ViewLayer.Combined"][20, 30] = 500
+        layers["ViewLayer.Combined"][PLACE] = 500 + 60 * (index % 3)
 
-    frames = LoadedFrames(open_shot(CALM.write(tmp_path, edit=shine)), Rules())
-    frames.load(range(1004, 1009))
-    frame = frames[1006]
-    assert frame.fireflies == 0
-    assert frame.radiance[20, 30].mean() == pytest.approx(500, rel=1e-3)
-    assert (frame.lamps is not None and bool(frame.lamps[20, 30])) == lamp
+    frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
+    assert frame.lamps is not None
+    np.testing.assert_allclose(frame.lamps.light, 560, rtol=0.01)
+
+
+@pytest.mark.parametrize("off", [(0, 2), (3, 0)])
+def test_bright_samples_near_each_other_are_no_lamp(tmp_path, off):
+    """They were one within three pixels, with vectors, and twelve without: ten a frame came out as rendered."""
+
+    def shine(index, layers):
+        layers["ViewLayer.Combined"][20 + off[0] * (index % 2), 30 + off[1] * (index % 2)] = 500
+
+    frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
+    assert frame.lamps is None
+
+
+def test_a_lamp_moves_along_with_the_vectors(tmp_path):
+    scene = replace(CALM, step=(2, 1))
+
+    def shine(index, layers):
+        layers["ViewLayer.Combined"][10 + index, 20 + 2 * index] = 500
+
+    frame = load(open_shot(scene.write(tmp_path, edit=shine)), range(1003, 1008))[1005]
+    assert frame.lamps is not None
+    assert frame.lamps.pixels.tolist() == [[14, 28]]
+
+
+@pytest.mark.parametrize("number", [1001, 1012])
+def test_at_the_ends_of_a_shot_the_two_nearest_frames_know_a_lamp(tmp_path, number):
+    shot = open_shot(CALM.write(tmp_path, edit=shining(*range(12))))
+    assert load(shot, [number])[number].lamps is not None
+
+
+def test_a_frame_alone_knows_no_lamp(tmp_path):
+    shot = open_shot(replace(CALM, frames=1).write(tmp_path, edit=shining(0)))
+    frame = load(shot, [1001])[1001]
+    assert (frame.fireflies, frame.lamps) == (1, None)
+
+
+@pytest.mark.parametrize("held", [{4: 5}, {6: 5}, {4: 5, 6: 5}, {index: 5 for index in range(12)}])
+def test_the_same_noise_once_more_is_no_witness(tmp_path, held):
+    """A firefly of a frame that is shown twice, or of a shot with one seed, was a lamp."""
+
+    def shine(index, layers):
+        if held.get(index, index) == 5:
+            layers["ViewLayer.Combined"][:] = CALM.noisy(5)["ViewLayer.Combined"]
+            layers["ViewLayer.Combined"][PLACE] = 500
+
+    frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
+    assert (frame.fireflies, frame.lamps) == (1, None)
+    assert frame.radiance[PLACE].max() < 10
+
+
+@pytest.mark.parametrize("vectors", [True, False])
+def test_dense_fireflies_are_taken_out(tmp_path, vectors):
+    """A thousandth of the pixels: without vectors nine of ten were witnesses for each other."""
+    rng = np.random.default_rng(0)
+    scene = replace(CALM, height=96, width=128, frames=3)
+
+    def shine(index, layers):
+        layers["ViewLayer.Combined"][rng.random((96, 128)) < 0.001] = 500
+
+    shot = open_shot(scene.write(tmp_path, edit=shine, without=set() if vectors else {"Vector"}))
+    frame = load(shot, range(1001, 1004))[1002]
+    assert frame.lamps is None
+    assert frame.fireflies >= 8
+    assert np.count_nonzero(frame.radiance.mean(axis=-1) > 100) <= 3
 
 
 def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monkeypatch):
@@ -57,8 +147,8 @@ def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monke
     for number in shot.numbers:
         frames.load(frames.around(number, 2))
         assert frames[number].fireflies == 1
-        # The newest, whose fireflies the next one is asked about, and what was read to ask it about its own.
-        assert set(frames._read) <= {number + 2, number + 3, shot.numbers[-1]}
+        # The newest two, whose fireflies the next ones are asked about, and what was read to ask it about its own.
+        assert set(frames._read) <= {number + 1, number + 2, number + 3, *shot.numbers[-2:]}
     assert len(read) > len(reads) == len(shot.numbers)
 
 
