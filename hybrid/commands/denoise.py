@@ -122,6 +122,7 @@ def pseudoref(
         _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
+        _expect_memory(opened, max_memory)
         (opened, *others), judgement = _judge(opened, strict=strict)
     timings = Timings()
     choose = partial(choose_estimate, estimate, own=chosen, kept=keep_estimates, forced=rules.forced, device=device)
@@ -284,6 +285,7 @@ def denoise(
         _look(opened.pictures[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
+        _expect_memory(opened, max_memory)
         (opened, *others), judgement = _judge(opened, strict=strict)
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
@@ -457,6 +459,14 @@ def _expect_all(shot: Shot, keep_going: bool) -> None:
     if shot.missing and not keep_going:
         missing = format_frames(shot.missing)
         raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
+
+
+def _expect_memory(shot: Shot, max_memory: str | None) -> None:
+    """Refuse, before any pixel is read, what is too little memory whatever runs; `_denoise` knows what does."""
+    from hybrid.memory import parse_size, plan_rows
+
+    if max_memory is not None:
+        plan_rows(parse_size(max_memory), shot, ())
 
 
 def _fitting(shot: Shot, budget: str, estimate: str, rules: Rules, precision: str, device: str) -> str:

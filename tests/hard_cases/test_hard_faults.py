@@ -14,6 +14,7 @@ import time
 from contextlib import suppress
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from hybrid.alignment.align import Aligner
@@ -469,6 +470,22 @@ def test_the_least_memory_that_a_refusal_names_is_enough(tall):
         plan_rows(parse_size("0.1G"), shot, STAGES)
     least = str(error.value).split("at least ")[1].split()[0]
     assert plan_rows(parse_size(f"{least}G"), shot, STAGES) in (None, 64)
+
+
+def test_too_little_memory_is_refused_before_any_pixel_is_read(tmp_path, monkeypatch, capsys):
+    """Layers were judged first, which asked for gigabytes where data windows lie far apart."""
+    for number, at in ((1, 0), (2, 5000)):
+        header = {"dataWindow": ((at, at), (at + 7, at + 7)), "displayWindow": ((0, 0), (7, 7))}
+        channels = dict.fromkeys("RGB", np.ones((8, 8), np.float32))
+        OpenEXR.File({**header, "compression": OpenEXR.ZIP_COMPRESSION}, channels).write(f"{tmp_path}/s.{number}.exr")
+
+    def headers_only(path, *, pixels=True, **options):
+        assert not pixels
+        return read_exr(path, pixels=False, **options)
+
+    monkeypatch.setattr("hybrid.files.frames.read_exr", headers_only)
+    assert draft(tmp_path, tmp_path / "out", "--max-memory", "1G") == 1
+    assert "expected at least" in capsys.readouterr().err
 
 
 def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
