@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -29,7 +29,7 @@ FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybr
 class Command(TyperCommand):
     """A command that says what to do where a shell has replaced a pattern by the names of files."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; of several files where one was expected, say that the pattern is to be quoted."""
         files = [argument for argument in args if argument.lower().endswith(".exr")]
         try:
@@ -37,9 +37,7 @@ class Command(TyperCommand):
         except typer.BadParameter:
             raise
         except Exception as error:
-            if len(files) > 1 and (message := getattr(error, "message", "")).startswith(
-                "Got unexpected extra argument"
-            ):
+            if len(files) > 1 and "unexpected extra argument" in str(getattr(error, "message", "")):
                 said = f"{len(files)} files, of which {files[1]}"
                 raise typer.BadParameter(f"expected one pattern in quotes, such as '*.exr', got {said}") from None
             raise
