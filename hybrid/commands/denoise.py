@@ -630,7 +630,7 @@ def _denoise(job: Job, record: Record) -> None:
     taken = shot.layers(shot.numbers[0])
     layers = summarize_layers(taken)
     said = [finding.message for finding in job.judgement.findings if not finding.warning]
-    for words in (f"layers: {layers}", *taken.notes, *said):
+    for words in (f"layers: {layers}", *taken.notes, *said, *shot.kept_lossless(other for other, _ in job.others)):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
     # Not where things lie: what was read from there is told by the files and layers that each picture was made from.

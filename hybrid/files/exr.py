@@ -15,7 +15,7 @@ import re
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -38,6 +38,8 @@ _MAX_TILE = 2**13
 _MAX_BYTES_PER_PIXEL = 64
 
 HALF_MAX = 65504.0
+# Compressions that change values whenever they are written; PXR24 changes those that it has written no further.
+_LOSSY = {"B44_COMPRESSION", "B44A_COMPRESSION", "DWAA_COMPRESSION", "DWAB_COMPRESSION", "LJ2K_COMPRESSION"}
 _MAGIC = b"\x76\x2f\x31\x01"
 
 
@@ -85,6 +87,25 @@ class Part:
         return self.header.get("view")
 
     @property
+    def deep(self) -> bool:
+        """Whether its pixels are lists of samples; such a part has no layers."""
+        return self.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile)
+
+    def would_lose(self, replaced: Collection[str]) -> str | None:
+        """The compression that would change channels when the part is written again; None where none does.
+
+        Parameters
+        ----------
+        replaced : collection of str
+            Channels that are replaced, by their names in the part; alpha is kept in some frames.
+        """
+        compression = self.header["compression"].name
+        # DWA and its like keep alpha exactly.
+        exact = {name for name in self.channels if component_of(name) == "A" and not compression.startswith("B44")}
+        kept = {name for name in self.channels if name not in replaced or component_of(name) == "A"} - exact
+        return str(compression.removesuffix("_COMPRESSION")) if compression in _LOSSY and kept else None
+
+    @property
     def data_window(self) -> tuple[int, int, int, int]:
         """First column, first row, last column, last row of the pixels that are stored."""
         low, high = self.header["dataWindow"]
@@ -124,7 +145,7 @@ class ExrImage:
         """Qualified name → (part, name in that part)."""
         origin: dict[str, tuple[int, str]] = {}
         for index, part in enumerate(self.parts):
-            for name in part.channels:
+            for name in () if part.deep else part.channels:
                 qualified = self._qualify(part, name)
                 if qualified in origin:  # parts "a" and "a.b" with channels "b.R" and "R"
                     qualified = f"{index}.{qualified}"
@@ -149,6 +170,18 @@ class ExrImage:
         """The name that a channel has in its part."""
         return self._origin[channel][1]
 
+    def recompressed(self, replaced: Collection[str]) -> dict[int, str]:
+        """The parts whose compression would change what is kept (`Part.would_lose`), and that compression.
+
+        Parameters
+        ----------
+        replaced : collection of str
+            Qualified names of the channels that are replaced.
+        """
+        places = {self._origin[name] for name in replaced}
+        lossy = {i: p.would_lose({own for at, own in places if at == i}) for i, p in enumerate(self.parts)}
+        return {index: compression for index, compression in lossy.items() if compression is not None}
+
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """All layers, in the order of the file."""
@@ -166,7 +199,7 @@ class ExrImage:
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """Qualified names of all channels."""
+        """Qualified names of all channels that are not deep."""
         return tuple(self._origin)
 
     def part_of(self, name: str) -> Part:
@@ -315,7 +348,7 @@ def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIX
         If the file cannot be opened.
     ExrError
         If it is no OpenEXR file, is damaged or truncated (also where only one part of it is), too large,
-        deep, mip-mapped or chroma-subsampled.
+        deep in all parts, mip-mapped or chroma-subsampled.
     """
     path = Path(path)
     refuse_other_kinds(path)
@@ -369,9 +402,9 @@ def _for_library(path: Path) -> str | bytes:
 def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> None:
     """Raise ExrError for what is well-formed and cannot be denoised, before memory is taken for it."""
     total = 0
+    if parts and all(part.deep for part in parts):
+        raise ExrError(f"{path}: deep image, expected a flat one, or one with a flat part")
     for part in parts:
-        if part.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
-            raise ExrError(f"{path}: deep image; flatten it first")
         tiles = part.header.get("tiles")
         if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
             raise ExrError(f"{path}: mip-mapped texture, not a rendered frame")
@@ -514,8 +547,8 @@ def write_exr(
 
     Notes
     -----
-    Channels that are not replaced keep their values exactly, unless the file's compression is a lossy one
-    (DWA, B44), which loses a little each time a file is written.
+    Channels that are not replaced keep their values exactly: a part with such channels whose compression loses a little
+    each time it is written (DWA, B44) is written with ZIP. Deep parts are kept.
     """
     by_part: list[dict[str, OpenEXR.Channel]] = [dict(part.channels) for part in source.parts]
     clamped = 0
@@ -530,7 +563,8 @@ def write_exr(
 
     added: list[OpenEXR.Part] = []
     for name, values in (extra or {}).items():
-        over = next((i for i, part in enumerate(source.parts) if part.shape == values.shape[:2]), None)
+        fitting = (i for i, p in enumerate(source.parts) if p.shape == values.shape[:2] and not p.deep)
+        over = next(fitting, None)
         if over is None:
             raise ValueError(f"layer {name!r} has shape {values.shape}, expected {source.parts[0].shape}")
         channels = {n: OpenEXR.Channel(n, np.ascontiguousarray(v)) for n, v in _named(name, values).items()}
@@ -543,8 +577,11 @@ def write_exr(
             added.append(OpenEXR.Part(header, channels, name))
 
     parts = []
+    recompressed = source.recompressed(replaced)
     for index, part in enumerate(source.parts):
         header = _writable(part.header)
+        if index in recompressed:
+            header["compression"] = OpenEXR.ZIP_COMPRESSION
         for key, value in (attributes or {}).items() if index == 0 else ():
             if not isinstance(header.get(key, ""), str):
                 raise ValueError(f"attribute {key!r} of {source.path} is not a string, and cannot be set")

@@ -546,6 +546,22 @@ class Shot:
             added |= {picture.own_name(name): picture._cut(image, home) for name, image in new.items()}
         return write_exr(path, source, replaced, added, attributes)
 
+    def kept_lossless(self, others: Iterable[Shot] = ()) -> list[str]:
+        """Say of each part of the first file that `write` compresses otherwise, as its layers are kept to the bit.
+
+        Parameters
+        ----------
+        others : iterable of Shot
+            Further `pictures` of the same files that are written.
+        """
+        image = self.header(self.numbers[0])
+        taken = [picture.layers(self.numbers[0]) for picture in (self, *others)]
+        replaced = [channel for x in taken for layer in (x.target, *x.aovs.values()) for channel in layer.channels]
+        return [
+            f"{image.parts[index].name or 'files'}: {compression} would change layers that are kept, written with ZIP"
+            for index, compression in image.recompressed(replaced).items()
+        ]
+
     def own_name(self, layer: str) -> str:
         """What a layer is called that is added to the files for this picture."""
         return f"{self.picture}.{layer}" if self.picture else layer

@@ -146,7 +146,7 @@ def test_what_is_not_a_rendered_frame_is_refused(tmp_path):
         deep[index] = np.array([1.0], np.float32)
     header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
     OpenEXR.File(header, {"Z": deep}).write(str(tmp_path / "deep.exr"))
-    with pytest.raises(ExrError, match="deep"):
+    with pytest.raises(ExrError, match="deep image, expected a flat one, or one with a flat part"):
         read_exr(tmp_path / "deep.exr")
 
     tiles = OpenEXR.TileDescription()
@@ -228,6 +228,60 @@ def test_rewriting_a_multi_part_file_gives_the_same_bytes(tmp_path):
     )
     write_exr(tmp_path / "b.exr", read_exr(path), {})
     assert (tmp_path / "b.exr").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", [OpenEXR.deepscanline, OpenEXR.deeptile])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_deep_part_beside_a_flat_one_is_kept(tmp_path, kind, first):
+    """The file was refused, without the name of the part."""
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 4
+    rng = np.random.default_rng(1)
+    counts = rng.integers(0, 3, (5, 7))
+    deep = {name: np.empty((5, 7), object) for name in "ZA"}
+    for name, half in (("Z", False), ("A", True)):
+        for index, count in np.ndenumerate(counts):
+            deep[name][index] = rng.random(count).astype("f2" if half else "f4") if count else None
+    parts = {"deep": dict(deep), "rgba": planes([*"RGBA"])}
+    headers = {"deep": {"type": kind, **({"tiles": tiles} if kind == OpenEXR.deeptile else {})}}
+    names = ["deep", "rgba"] if first else ["rgba", "deep"]
+    source = read_exr(save_parts(tmp_path / "a.exr", {name: parts[name] for name in names}, headers))
+    assert source.channel_names == ("rgba.A", "rgba.B", "rgba.G", "rgba.R")
+    write_exr(tmp_path / "b.exr", source, {"rgba.R": np.ones((5, 7))}, {"new": np.zeros((5, 7), "f4")})
+    written = read_exr(tmp_path / "b.exr")
+    assert (written.channel("rgba.R") == 1).all()
+    assert "new.Y" in written.channel_names
+    kept = written.parts[names.index("deep")]
+    assert kept.header["type"] == kind
+    for name in "ZA":
+        for index, count in np.ndenumerate(counts):
+            found = kept.channels[name].pixels[index]
+            np.testing.assert_array_equal(found if count else [], deep[name][index] if count else [])
+
+
+@pytest.mark.parametrize("compression", ["DWAA", "DWAB", "B44", "B44A", "PXR24", "ZIP"])
+@pytest.mark.parametrize("kind", ["f2", "f4"])
+def test_channels_that_are_kept_are_kept_to_the_bit_whatever_the_compression(tmp_path, compression, kind):
+    """DWA changed vectors by a tenth of a pixel whenever a file was written."""
+    names = [*"RGBA", "Matte.R", "Matte.G", "Matte.B", "Vector.X", "Vector.Y", "Z"]
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    source = read_exr(save(tmp_path / "a.exr", planes(names, (40, 56), kind), **header))
+    write_exr(tmp_path / "b.exr", source, {name: np.ones((40, 56)) for name in "RGB"})
+    written = read_exr(tmp_path / "b.exr")
+    for name in names[3:]:
+        np.testing.assert_array_equal(written.channel(name), source.channel(name))
+    assert written.parts[0].header["compression"].name.startswith("PXR24" if compression == "PXR24" else "ZIP")
+
+
+def test_a_part_of_which_all_is_replaced_keeps_its_compression(tmp_path):
+    header = {"compression": OpenEXR.DWAA_COMPRESSION}
+    parts = {"rgba": planes([*"RGBA"], (40, 56)), "matte": planes([*"RGB"], (40, 56))}
+    source = read_exr(save_parts(tmp_path / "a.exr", parts, dict.fromkeys(parts, header)))
+    write_exr(tmp_path / "b.exr", source, {f"rgba.{name}": np.ones((40, 56)) for name in "RGB"})
+    written = read_exr(tmp_path / "b.exr")
+    assert [part.header["compression"].name for part in written.parts] == ["DWAA_COMPRESSION", "ZIP_COMPRESSION"]
+    for name in ("rgba.A", "matte.R", "matte.G", "matte.B"):
+        np.testing.assert_array_equal(written.channel(name), source.channel(name))
 
 
 def test_only_the_replaced_channels_change(tmp_path):

@@ -38,6 +38,23 @@ def neighbours(shot: Shot, number: int, radius: int) -> list[int | None]:
     return [n if shot.has(n) else None for n in around]
 
 
+# --- what is kept
+
+
+def test_a_lossy_compression_of_what_is_kept_is_named(tmp_path):
+    planes = layer("", "RGBA", image(1), image(1, 1)[..., 0]) | layer("Vector", "XY", image(1, 2))
+    header = {"compression": OpenEXR.DWAA_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File([OpenEXR.Part(header, {n: OpenEXR.Channel(n, p) for n, p in planes.items()}, "")]).write(
+        str(tmp_path / "a.0001.exr")
+    )
+    said = ["files: DWAA would change layers that are kept, written with ZIP"]
+    assert open_shot(tmp_path).kept_lossless() == said
+    assert open_shot(tmp_path, layers={"color": "RGB"}, aovs=["Vector"]).kept_lossless() == []
+    (tmp_path / "zip").mkdir()
+    save(tmp_path / "zip", [1])
+    assert open_shot(tmp_path / "zip").kept_lossless() == []
+
+
 # --- names
 
 
