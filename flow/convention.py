@@ -158,12 +158,10 @@ def choose_convention(
     ValueError
         No pairs, or vectors with fewer channels than `assumed` has.
 
-    Notes
-    -----
-    Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a patch of
-    neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1, (m/2q)²)
-    less what noise alone gives; patches that leave the picture say nothing. One reading is clearly better than another
-    if the mean difference, patch by patch, is three times its standard error.
+    Notes ----- Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a
+    patch of neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1,
+    (m/2q)²) less what noise alone gives; patches that leave what is seen say nothing, and empty ones are not asked. One
+    reading is clearly better than another if the mean difference, patch by patch, is three times its standard error.
 
     Where shadows move, light is explained by no vectors, and best by a flow that follows them. Surfaces confirm a
     reading that leaves less than a quarter of what one pixel more or less would, or that is clearly better than no
@@ -206,12 +204,24 @@ class Patches:
         self.resolution, self.frames = pair.resolution, pair.frames
         exposure = median_luminance(pair.earlier)
         self.pictures = tuple(tone_map(color, exposure) for color in (pair.earlier, pair.later))
+        # Closed: noise leaves single pixels of what is seen black.
+        box = np.ones((3, 3), np.uint8)
+        shown = (cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, box) for picture in self.pictures)
+        self.shown = tuple(mask.astype(bool) for mask in shown)
         height, width = self.pictures[0].shape
         self.radius = min(RADIUS, (min(height, width) - 1) // 2)
         size = 2 * self.radius + 1
         spacing = max(size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
-        inner = (np.arange(self.radius, side - self.radius, spacing) for side in (height, width))
+        inner = [np.arange(self.radius, side - self.radius, spacing) for side in (height, width)]
         self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
+        seen = self._seen(size)
+        if seen.any() and not seen.all():
+            # As many patches as the seen part of the picture holds, so that an object of 1 % of it has enough of them.
+            finer = max(1, int(spacing * np.sqrt(seen.mean())))
+            inner = [np.arange(self.radius, side - self.radius, finer) for side in (height, width)]
+            self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
+            seen = self._seen(size)
+            self.rows, self.columns = self.rows[seen], self.columns[seen]
         noise = [estimate_noise(picture)[self.rows, self.columns] ** 2 for picture in self.pictures]
         deviation = np.sqrt(np.mean(noise, axis=0))
         # The scale is made for patches of 9 x 9; the means of smaller ones are as much noisier as they are smaller.
@@ -226,6 +236,11 @@ class Patches:
         self.few_vectors = [self.gather(layer, self.few) for layer in layers]
         self.tried: dict[tuple[MotionConvention, bool], np.ndarray] = {}
         self.decoded: dict[tuple[str, str, float, bool], tuple[_Flows, _Flows]] = {}
+
+    def _seen(self, size: int) -> np.ndarray:
+        """Which patches show anything: beside a render region, or behind an object, no vectors explain anything."""
+        shown = np.logical_or(*self.shown).astype(np.float32)
+        return np.asarray(cv2.blur(shown, (size, size))[self.rows, self.columns] > 0)
 
     def costs(self, convention: MotionConvention, *, few: bool = False) -> np.ndarray:
         """What a reading leaves of each patch, or of the `few` that tell most, in [0, 1]; NaN outside."""
@@ -274,7 +289,7 @@ class Patches:
         costs = []
         for axis in (0, 1):
             steps[:] = np.eye(2)[axis]
-            costs.append(self._compared(self.pictures[1], self.pictures[1], steps, self.all, ONE_PIXEL))
+            costs.append(self._compared(1, 1, steps, self.all, ONE_PIXEL))
         return float(np.nanmean(costs))
 
     def length(self, convention: MotionConvention) -> float:
@@ -296,13 +311,12 @@ class Patches:
         return np.asarray(layer[rows, columns].reshape(-1, len(reach), layer.shape[2]))
 
     def _costs(self, centre: int, flow: np.ndarray, at: np.ndarray, unit: np.ndarray) -> np.ndarray:
-        return self._compared(self.pictures[centre], self.pictures[1 - centre], flow, at, unit)
+        return self._compared(centre, 1 - centre, flow, at, unit)
 
-    def _compared(
-        self, here: np.ndarray, there: np.ndarray, flow: np.ndarray, at: np.ndarray, unit: np.ndarray
-    ) -> np.ndarray:
+    def _compared(self, here: int, there: int, flow: np.ndarray, at: np.ndarray, unit: np.ndarray) -> np.ndarray:
         difference = np.empty(len(at), np.float32)
-        _compare(here, there, flow, unit, self.rows[at], self.columns[at], self.radius, difference)
+        pictures = self.pictures[here], self.pictures[there], self.shown[here], self.shown[there]
+        _compare(*pictures, flow, unit, self.rows[at], self.columns[at], self.radius, difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 
@@ -310,6 +324,8 @@ class Patches:
 def _compare(
     centre: np.ndarray,
     other: np.ndarray,
+    centre_shown: np.ndarray,
+    other_shown: np.ndarray,
     flow: np.ndarray,
     unit: np.ndarray,
     rows: np.ndarray,
@@ -317,23 +333,26 @@ def _compare(
     radius: int,
     difference: np.ndarray,
 ) -> None:
-    """Mean of other(x + v) − centre(x), v = unit · flow, over each patch; NaN where less than half of it stays."""
+    """Mean of other(x + v) − centre(x), v = unit · flow, over the seen part of patches; NaN where half of it goes."""
     height, width = other.shape
     size = 2 * radius + 1
     one = np.float32(1)
     for p in range(len(rows)):
-        total, count = np.float32(0), 0
+        total, count, seen = np.float32(0), 0, 0
         for j in range(size):
             for i in range(size):
                 y, x = rows[p] - radius + j, columns[p] - radius + i
+                if not centre_shown[y, x]:
+                    continue
+                seen += 1
                 u, v = unit[0] * flow[p * size + j, i, 0], unit[1] * flow[p * size + j, i, 1]
                 inside, x0, y0, x1, y1, fx, fy = locate(np.float32(x) + u, np.float32(y) + v, width, height)
-                if inside:
+                if inside and other_shown[y0, x0] and other_shown[y1, x1]:
                     total -= centre[y, x]
                     total += (one - fy) * ((one - fx) * other[y0, x0] + fx * other[y0, x1])
                     total += fy * ((one - fx) * other[y1, x0] + fx * other[y1, x1])
                     count += 1
-        difference[p] = total / count if 2 * count >= size * size else np.nan
+        difference[p] = total / count if count > 0 and 2 * count >= seen else np.nan
 
 
 def _related(pairs: Sequence[Patches]) -> Sequence[Patches]:

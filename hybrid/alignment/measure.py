@@ -341,6 +341,7 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     if vectors is not None:
         other, inside = warp(other, vectors[0])
         inside &= vectors[1]
+    inside &= _seen(here, there)
     window = np.stack([other, here.light, other])
     weight = color_gate(window, here.irradiance, exposure)[0]
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
@@ -359,6 +360,7 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
     if vectors is not None:
         (both[1], inside), (light, _) = warp(there.irradiance, vectors[0]), warp(there.light, vectors[0])
         inside &= vectors[1]
+    inside &= _seen(here, there)
     floor = np.float32(0.05 * measure_exposure(here.light))
     level = 0.5 * (_level(here.light) + _level(light)) + floor
     difference = np.where(inside, (_level(both[1]) - _level(both[0])) / level, np.float32(0))
@@ -370,8 +372,21 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
         mean, square = mean[full] / known[full], square[full] / known[full]
         error = np.sqrt(np.maximum(square - np.square(mean), 0) / (side**2 * known[full]))
         changed = (np.abs(mean) > AREA_CHANGE) & (np.abs(mean) > AREA_NOISE * error)
-        shares.append(float(changed.sum() / full.size))
+        shares.append(float(changed.sum() / max(full.sum(), 1)))
     return max(shares)
+
+
+def _seen(here: SmallFrame, there: SmallFrame) -> Mask:
+    """Where the first of two frames shows anything; all that either shows, where the first is much emptier.
+
+    Beside a render region, and behind an object, nothing is seen: what an object uncovers there is no change of light.
+    """
+    # Closed: noise leaves single pixels of what is seen black.
+    lit = ((_level(frame.irradiance) > 0).astype(np.uint8) for frame in (here, there))
+    shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]
+    if 2 * np.count_nonzero(shown[0]) > np.count_nonzero(shown[1]):
+        return np.asarray(shown[0])
+    return np.asarray(np.logical_or(*shown))
 
 
 def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mask]:
