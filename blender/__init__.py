@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import jobs, operators, panel, settings
+from . import jobs, operators, panel, settings, terminal
 
 CLASSES = (
     settings.Preferences,
@@ -23,6 +23,7 @@ HANDLERS = (
     ("render_complete", jobs.protected),
     ("render_cancel", jobs.protected),
 )
+_command = []  # what unregisters the command line
 
 
 def register() -> None:
@@ -31,10 +32,12 @@ def register() -> None:
     bpy.types.Scene.ravg = bpy.props.PointerProperty(type=settings.SceneSettings)
     for name, handler in HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
+    _command.append(bpy.utils.register_cli_command(terminal.NAME, terminal.run))
 
 
 def unregister() -> None:
     jobs.stop_current()
+    bpy.utils.unregister_cli_command(_command.pop())
     for name, handler in HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)
     del bpy.types.Scene.ravg

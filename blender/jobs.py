@@ -46,7 +46,7 @@ class Job:
         FileNotFoundError
                 If no frame of the scene is there, or the scene is not.
         ValueError
-            If a frame is no noisy render with the passes that ravg reads.
+            If a frame is no noisy render with the passes that ravg reads, or the preset denoises no light passes.
         OSError
             If the command cannot be started.
         """
@@ -57,6 +57,8 @@ class Job:
         pattern = scenes.noisy_pattern(scene)
         if not there:
             raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
+        if scene.ravg.light_passes and scene.ravg.preset == "average":
+            raise ValueError(scenes.NO_LIGHT_PASSES)
         if reason := scenes.refused(scene):
             raise ValueError(f"{reason} ({Path(pattern).parent})")
         chosen, folder = scene.ravg, scenes.output_folder(scene)

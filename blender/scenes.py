@@ -13,6 +13,7 @@ import bpy
 
 from . import frames
 
+NO_LIGHT_PASSES = "Without Network does not denoise them, choose another preset or switch Light Passes off"
 # Seen with Blender 5.0.1: the left view of a multi-view OpenEXR image in all views.
 STEREO = "Blender's compositor shows the left eye's image in both: composite the frames in another program"
 
@@ -69,7 +70,9 @@ def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
         found.append(Problem("Seed is constant: noise that stands still cannot be averaged away", True))
     if scene.ravg.preset == "fast" and not scene.cycles.use_denoising:
         found.append(Problem("Render > Denoise is off: Fast is more accurate with Blender's own denoised frames", True))
-    if scene.ravg.light_passes and not any(_light_passes(layer) for layer in layers):
+    if scene.ravg.light_passes and scene.ravg.preset == "average":
+        found.append(Problem(f"Light Passes: {NO_LIGHT_PASSES}", False))
+    elif scene.ravg.light_passes and not any(_light_passes(layer) for layer in layers):
         found.append(Problem("Light Passes: no view layer renders any, choose them in View Layer > Passes", False))
     if render.use_motion_blur and not any(vectors):
         text = "Motion Blur is on: motion has to be found in the pictures, switch it off and blur afterwards"

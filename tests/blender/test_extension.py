@@ -443,6 +443,123 @@ def test_resume_leaves_finished_frames_alone(blender, shot):
     assert kept == ["shot_0004.exr", "shot_0006.exr"]
 
 
+LIGHT = ("Diffuse Direct", "Diffuse Indirect", "Glossy Direct", "Glossy Indirect")
+
+
+@needs_ravg
+def test_light_passes_are_denoised_along_and_add_up_as_before(blender, blend):
+    code = f"""{PROBLEMS}
+layer = scene.view_layers[0]
+scene.ravg.light_passes, scene.frame_end = True, 5
+bpy.ops.ravg.set_up()
+said = texts()
+for kind in ("diffuse", "glossy"):
+    for part in ("direct", "indirect", "color"):
+        setattr(layer, f"use_pass_{{kind}}_{{part}}", True)
+more = texts()
+scene.ravg.preset = "average"
+most = texts()
+scene.ravg.preset = "fast"
+bpy.ops.ravg.denoise(render=True)
+answer = [said, more, most]
+"""
+    assert blender.run(code, blend=blend) == [["Light Passes"], [], ["Light Passes"]]
+
+    def total(found: dict[str, np.ndarray], c: str) -> np.ndarray:
+        kinds = ("Diffuse", "Glossy")
+        light = [(found[f"{x} Direct.{c}"] + found[f"{x} Indirect.{c}"]) * found[f"{x} Color.{c}"] for x in kinds]
+        return np.sum(light, axis=0)
+
+    for frame in (4, 5):
+        noisy, denoised = (
+            channels(blend.parent / f"ravg/shot/{x}/Scene_{frame:04d}.exr") for x in ("noisy", "denoised")
+        )
+        for name in LIGHT[:3]:
+            assert not np.array_equal(noisy[f"{name}.G"], denoised[f"{name}.G"]), name
+        for before, kind in ((noisy, "Noisy Image"), (denoised, "Combined")):
+            assert abs(total(before, "G") - before[f"{kind}.G"]).mean() < 0.01 * before[f"{kind}.G"].mean()
+
+
+BLURRED = """
+scene.camera.animation_data_clear()
+for frame in (1, 10):
+    scene.camera.location.x = 0.5 * (frame - 5)
+    scene.camera.keyframe_insert("location", frame=frame)
+curves = scene.camera.animation_data.action.layers[0].strips[0].channelbags[0].fcurves
+for curve in curves:
+    for key in curve.keyframe_points:
+        key.interpolation = "LINEAR"
+scene.render.motion_blur_shutter = 0.5
+scene.cycles.samples = 16
+settings = scene.render.image_settings
+def movie(name):
+    settings.media_type, settings.file_format, settings.color_depth = "IMAGE", "OPEN_EXR", "32"
+    scene.render.filepath = f"//{name}/"
+    bpy.ops.render.render(animation=True)
+scene.view_layers[0].use_pass_z = True
+bpy.ops.ravg.denoise(render=True)
+bpy.ops.ravg.add_to_compositor()
+movie("sharp")
+tree = scene.compositing_node_group
+image = next(node for node in tree.nodes if node.type == "IMAGE")
+end = next(node for node in tree.nodes if node.type == "GROUP_OUTPUT")
+blur = tree.nodes.new("CompositorNodeVecBlur")
+blur.inputs["Shutter"].default_value = scene.render.motion_blur_shutter
+for name, output in (("Image", "Combined"), ("Speed", "Vector"), ("Z", "Depth")):
+    tree.links.new(image.outputs[output], blur.inputs[name])
+tree.links.new(blur.outputs["Image"], end.inputs[0])
+movie("blurred")
+scene.compositing_node_group = None
+scene.render.use_motion_blur, scene.cycles.samples, scene.cycles.use_denoising = True, 512, False
+movie("real")
+"""
+
+
+@needs_ravg
+def test_motion_blur_is_added_after_denoising_as_the_documentation_says(blender, blend):
+    blender.run(BLURRED, blend=blend)
+
+    def shown(name: str, frame: int) -> np.ndarray:
+        found = channels(blend.parent / name / f"{frame:04d}.exr")
+        return np.stack([found[c] for c in "RGB"], axis=-1)[4:-4, 12:-12]  # what enters at the borders is not known
+
+    for frame in (4, 5, 6):
+        sharp, blurred, real = (shown(name, frame) for name in ("sharp", "blurred", "real"))
+        print(frame, [float(((x - real) ** 2).mean()) for x in (sharp, blurred)])  # shown where it fails
+        assert ((blurred - real) ** 2).mean() < 0.5 * ((sharp - real) ** 2).mean()
+
+
+# --- without a window ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        ([], 0, "3 of 3 frames, 100 %"),
+        (["--render"], 1, "noisy frames 4-6 are there already"),
+        (["--render", "--keep"], 0, "3 of 3 frames, 100 %"),
+        (["--render", "--keep", "--replace"], 2, "not allowed with argument"),
+        (["--no-such"], 2, "unrecognized arguments"),
+        (["--help"], 0, "usage: blender --background FILE --command ravg"),
+    ],
+)
+@needs_ravg
+def test_the_command_line_ends_with_a_code_and_no_traceback(blender, shot, arguments, code, says):
+    script = """
+    import contextlib, io
+    from bl_ext.user_default.ravg import terminal
+    scene.ravg.preset = "average"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        code = terminal.run(ARGUMENTS)
+    answer = [code, printed.getvalue()]
+    """
+    found, printed = blender.run(script, blend=shot, ARGUMENTS=arguments)
+    assert found == code
+    assert "Traceback" not in printed
+    assert says in printed
+
+
 # --- nothing is written over ---------------------------------------------------------------------------
 
 # As one makes a movie: the compositor gets the denoised frames, and the animation is rendered through it.
