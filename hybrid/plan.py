@@ -97,10 +97,13 @@ class Plan:
         One for each of `STAGES`.
     cuts : tuple of (int, int)
         Neighbouring frames that show something else: nothing is averaged over them.
+    repeats : tuple of (int, int)
+        Neighbouring frames of which one is the other once more: its samples count once.
     """
 
     decisions: tuple[Decision, ...]
     cuts: tuple[tuple[int, int], ...] = ()
+    repeats: tuple[tuple[int, int], ...] = ()
 
     @property
     def stages(self) -> frozenset[str]:
@@ -215,6 +218,7 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
         One decision for each of `STAGES`.
     """
     cuts = tuple(pair.numbers for pair in pairs if pair.cut)
+    repeats = tuple(pair.numbers for pair in pairs if pair.repeated)
     pairs = [pair for pair in pairs if not pair.cut]
     vectors = bool(pairs) and all(pair.vectors for pair in pairs)
     changed = max((pair.changed for pair in pairs), default=0.0)
@@ -252,6 +256,7 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
             _decide("skip", min(frame.noise_free for frame in frames), 0.0, "{:.1%} of the tiles hold no noise"),
         ),
         cuts,
+        repeats,
     )
 
 
@@ -308,7 +313,8 @@ def merge(plans: dict[int, Plan]) -> Plan:
         where = f"; frames {format_frames(on)} of {format_frames(plans)}" if 0 < len(on) < len(plans) else ""
         assert stage == most.stage
         merged.append(replace(most, reason=most.reason + where, frames=on))
-    return Plan(tuple(merged), tuple(sorted({cut for plan in plans.values() for cut in plan.cuts})))
+    cuts, repeats = ({pair for plan in plans.values() for pair in getattr(plan, name)} for name in ("cuts", "repeats"))
+    return Plan(tuple(merged), tuple(sorted(cuts)), tuple(sorted(repeats)))
 
 
 def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision:

@@ -169,6 +169,13 @@ def find_cut(a: int, b: int) -> Finding:
     )
 
 
+def find_repeat(a: int, b: int) -> Finding:
+    """Say that the later of two neighbouring frames is the earlier one once more (`PairFacts.repeated`)."""
+    return Finding(
+        "color", f"frame {b} is frame {a} once more: the same noise, whose samples count once", left_out=False
+    )
+
+
 def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str | None:
     """Say whether denoised pictures of a shot are each of the frame before or after; None where they are not.
 

@@ -366,7 +366,11 @@ class Aligner:
                     known = measured, trust_geometry(layers, warped, flow, measured, back[0], rows.start)
                     if not again and "steady" in self.frames.allowed and abs(neighbour - number) == self.shot.step:
                         self._trusted[pair] = known
-                novelty = novelty_of(flow) if "fixed-noise" in stages else 1.0
+                nearer = neighbour + (self.shot.step if neighbour < number else -self.shot.step)
+                if self.frames.repeated(neighbour, nearer):  # its samples are there already
+                    novelty: Array | np.float32 = np.float32(0)
+                else:
+                    novelty = novelty_of(flow) if "fixed-noise" in stages else np.float32(1)
                 seen[index], confidence[index] = (novelty * part for part in known)
         return window, confidence, seen
 

@@ -91,7 +91,7 @@ class Flows:
         shape = here.irradiance.shape[:2]
         if self.frames.cut(*numbers):
             return None, None
-        if "warp" not in stages:
+        if "warp" not in stages or self.frames.repeated(*numbers):
             still = np.zeros((*shape, 2), np.float32), np.ones(shape, bool)
             return still, still
         dense = "dense-flow" in stages

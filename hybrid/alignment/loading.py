@@ -152,6 +152,11 @@ class LoadedFrames:
         """Whether these neighbours, the earlier one first, are two shots; never where all stages are told."""
         return not isinstance(self._decide, _Always) and self._facts_of_pair(a, b).cut
 
+    def repeated(self, a: int, b: int) -> bool:
+        """Whether these neighbours are one frame twice; never where all stages are told."""
+        first, second = sorted((a, b))
+        return not isinstance(self._decide, _Always) and self._facts_of_pair(first, second).repeated
+
     def _facts_of(self, number: int) -> FrameFacts:
         if number not in self._frame_facts:
             with self.timings.stage("plan"):

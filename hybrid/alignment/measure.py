@@ -106,6 +106,8 @@ class PairFacts:
         Upper quartile of what albedo and normal differ by between the frames, along the vectors.
     cut : bool
         Whether the frames show something else, so that nothing of one helps the other.
+    repeated : bool
+        Whether one is the other once more, so that it holds no samples of its own.
     """
 
     numbers: tuple[int, int]
@@ -116,6 +118,7 @@ class PairFacts:
     fixed_noise: float
     guide_noise: float
     cut: bool = False
+    repeated: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         fixed_noise=fixed_noise(here, there, moves=changed > 0),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=changed > CUT and _is_cut(here, there, smalls, vectors),
+        repeated=repeats(*equal_noise(here.irradiance, there.irradiance)),
     )
 
 

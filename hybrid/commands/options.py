@@ -380,13 +380,16 @@ def _say(judgement: Judgement, shot: Shot, *, strict: bool, name: str = "") -> N
 
 
 def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
-    """What there is to say of a plan's cuts beyond what is known; said in a line each, an error if `strict`."""
-    from hybrid.plausibility import find_cut
+    """Log a plan's cuts, an error if `strict`, and its repeated frames, a line each, beyond what is known."""
+    from hybrid.plausibility import find_cut, find_repeat
 
     found = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
     words = [f"{name}: {finding.message}" if name else finding.message for finding in found]
     if strict and found:
         raise ValueError("; ".join(words))
+    repeats = [finding for pair in plan.repeats if (finding := find_repeat(*pair)) not in known]
+    found += repeats
+    words += [f"{name}: {finding.message}" if name else finding.message for finding in repeats]
     for line in words:
         LOG.warning(printable(line))
     return found

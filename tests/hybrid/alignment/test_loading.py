@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybrid.alignment.align import Aligner
 from hybrid.alignment.loading import LoadedFrames
 from hybrid.files.frames import open_shot
-from hybrid.plan import Rules
+from hybrid.plan import Rules, plan_shot
 from tests.scenes import Scene
 
 # Locked off. Frame numbers 1001 to 1012.
@@ -114,6 +115,27 @@ def test_the_same_noise_once_more_is_no_witness(tmp_path, held):
     frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
     assert (frame.fireflies, frame.lamps) == (1, None)
     assert frame.radiance[PLACE].max() < 10
+
+
+def test_a_frame_that_is_shown_twice_counts_once_and_is_named(tmp_path):
+    """Its samples counted twice, and its vectors said that it moves."""
+    scene = replace(CALM, step=(2, 1))
+
+    def hold(index, layers):
+        if index == 6:
+            layers |= scene.noisy(5)
+
+    shot = open_shot(scene.write(tmp_path, edit=hold))
+    aligner = Aligner(shot, Rules())
+    for number, weightless in ((1006, {3}), (1007, {1}), (1005, {4}), (1004, set()), (1008, {0}), (1009, set())):
+        window = aligner.align(number)
+        assert {index for index, layer in enumerate(window.confidence) if not layer.any()} == weightless
+    aligner.align(1006)
+    flow = aligner.flows.between(1006, 1007)
+    assert flow is not None
+    assert not flow[0].any()
+    assert plan_shot(shot).repeats == ((1006, 1007),)
+    assert plan_shot(shot).cuts == ()
 
 
 @pytest.mark.parametrize("vectors", [True, False])
