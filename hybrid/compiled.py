@@ -47,9 +47,11 @@ class _FirstRun(event.Listener):
             getattr(event.data["dispatcher"]._cache, "cache_path", None) or os.devnull
         )  # a loop that is not kept has none
         if not kept.startswith(os.devnull):
-            nothing: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+            options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+            if sys.platform == "win32":  # no console window of its own where this process has none
+                options["creationflags"] = subprocess.CREATE_NO_WINDOW
             with suppress(OSError):
-                self.beside = subprocess.Popen([sys.executable, "-m", "hybrid.compiled"], **nothing)
+                self.beside = subprocess.Popen([sys.executable, "-m", "hybrid.compiled"], **options)
 
     def on_end(self, event: Any) -> None:
         pass
@@ -92,12 +94,12 @@ class Fallback(UserWideCacheLocator):
 def _temporary_folder() -> str | None:
     """A folder of this user's own; what is read from it is run, so nobody else may have written it."""
     try:
-        folder = Path(tempfile.gettempdir()) / f"ravg-compiled-{os.geteuid()}"
+        folder = Path(tempfile.gettempdir()) / "ravg-compiled"
+        if sys.platform != "win32":  # where the folder of temporary files is the user's own
+            folder = folder.with_name(f"ravg-compiled-{os.geteuid()}")
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        status = folder.lstat()
-        ours = status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) & 0o077 == 0
-        if not ours or not stat.S_ISDIR(status.st_mode):
+        if not _is_private(folder):
             folder = Path(tempfile.mkdtemp(prefix="ravg-compiled-"))
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -106,6 +108,14 @@ def _temporary_folder() -> str | None:
         return None
     LOG.info(f"compiled loops are kept in {folder}: neither where ravg is installed nor in ~/.cache can be written to")
     return str(folder)
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether this is a folder that only this user can write to."""
+    status = folder.lstat()
+    if sys.platform != "win32" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077):
+        return False
+    return stat.S_ISDIR(status.st_mode)
 
 
 def _load(load: Any) -> Any:

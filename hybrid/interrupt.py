@@ -7,14 +7,41 @@ import signal
 import socket
 import sys
 import threading
+from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from hybrid.files.replace import remove_unfinished
+from hybrid.system import INTERRUPTS
 
 INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
 # How long Python is given to come back from compiled code and to unwind by itself, seconds.
 PATIENCE = 1.0
+# A program that has started ravg asks for its end by closing its standard input where this variable is 1. On Windows no
+# signal reaches a process without a console of its own.
+STOP_WITH_STDIN = "RAVG_STOP_WITH_STDIN"
+
+
+def stop_with_stdin() -> None:
+    """Take the end of standard input for Ctrl-C, where `STOP_WITH_STDIN` is 1.
+
+    Processes that this one starts inherit neither the variable nor its standard input.
+    """
+    if os.environ.pop(STOP_WITH_STDIN, "") != "1":
+        return
+    # Windows lets nobody ask about a pipe while a thread reads from it, as a child would that inherits it.
+    own = os.dup(0)
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.close(null)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # who starts it may have it ignored
+
+    def wait() -> None:
+        while os.read(own, 4096):
+            pass
+        interrupt_main()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def is_interrupt(error: BaseException | None) -> bool:
@@ -26,7 +53,7 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 @contextmanager
 def interruptible(report: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C, or SIGTERM, end the process within about a second, whatever it is doing.
+    """Let Ctrl-C, SIGTERM, or Ctrl-Break end the process within about a second, whatever it is doing.
 
     Python sees a signal only when compiled code returns, which may take many seconds for one stage of a large frame.
     Where no KeyboardInterrupt has left the block in `PATIENCE` seconds, a thread removes what was being written, calls
@@ -59,7 +86,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
             remove_unfinished()  # what a thread has begun to write while that was said
             os._exit(INTERRUPTED)
 
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, signal.default_int_handler) for number in INTERRUPTS}
     # Written to by the handler in C, at once.
     previous = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     watcher = threading.Thread(target=watch, daemon=True)

@@ -20,7 +20,8 @@ from typing import Any
 from hybrid.files.replace import remove_leftovers, write_file
 from hybrid.files.sequences import format_frames
 from hybrid.files.sources import PACKAGES, versions
-from hybrid.timing import Timings, peak_memory
+from hybrid.system import peak_memory, process_lives
+from hybrid.timing import Timings
 
 FOLDER = "ravg"
 # The sequence whose files are called by their numbers alone.
@@ -234,13 +235,7 @@ def goes_on(document: Mapping[str, Any]) -> bool:
         return False
     if document["host"] != platform.node():
         return True
-    try:
-        os.kill(document["process"], 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # it is somebody else's
-        pass
-    return True
+    return process_lives(document["process"])
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -283,7 +278,7 @@ def _is_entry(number: str, entry: Any) -> bool:
         return isinstance(entry.get("error"), str)
     file = entry.get("file")
     # A name alone: what lies in another folder is no frame of this one.
-    plain = isinstance(file, str) and file not in ("", ".", "..") and not {"/", "\0"} & {*file}
+    plain = isinstance(file, str) and file not in ("", ".", "..") and not {"/", "\\", ":", "\0"} & {*file}
     return entry.get("state") in ("made", "there") and plain and _is_amount(entry.get("seconds"))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+
+from hybrid.system import peak_memory
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Stage:
     peak_bytes: int = 0
 
 
-# What tells the CPU time of another thread. Where it is missing (macOS) that counts when the thread's work has ended.
+# The CPU time of another thread. Where the system does not have it (macOS, Windows) it counts when its work has ended.
 _CLOCK_OF: Callable[[int], int] | None = getattr(time, "pthread_getcpuclockid", None)
 
 
@@ -74,7 +74,9 @@ class Timings:
     def _cpu_time(self) -> float:
         """CPU seconds of the process, but for what has gone on beside the work."""
         with self._lock:
-            beside = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
+            beside = 0.0
+            if sys.platform != "win32":  # which has no such clocks
+                beside = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
             return time.process_time() - self._ended - beside
 
     def _add(self, name: str, wall: float, cpu: float, *, calls: int) -> None:
@@ -97,14 +99,3 @@ class Timings:
             )
             for name, stage in self.stages.items()
         ]
-
-
-def peak_memory() -> int:
-    """Return the peak resident memory of this process, in bytes, as the operating system counted it."""
-    try:
-        # Unlike getrusage's, Linux's own count does not take over that of the process which started this one.
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
-    except (OSError, StopIteration):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024  # macOS counts bytes, others KiB

@@ -52,4 +52,5 @@ def _threads() -> ThreadPoolExecutor:
 
 
 # The threads stay behind in the process that has forked.
-os.register_at_fork(after_in_child=_threads.cache_clear)
+if hasattr(os, "register_at_fork"):  # Windows does not fork
+    os.register_at_fork(after_in_child=_threads.cache_clear)

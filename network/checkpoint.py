@@ -172,7 +172,7 @@ def new_partial(path: Path) -> Path:
         raise OSError(f"{path} is there and no file, expected a file or a new name")
     partial = path.with_name(path.name + ".part")
     partial.unlink(missing_ok=True)
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+    partial.touch(exist_ok=False)  # O_EXCL follows no link
     return partial
 
 

@@ -104,7 +104,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/commands/options.py",
     "hybrid/commands/simulate.py",
     "hybrid/commands/status.py",
-    "hybrid/interrupt.py",
     "hybrid/memory.py",
     "hybrid/neural/train.py",
     "hybrid/simulate/evaluation.py",

@@ -102,7 +102,7 @@ def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: s
     try:
         from distributed import Client, Event, as_completed
     except ModuleNotFoundError as error:
-        raise ImportError("distributed is not installed; expected: pip install 'ravg[cluster]'") from error
+        raise ImportError('distributed is not installed; expected: pip install "ravg[cluster]"') from error
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -185,12 +185,13 @@ def run_chunk(name: str, arguments: Sequence[str], folder: str, topic: str) -> s
     process = subprocess.Popen(
         [sys.executable, "-m", "hybrid.cli", *_before_positional(arguments, "--log-format=json")],
         cwd=folder,
-        env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1"},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
+        errors="replace",
     )
 
     def watch() -> None:

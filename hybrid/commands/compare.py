@@ -231,7 +231,7 @@ def compare(
 def _need_page() -> None:
     """Refuse a page that cannot be made here."""
     if missing := [name for name in ("jinja2", "resvg_py", "font_manrope") if find_spec(name) is None]:
-        words = "expected: pip install 'ravg[compare]' (the table alone is made without)"
+        words = 'expected: pip install "ravg[compare]" (the table alone is made without)'
         raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
 
 

@@ -19,6 +19,7 @@ from hybrid.comparison.running import ENOUGH, WARM_UP, Progress, Run, run_apart,
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
+from hybrid.system import load_average
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
 LARGE = 1 << 20  # pixels of a frame; above, the maps of all frames would take longer than the rest of a comparison
@@ -110,7 +111,7 @@ def compare_shot(
             pairs = run_apart(store_flows, store, shot, numbers)
             judge = Judge(store, numbers, pairs, exposure, find_static_pixels(store, numbers, pairs, exposure))
         said = [*said, *(found.result() if found is not None else ())]
-        load = os.getloadavg()[0]
+        load = load_average()
         runs, absent = time_methods(methods, shot, rounds, store, partial(tell, before=1))
         chosen = {name: methods[name] for name in runs}
         statistics = _judge_methods(judge, chosen, partial(tell, before=1 + run_steps))
@@ -279,7 +280,7 @@ def _facts_of_frames(judge: Judge) -> dict[str, str]:
     }
 
 
-def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:
+def _facts_of_runs(exposure: float, rounds: int, load: float | None) -> dict[str, str]:
     return {
         "Tone curve": f"e·x / (1 + e·x) with e = {exposure:g}, one for the whole shot",
         "Timing": f"Each method ran {rounds} {'time' if rounds == 1 else 'times'} in turns with the others, "
@@ -287,7 +288,8 @@ def _facts_of_runs(exposure: float, rounds: int, load: float) -> dict[str, str]:
         f"frame, up to {WARM_UP} pixels on a side. Compilation, weights and reading files are not counted. Median, and "
         "the range of the runs. Peak memory as the operating system counted it. Threads that wait sleep "
         f"(OMP_WAIT_POLICY=PASSIVE, GOMP_SPINCOUNT={os.environ.get('GOMP_SPINCOUNT', '0')}).",
-        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}; load average {load:.1f} at the start",
+        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}"
+        + ("" if load is None else f"; load average {load:.1f} at the start"),
         "Versions": ", ".join(_versions()),
     }
 

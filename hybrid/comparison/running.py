@@ -8,7 +8,6 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from typing import Any, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
@@ -18,8 +17,8 @@ from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Frame, MappedShot, Shot
 from hybrid.heap import keep_freed_memory
+from hybrid.system import peak_memory, start_context
 from hybrid.threads import let_waiting_threads_sleep, limit_threads
-from hybrid.timing import peak_memory
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
 P = ParamSpec("P")
@@ -56,7 +55,7 @@ class Seconds:
 def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call a module's function in a fresh process.
 
-    The process is forked from a server and not from this one, whose peak memory Linux would count as its own.
+    The process is not forked from this one, whose peak memory Linux would count as its own.
 
     Parameters
     ----------
@@ -76,9 +75,7 @@ def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         If the process dies.
     """
     let_waiting_threads_sleep()  # the libraries read it when the forked process first uses them
-    context = get_context("forkserver")
-    context.set_forkserver_preload([__name__])  # once, and not for every method
-    with ProcessPoolExecutor(1, mp_context=context, initializer=keep_freed_memory) as pool:
+    with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=keep_freed_memory) as pool:
         return pool.submit(function, *args, **kwargs).result()
 
 

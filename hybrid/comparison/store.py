@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,8 @@ from numpy.typing import NDArray
 from hybrid.comparison.metrics import Reference
 
 Array = NDArray[np.float32]
+
+_PLAIN = b"abcdefghijklmnopqrstuvwxyz0123456789-"
 
 REFERENCE = "reference"
 HALVES = ("half a", "half b")  # of a reference that comes in halves
@@ -74,6 +75,10 @@ class FrameStore:
         return [title for title in MAP_TITLES if self.has(owner, number, title)]
 
     def _path(self, owner: str, number: int, title: str) -> Path:
-        # A name may be ".." or hold a slash; `quote` leaves dots alone.
-        folder, kind = (quote(name, safe=" ,").replace(".", "%2E") for name in (owner, title))
-        return self.folder / folder / kind / f"{number}.npy"
+        return self.folder / _folder_name(owner) / _folder_name(title) / f"{number}.npy"
+
+
+def _folder_name(name: str) -> str:
+    """A folder name that differs for each name, also where case and a space at the end are ignored (Windows, macOS)."""
+    # The mark in front makes no name a device of Windows, such as "con".
+    return "_" + "".join(chr(byte) if byte in _PLAIN else f"%{byte:02X}" for byte in name.encode())

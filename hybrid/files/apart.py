@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -56,7 +55,9 @@ class Apart:
 
 def names_sequence(value: str) -> bool:
     """Whether a layer that the user names is a sequence: ``path/alb.####.exr``, with ``:layer``, or a folder's path."""
-    return re.search(r"\.exr(:|\s|$)", value, re.IGNORECASE) is not None or (os.sep in value and Path(value).is_dir())
+    return re.search(r"\.exr(:|\s|$)", value, re.IGNORECASE) is not None or (
+        len(Path(value).parts) > 1 and Path(value).is_dir()
+    )
 
 
 def open_apart(role: str, value: str) -> Apart:

@@ -5,7 +5,6 @@ Whatever a command writes goes through here: `check_outputs` before anything is 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import secrets
@@ -14,6 +13,8 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from hybrid.system import lock_file, open_file, replace_path, same_file, sync_file
 
 # What this process is writing to just now.
 _unfinished: set[Path] = set()
@@ -62,7 +63,8 @@ def identities(path: Path) -> Iterator[object]:
     yield os.path.join(os.path.realpath(path.parent), path.name)  # a link itself, which would be replaced
     with suppress(OSError):
         status = path.stat()
-        yield status.st_dev, status.st_ino
+        if status.st_ino:  # 0 on some network drives of Windows
+            yield status.st_dev, status.st_ino
 
 
 def refuse_other_kinds(path: Path) -> None:
@@ -101,10 +103,10 @@ def replace_file(path: Path) -> Iterator[Path]:
     temporary, descriptor = _create(path)
     try:
         yield temporary
-        os.fsync(descriptor)
+        sync_file(descriptor)
         if not _is(temporary, descriptor):
             raise OSError(f"{path}: cannot write: its temporary file was exchanged")
-        os.replace(temporary, path)
+        replace_path(temporary, path)
     except BaseException as error:
         with suppress(OSError):
             if _is(temporary, descriptor):
@@ -196,8 +198,7 @@ def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
         temporary = path.with_name(name)
         _unfinished.add(temporary)
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-            descriptor = os.open(temporary, flags, 0o666)
+            descriptor = open_file(temporary, new=True)
         except OSError as error:
             _unfinished.discard(temporary)
             if isinstance(error, FileExistsError):
@@ -205,7 +206,7 @@ def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
             raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
         locked = True
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(descriptor)
         except BlockingIOError:  # somebody who clears up was faster
             locked = False
         except OSError:  # this file system has no locks: then nobody clears up
@@ -223,14 +224,14 @@ def _is(path: Path, descriptor: int) -> bool:
         here = path.lstat()
     except FileNotFoundError:
         return False
-    return os.path.samestat(here, os.fstat(descriptor))
+    return same_file(here, os.fstat(descriptor))
 
 
 @contextmanager
 def _abandoned(lock: Path) -> Iterator[bool]:
     """Tell whether nobody holds the lock on a file, or the file is gone; nobody can take it within the block."""
     try:
-        descriptor = os.open(lock, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = open_file(lock, new=False)
     except FileNotFoundError:
         yield True
         return
@@ -240,7 +241,7 @@ def _abandoned(lock: Path) -> Iterator[bool]:
     free = True
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(descriptor)
         except OSError:
             free = False
         yield free

@@ -7,6 +7,7 @@ such names of files: as lone surrogates (PEP 383).
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -76,11 +77,12 @@ def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict
         if (plain := without_surrogates(text)) != text:
             strings[part, name] = text
             data[where] = plain.encode()
-    with tempfile.NamedTemporaryFile(suffix=".exr") as copy:
-        copy.write(data)
-        copy.truncate(path.stat().st_size)
-        copy.flush()
-        yield Path(copy.name), strings
+    # A folder, for Windows opens no temporary file a second time by its name.
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy.exr"
+        copy.write_bytes(data)
+        os.truncate(copy, path.stat().st_size)
+        yield copy, strings
 
 
 def restore_strings(path: Path, headers: Sequence[dict[str, str]]) -> None:

@@ -332,7 +332,7 @@ def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, see
 def _new_partial(path: Path) -> Path:
     """A new file to render to, by a name that nobody can guess, so that Blender writes through nobody's link."""
     partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}-{path.name}")
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+    partial.touch(exist_ok=False)  # O_EXCL follows no link
     return partial
 
 

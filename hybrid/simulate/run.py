@@ -11,18 +11,20 @@ import re
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from hybrid.files.replace import write_file
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, spp_of
 
 NO_BLENDER = (
-    "Blender's Python module (bpy) is not installed in {python}: `pip install ravg[simulate]` with Python 3.11, "
+    "Blender's Python module (bpy) is not installed in {python}: `pip install \"ravg[simulate]\"` with Python 3.11, "
     "or name an interpreter that has it with --python"
 )
 
@@ -205,14 +207,21 @@ class _Worker:
         if self._process.stdout is None:
             raise SimulationError("Blender: its output cannot be read")
         self._pipe = self._process.stdout
-        os.set_blocking(self._pipe.fileno(), False)
-        self._rest = b""
+        # A thread reads, as Python before 3.12 has no reading without waiting on Windows.
+        self._lines: SimpleQueue[bytes] = SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        for line in self._pipe:
+            self._lines.put(line)
 
     def messages(self) -> list[dict[str, Any]]:
         """Return what came since the last call."""
-        self._rest += self._pipe.read() or b""
-        *lines, self._rest = self._rest.split(b"\n")
-        return [json.loads(line) for line in lines if line.startswith(b"{")]
+        if self.ended():
+            self._reader.join(5)  # seconds; it reads to the end of the pipe
+        lines = [self._lines.get() for _ in range(self._lines.qsize())]
+        return [json.loads(line) for line in lines if line.startswith(b"{") and line.endswith(b"\n")]
 
     def ended(self) -> bool:
         """Return whether the process has ended."""
@@ -221,7 +230,7 @@ class _Worker:
     def close(self) -> None:
         """Clear up after the process; raise if it ended badly."""
         self._pipe.close()
-        lines = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        lines = [line for line in self._log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         self._folder.cleanup()
         if self._process.returncode != 0:
             last = lines[-1].strip() if lines else "no word"
@@ -235,6 +244,7 @@ class _Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._reader.join(5)
         self._pipe.close()
         for partial in self.out.glob(f".{self._process.pid}-*"):
             partial.unlink()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
@@ -58,6 +59,8 @@ class ViewServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    # Windows would let two servers share a port.
+    allow_reuse_address = sys.platform != "win32"
 
     def __init__(self, sequences: list[Sequence], *, rate: float = 24, port: int = 0) -> None:
         self.sequences = sequences

@@ -127,7 +127,7 @@ def test_where_nothing_can_be_locked_nothing_is_cleared(tmp_path, monkeypatch):
     def unsupported(*_):
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr(replace.fcntl, "flock", unsupported)
+    monkeypatch.setattr(replace, "lock_file", unsupported)
     with replace_file(tmp_path / "a") as temporary:
         temporary.write_text("whole")
         remove_leftovers(tmp_path)

@@ -1,0 +1,149 @@
+"""The differences between systems, on whichever the tests run."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hybrid import system
+from hybrid.system import (
+    load_average,
+    lock_file,
+    open_file,
+    peak_memory,
+    process_lives,
+    replace_path,
+    same_file,
+    start_context,
+)
+
+
+def test_a_new_file_is_made_once_and_an_old_one_is_opened_again(tmp_path):
+    path = tmp_path / "a"
+    with pytest.raises(FileNotFoundError):
+        open_file(path, new=False)
+    os.close(open_file(path, new=True))
+    with pytest.raises(FileExistsError):
+        open_file(path, new=True)
+    os.close(open_file(path, new=False))
+
+
+def test_a_locked_file_is_read_written_renamed_and_removed_by_its_name(tmp_path):
+    """Locks of Windows are mandatory, and its files are not shared unless that is asked for."""
+    path = tmp_path / "a"
+    descriptor = open_file(path, new=True)
+    try:
+        lock_file(descriptor)
+        path.write_bytes(b"frame")
+        assert path.read_bytes() == b"frame"
+        replace_path(path, tmp_path / "b")
+        assert (tmp_path / "b").read_bytes() == b"frame"
+        (tmp_path / "b").unlink()
+    finally:
+        os.close(descriptor)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_held_by_one_until_the_file_is_closed(tmp_path):
+    path = tmp_path / "a"
+    one, other = open_file(path, new=True), open_file(path, new=False)
+    try:
+        lock_file(one)
+        with pytest.raises(BlockingIOError):
+            lock_file(other)
+        os.close(one)
+        lock_file(other)
+    finally:
+        os.close(other)
+
+
+def test_a_file_that_another_program_has_open_is_replaced_when_it_is_closed(tmp_path, monkeypatch):
+    """As by Windows, which refuses that with WinError 5 or 32."""
+    (tmp_path / "a").write_text("new")
+    refusals = iter([PermissionError(13, "in use", str(tmp_path / "a"))] * 3)
+    replace = os.replace
+
+    def refuse(source, target):
+        if error := next(refusals, None):
+            raise error
+        replace(source, target)
+
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    monkeypatch.setattr(system.os, "replace", refuse)
+    monkeypatch.setattr(system.time, "sleep", lambda seconds: None)
+    replace_path(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "new"
+
+
+def test_a_file_that_stays_open_is_an_error_in_the_end(tmp_path, monkeypatch):
+    def refuse(source, target):
+        raise PermissionError(13, "in use", str(source))
+
+    clock = iter(range(100))
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    monkeypatch.setattr(system.os, "replace", refuse)
+    monkeypatch.setattr(system.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(system.time, "monotonic", lambda: next(clock))
+    with pytest.raises(PermissionError, match="in use"):
+        replace_path(tmp_path / "a", tmp_path / "b")
+
+
+def test_a_read_only_file_is_called_so(tmp_path, monkeypatch):
+    """Windows refuses to replace it, with "access is denied"."""
+
+    def refuse(source, target):
+        raise PermissionError(13, "access is denied", str(source))
+
+    (tmp_path / "b").write_text("old")
+    (tmp_path / "b").chmod(0o444)
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    monkeypatch.setattr(system.os, "replace", refuse)
+    with pytest.raises(PermissionError, match="the file there is read-only"):
+        replace_path(tmp_path / "a", tmp_path / "b")
+
+
+def test_files_without_numbers_are_taken_for_the_same(tmp_path):
+    """Some network drives of Windows number no files."""
+    for name in "ab":
+        (tmp_path / name).touch()
+    one, other = (tmp_path / "a").stat(), (tmp_path / "b").stat()
+    assert same_file(one, one)
+    assert not same_file(one, other)
+    unnumbered = os.stat_result([0 if n == 1 else value for n, value in enumerate(other)])
+    assert same_file(one, unnumbered)
+
+
+def test_a_process_is_asked_about_without_a_signal():
+    """A signal of number 0 is Ctrl-C on Windows."""
+    code = "import sys; print('begun', flush=True); sys.stdin.read()"
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "begun\n"
+        assert process_lives(child.pid)
+        assert child.poll() is None
+        child.communicate()
+        assert child.returncode == 0
+    assert not process_lives(child.pid)
+    assert process_lives(os.getpid())
+
+
+def test_peak_memory_holds_what_the_process_takes():
+    before = peak_memory()
+    held = bytearray(os.urandom(1)) * 2**26
+    assert peak_memory() > 2**22  # bytes, and not KiB or pages: an interpreter alone takes more
+    assert peak_memory() >= before
+    assert len(held) == 2**26
+
+
+def test_processes_are_forked_from_a_server_on_linux_alone(monkeypatch):
+    assert start_context("hybrid.system").get_start_method() == ("forkserver" if sys.platform == "linux" else "spawn")
+    for platform in ("darwin", "win32"):
+        monkeypatch.setattr(system.sys, "platform", platform)
+        assert start_context("hybrid.system").get_start_method() == "spawn"
+
+
+def test_the_load_is_unknown_on_windows(monkeypatch):
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    assert load_average() is None
