@@ -53,7 +53,7 @@ class Job:
         scene = self.scene
         if scene is None:
             raise FileNotFoundError("the scene was removed")
-        there = [number for number, path in scenes.noisy_files(scene).items() if path.is_file()]
+        there = list(scenes.rendered_files(scene))
         pattern = scenes.noisy_pattern(scene)
         if not there:
             raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")

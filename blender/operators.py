@@ -56,7 +56,7 @@ class Denoise(bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask about frames that are there; then return at once, and let a timer follow."""
         self.wait = bpy.app.background
-        if self.render and not self.wait and self._there(context.scene):
+        if self.render and not self.wait and scenes.rendered_files(context.scene):
             self.existing = "KEEP"
             return context.window_manager.invoke_props_dialog(self, title="Noisy frames are there already")
         return self.execute(context)
@@ -68,13 +68,8 @@ class Denoise(bpy.types.Operator):
         """Denoise; with `wait` until the end, in scripts and where Blender has no window."""
         return _follow(self, context, lambda: self._begin(context.scene))
 
-    def _there(self, scene: bpy.types.Scene) -> list[int]:
-        if not scenes.is_placed(scene):
-            return []
-        return [number for number, path in scenes.noisy_files(scene).items() if path.is_file()]
-
     def _begin(self, scene: bpy.types.Scene) -> None:
-        job, there = jobs.begin(scene), self._there(scene)
+        job, there = jobs.begin(scene), scenes.rendered_files(scene)
         if not self.render:
             job.start()
             return

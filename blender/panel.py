@@ -48,7 +48,7 @@ class OutputPanel(bpy.types.Panel):
         row.operator("ravg.denoise", text="Render and Denoise", icon="RENDER_ANIMATION").render = True
         row.operator("ravg.denoise", icon="SHADERFX")
         column = layout.column()
-        there, total = scenes.count_noisy(scene)
+        there, total = len(scenes.rendered_files(scene)), len(scenes.frame_numbers(scene))
         column.label(text=f"{there} of {total} noisy frames are there", icon="FILE_IMAGE")
         row = layout.row(align=True)
         row.operator("ravg.show", icon="IMAGE_DATA")

@@ -38,7 +38,7 @@ def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
     found = []
     if reason := refused(scene):
         found.append(Problem(f"{reason} (Render and Denoise renders all again)", False))
-    missing = [number for number, path in noisy_files(scene).items() if not path.is_file()]
+    missing = set(frame_numbers(scene)) - rendered_files(scene).keys()
     if 0 < len(missing) < len(frame_numbers(scene)):
         found.append(Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False))
     if scene.render.use_multiview:
@@ -112,6 +112,16 @@ def noisy_files(scene: bpy.types.Scene) -> dict[int, Path]:
     return {n: Path(f"{before}{n:0{width}d}{after}") for n in frame_numbers(scene)}
 
 
+def rendered_files(scene: bpy.types.Scene) -> dict[int, Path]:
+    """Frame number → the file of its noisy render, for those that are there: one listing of their folder."""
+    files = noisy_files(scene) if is_placed(scene) else {}
+    try:
+        there = set(os.listdir(Path(noisy_pattern(scene)).parent))
+    except OSError:
+        there = set()
+    return {number: path for number, path in files.items() if path.name in there}
+
+
 def noisy_pattern(scene: bpy.types.Scene) -> str:
     """The files of all noisy frames as one pattern, ``shot_####.exr``."""
     before, width, after = _name(scene)
@@ -137,17 +147,11 @@ def is_placed(scene: bpy.types.Scene) -> bool:
     return bool(bpy.data.filepath) or bool(scene.ravg.noisy and not scene.ravg.noisy.startswith("//"))
 
 
-def count_noisy(scene: bpy.types.Scene) -> tuple[int, int]:
-    """How many noisy frames are there, of how many."""
-    files = noisy_files(scene).values() if is_placed(scene) else []
-    return sum(path.is_file() for path in files), len(frame_numbers(scene))
-
-
 def refused(scene: bpy.types.Scene) -> str:
     """Say which of the noisy frames on disk is none, and why; empty where all are."""
     cycles = scene.render.engine == "CYCLES"
-    for path in noisy_files(scene).values():
-        if path.is_file() and (reason := _refusal(path, path.stat().st_mtime_ns, cycles)):
+    for path in rendered_files(scene).values():
+        if reason := _refusal(path, path.stat().st_mtime_ns, cycles):
             return f"{path.name} is no noisy frame: {reason}"
     return ""
 
@@ -163,7 +167,13 @@ def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
     if not is_placed(scene):
         return []
     kept = {*noisy_files(scene).values(), *denoised_files(scene).values()}
-    written = {_absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
+    try:
+        first = _absolute(scene.render.frame_path(frame=scene.frame_start))
+        if first.parent not in {path.parent for path in kept}:  # the common case, as often as a panel is drawn
+            return []
+        written = {_absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
+    except RuntimeError:  # a path that Blender cannot read as a template: it does not render to it either
+        return []
     return sorted(path for path in kept & written if path.is_file())
 
 
@@ -183,7 +193,7 @@ def lend(scene: bpy.types.Scene, *, replace: bool) -> None:
         If Blender would write other files than `noisy_files`.
     """
     settings: dict[str, object] = {
-        "render.filepath": noisy_pattern(scene),
+        "render.filepath": _literal(noisy_pattern(scene)),
         "render.image_settings.media_type": "MULTI_LAYER_IMAGE",  # Blender 5.0 and later choose the format in two steps
         "render.image_settings.file_format": "OPEN_EXR_MULTILAYER",
         "render.image_settings.color_mode": "RGBA",
@@ -203,7 +213,7 @@ def lend(scene: bpy.types.Scene, *, replace: bool) -> None:
     written, expected = _absolute(scene.render.frame_path(frame=first)), noisy_files(scene)[first]
     if written != expected:
         give_back(scene)
-        raise OSError(f"Blender would write {written}, expected {expected}: name Noisy Frames without {{ and }}")
+        raise OSError(f"Blender would write {written}, expected {expected}: give Noisy Frames a plainer name")
 
 
 def keep_existing(scene: bpy.types.Scene) -> None:
@@ -235,6 +245,11 @@ def _owner(scene: bpy.types.Scene, path: str) -> tuple[object, str]:
     """The object that has a property of the scene, and the property's own name."""
     owner, _, name = path.rpartition(".")
     return (scene.path_resolve(owner), name)
+
+
+def _literal(path: str) -> str:
+    """A path as Blender's Output Path: since 5.0 braces name a variable there, unless they are doubled."""
+    return path.replace("{", "{{").replace("}", "}}") if bpy.app.version >= (5, 0, 0) else path
 
 
 def _set(scene: bpy.types.Scene, path: str, value: object) -> None:

@@ -282,10 +282,17 @@ def test_the_rendered_frames_hold_what_ravg_reads(rendered):
         ("//sh#t/v1_", "sh#t/v1_####.exr", "sh#t/v1_0005.exr"),
         ("//12/00##_a", "12/00##_a.exr", "12/0005_a.exr"),
         ("//", "####.exr", "0005.exr"),
+        ("//{x}/{blend_name}_", "{x}/{blend_name}_####.exr", "{x}/{blend_name}_0005.exr"),
+        ("//a.EXR", "a####.exr", "a0005.exr"),
     ],
 )
 def test_frames_are_looked_for_where_blender_writes_them(blender, rendered, filepath, pattern, fifth):
-    code = PROBLEMS + "scene.ravg.noisy = PATH; answer = [scenes.noisy_pattern(scene), scenes.noisy_files(scene)[5]]"
+    code = f"""{PROBLEMS}
+scene.ravg.noisy = PATH
+scenes.lend(scene, replace=True)
+assert scene.render.frame_path(frame=5) == str(scenes.noisy_files(scene)[5])
+answer = [scenes.noisy_pattern(scene), scenes.noisy_files(scene)[5]]
+"""
     found = blender.run(code, blend=rendered, PATH=filepath)
     assert found == [str(rendered.parent / pattern), str(rendered.parent / fifth)]
 
@@ -1024,6 +1031,11 @@ def test_the_panel_of_a_new_scene_is_that_of_the_documentation(blender, blend):
     assert block
     code = DRAWN + "scene.cycles.use_denoising = True; answer = draw()"  # as in a new file
     assert blender.run(code, blend=blend) == block[1].splitlines()
+
+
+def test_an_output_path_that_blender_cannot_read_leaves_the_panel_whole(blender, stub, rendered):
+    code = DRAWN + "scene.render.filepath = '//{no_such}/x_'; answer = draw()"
+    assert "Render and Denoise" in blender.run(code, blend=rendered, command=stub)
 
 
 def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, stub, rendered):
