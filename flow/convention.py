@@ -27,8 +27,10 @@ FINALISTS = 4
 # A difference of means that is taken for noise: the scale of `nlm.gate.color_gate`, a third of a pixel's noise and
 # one step of 8 bits. Noise alone brings twice that once in a thousand patches.
 NOISE_SHARE, NOISE_FLOOR = 0.3, 0.004
-# A reading of which a greater share leaves the picture than stays says nothing.
+# A reading that moves a greater share of what changes out of the picture than it keeps there explains nothing.
 INSIDE = 0.5
+# Of fewer patches the spread of their differences is unknown: nothing is clearly better by them.
+FEWEST = 8
 # Standard errors, of the differences patch by patch, by which one reading is clearly better than another.
 CLEARLY = 3.0
 # What noise alone gives is known to about 1 % of the picture: a reading that leaves less than this is good.
@@ -111,6 +113,8 @@ class Choice:
         Indices of pairs that show something else in each frame, as at a cut. They are not asked, unless all are such.
     by_surfaces : bool
         Whether surfaces have decided, and not light; all shares are then those of what surfaces show.
+    contradicted : bool
+        Whether the pictures contradict the reading, which is taken because the user has stated it.
     """
 
     convention: MotionConvention | None
@@ -121,6 +125,7 @@ class Choice:
     trials: tuple[Trial, ...]
     unrelated: tuple[int, ...] = ()
     by_surfaces: bool = False
+    contradicted: bool = False
 
     @property
     def certain(self) -> bool:
@@ -133,6 +138,7 @@ def choose_convention(
     assumed: MotionConvention,
     settled: Collection[str] = PARTS,
     surfaces: Callable[[], Sequence[Patches]] = tuple,
+    typed: Collection[str] = (),
 ) -> Choice:
     """Find the reading of motion vectors that explains the pictures.
 
@@ -146,22 +152,29 @@ def choose_convention(
         The parts of it that are known. They are tried otherwise only if they explain little.
     surfaces : callable
         Gives such pairs of what does not depend on light, an albedo say. Asked only where light leaves a doubt.
+    typed : collection of str
+        The parts that the user has stated. Nothing overrules them.
 
     Returns
     -------
     Choice
-        `convention` is None if surfaces do not confirm the vectors, and these are clearly worse than no motion or
-        explain less than half of what a flow found in the pictures explains.
+        `convention` is None if no part is typed, surfaces do not confirm the vectors, and these are clearly worse than
+        no motion or explain less than half of what a flow found in the pictures explains.
 
     Raises
     ------
     ValueError
         No pairs, or vectors with fewer channels than `assumed` has.
 
-    Notes ----- Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a
-    patch of neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1,
-    (m/2q)²) less what noise alone gives; patches that leave what is seen say nothing, and empty ones are not asked. One
-    reading is clearly better than another if the mean difference, patch by patch, is three times its standard error.
+    Notes
+    -----
+    Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a patch of
+    neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. A patch is unexplained by min(1, (m/2q)²)
+    less what noise alone gives. Of what a reading moves out of what is seen as large a share is unexplained as of the
+    rest; all is, if that is more than half of what changes. One reading is clearly better than another if the mean
+    difference, over the patches that both keep, is three times its standard error. The picture is the smallest
+    rectangle that holds all that is seen in either frame. Patches that are mostly black in both frames, or have vectors
+    of 0 in both, count for nothing.
 
     Where shadows move, light is explained by no vectors, and best by a flow that follows them. Surfaces confirm a
     reading that leaves less than a quarter of what one pixel more or less would, or that is clearly better than no
@@ -170,21 +183,23 @@ def choose_convention(
     if not pairs:
         raise ValueError("pairs is empty, expected at least one")
     unrelated = tuple(index for index, pair in enumerate(pairs) if pair.unrelated)
-    trials, settled = _Trials(_related(pairs)), frozenset(settled)
+    trials, settled, typed = _Trials(_related(pairs)), frozenset(settled), frozenset(typed)
     chosen = trials.best(assumed, settled)
     if (trials.clearly_better(None, chosen) or not trials.good(chosen)) and (shown := surfaces()):
         of_surfaces = _Trials(_related(shown))
-        reading = of_surfaces.read(assumed, settled)
+        reading = of_surfaces.read(assumed, settled, typed)
         if of_surfaces.confirm(reading):
             return of_surfaces.choice(reading, settled, unrelated=unrelated, by_surfaces=True)
-    chosen = trials.read(assumed, settled)
+    chosen = trials.read(assumed, settled, typed)
     believed, found = not trials.clearly_better(None, chosen), None
-    if believed and not trials.good(chosen):
+    if believed and not trials.good(chosen) and len(trials.costs(None)) >= FEWEST:
         # A change of light is explained by no motion. Vectors are wrong where a search explains what they do not.
         found = trials.search()
         believed = trials.worth(chosen, WORTH) or found >= (1 - WORTH) * trials.left(None)
     choice = trials.choice(chosen, settled, found=found, unrelated=unrelated)
-    return choice if believed else replace(choice, convention=None, open=())
+    if believed:
+        return choice
+    return replace(choice, contradicted=True) if typed else replace(choice, convention=None, open=())
 
 
 ONE_PIXEL = np.ones(2, np.float32)
@@ -203,10 +218,13 @@ class Patches:
     def __init__(self, pair: FramePair) -> None:
         self.resolution, self.frames = pair.resolution, pair.frames
         exposure = median_luminance(pair.earlier)
-        self.pictures = tuple(tone_map(color, exposure) for color in (pair.earlier, pair.later))
+        pictures = [tone_map(color, exposure) for color in (pair.earlier, pair.later)]
+        box = _lit_box(np.maximum(*pictures) > 0)
+        self.pictures = tuple(np.ascontiguousarray(picture[box]) for picture in pictures)
+        layers = pair.earlier_vectors[box], pair.later_vectors[box]
         # Closed: noise leaves single pixels of what is seen black.
-        box = np.ones((3, 3), np.uint8)
-        shown = (cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, box) for picture in self.pictures)
+        near = np.ones((3, 3), np.uint8)
+        shown = (cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, near) for picture in self.pictures)
         self.shown = tuple(mask.astype(bool) for mask in shown)
         height, width = self.pictures[0].shape
         self.radius = min(RADIUS, (min(height, width) - 1) // 2)
@@ -214,13 +232,16 @@ class Patches:
         spacing = max(size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
         inner = [np.arange(self.radius, side - self.radius, spacing) for side in (height, width)]
         self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
-        seen = self._seen(size)
+        shown = np.logical_or(*self.shown)
+        known = shown & np.logical_or(*(np.any(layer != 0, axis=-1) for layer in layers))
+        shown = known if known.any() else shown
+        seen = self._holds(shown, size)
         if seen.any() and not seen.all():
             # As many patches as the seen part of the picture holds, so that an object of 1 % of it has enough of them.
             finer = max(1, int(spacing * np.sqrt(seen.mean())))
             inner = [np.arange(self.radius, side - self.radius, finer) for side in (height, width)]
             self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
-            seen = self._seen(size)
+            seen = self._holds(shown, size)
             self.rows, self.columns = self.rows[seen], self.columns[seen]
         noise = [estimate_noise(picture)[self.rows, self.columns] ** 2 for picture in self.pictures]
         deviation = np.sqrt(np.mean(noise, axis=0))
@@ -229,18 +250,20 @@ class Patches:
         # Two means differ by noise with the variance 2 s² / size².
         self.expected = 2 * np.square(deviation / (size * self.scale))
         self.all = np.arange(len(self.rows))
+        # Without motion what is seen in one frame alone has changed: it is compared with black.
+        shown, self.shown = self.shown, (np.ones_like(self.shown[0]),) * 2
         self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all, ONE_PIXEL)
+        self.shown = shown
         self.few = _informative(self.still, SCREENED)
-        layers = pair.earlier_vectors, pair.later_vectors
         self.vectors = [self.gather(layer, self.all) for layer in layers]
         self.few_vectors = [self.gather(layer, self.few) for layer in layers]
         self.tried: dict[tuple[MotionConvention, bool], np.ndarray] = {}
         self.decoded: dict[tuple[str, str, float, bool], tuple[_Flows, _Flows]] = {}
 
-    def _seen(self, size: int) -> np.ndarray:
-        """Which patches show anything: beside a render region, or behind an object, no vectors explain anything."""
-        shown = np.logical_or(*self.shown).astype(np.float32)
-        return np.asarray(cv2.blur(shown, (size, size))[self.rows, self.columns] > 0)
+    def _holds(self, shown: np.ndarray, size: int) -> np.ndarray:
+        """Which patches hold most of what the fullest does of these: the means of fewer pixels have more noise."""
+        share = cv2.blur(shown.astype(np.float32), (size, size))[self.rows, self.columns]
+        return np.asarray((share > 0) & (2 * share >= share.max()))
 
     def costs(self, convention: MotionConvention, *, few: bool = False) -> np.ndarray:
         """What a reading leaves of each patch, or of the `few` that tell most, in [0, 1]; NaN outside."""
@@ -394,10 +417,12 @@ class _Trials:
 
     def clearly_better(self, a: MotionConvention | None, b: MotionConvention | None) -> bool:
         """Whether a leaves less than b where both stay in the picture, by more than chance."""
-        difference = self.costs(b) - self.costs(a)
-        difference = difference[~np.isnan(difference)]
-        enough = len(difference) >= INSIDE * len(self.costs(None))
-        return enough and float(difference.mean()) > CLEARLY * float(difference.std()) / np.sqrt(len(difference))
+        difference, still = self.costs(b) - self.costs(a), self.costs(None)
+        inside = ~np.isnan(difference)
+        if np.count_nonzero(inside) < FEWEST or not _keeps(inside, still):
+            return False
+        difference = difference[inside]
+        return float(difference.mean()) > CLEARLY * float(difference.std()) / np.sqrt(len(difference))
 
     def overrules(self, other: MotionConvention, stated: MotionConvention) -> bool:
         """Whether another reading leaves half of what the stated one does, or that explains half of what this does."""
@@ -418,11 +443,11 @@ class _Trials:
         """Whether a reading explains this share of what a search does."""
         return self.left(None) - self.left(reading) >= share * (self.left(None) - self.search())
 
-    def read(self, assumed: MotionConvention, settled: frozenset[str]) -> MotionConvention:
-        """The best reading that agrees with what is settled, or one that overrules it."""
+    def read(self, assumed: MotionConvention, settled: frozenset[str], typed: frozenset[str]) -> MotionConvention:
+        """The best reading that agrees with what is settled, or one that overrules what of it is not typed."""
         chosen = self.best(assumed, settled)
-        if settled and (self.clearly_better(None, chosen) or not self.good(chosen)):
-            other = self.best(assumed, frozenset())
+        if settled - typed and (self.clearly_better(None, chosen) or not self.good(chosen)):
+            other = self.best(assumed, typed)
             if self.overrules(other, chosen):
                 return other
         return chosen
@@ -525,10 +550,31 @@ class _Trials:
         return tuple(Trial(reading, self.left(reading)) for reading in order)
 
 
+def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:
+    """The smallest rectangle that holds all lit pixels (H, W), of at least 3 pixels on a side; all, if none is lit."""
+    box = []
+    for axis, side in enumerate(lit.shape):
+        at = np.flatnonzero(lit.any(axis=1 - axis))
+        if not at.size:
+            return slice(None), slice(None)
+        first = max(min(int(at[0]), side - 3), 0)
+        box.append(slice(first, max(int(at[-1]) + 1, first + 3)))
+    return box[0], box[1]
+
+
+def _keeps(inside: np.ndarray, still: np.ndarray) -> bool:
+    """Whether most of what changes without motion is inside."""
+    return bool(inside.any()) and float(still[inside].sum()) >= INSIDE * float(still.sum())
+
+
 def _mean(costs: np.ndarray, still: np.ndarray) -> float:
-    """Mean of the costs of patches that stay in the picture; where few do, as without motion."""
+    """Mean of the costs; those outside, NaN, differ from the cost without motion by the factor of those inside."""
     inside = ~np.isnan(costs)
-    return float((costs[inside] if inside.mean() >= INSIDE else still).mean())
+    if not _keeps(inside, still):
+        return float(still.mean())
+    change = float(still[inside].sum())
+    factor = min(float(costs[inside].sum()) / change, 1.0) if change > 0 else 1.0
+    return float(np.where(inside, costs, factor * still).mean())
 
 
 def _informative(still: np.ndarray, count: int) -> np.ndarray:

@@ -50,7 +50,7 @@ LIGHT, ERRORS, LEAK = 2.5, 10.0, 0.05
 LOST = 0.01
 # So many readings of the vectors are shown.
 SHOWN = 6
-# Two pictures of which so many pixels are equal are one.
+# Two pictures of which so many pixels are equal are one, black pixels left out: empty areas of all layers are equal.
 EQUAL = 0.99
 
 
@@ -262,7 +262,9 @@ def _judge(
     choice = None
     if layers.motion_convention is not None and light:
         sound = [role for role in ("albedo", "normal") if role not in {finding.role for finding in findings}]
-        choice = choose_convention(light, layers.motion_convention, layers.settled, lambda: surfaces(sound))
+        choice = choose_convention(
+            light, layers.motion_convention, layers.settled, lambda: surfaces(sound), layers.typed
+        )
         findings += _judge_motion(layers, choice)
     return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
 
@@ -416,7 +418,7 @@ def _judge_alpha(frame: Frame) -> str | None:
     layer = frame.alpha
     if layer is None or layer.min() == layer.max():
         return None  # opaque everywhere, or empty
-    if any(np.mean(layer == frame.color[..., c]) > EQUAL for c in range(3)):
+    if any(_equal_share(layer, frame.color[..., c], layer == frame.color[..., c]) > EQUAL for c in range(3)):
         return "is the color"
     outside = float(np.mean((layer < -STRAY) | (layer > 1 + STRAY)))
     return f"is not between 0 and 1 in {outside:.1%} of the picture" if outside > STRAY else None
@@ -437,7 +439,14 @@ def _judge_estimate(frame: Frame) -> str | None:
         return None
     # Half floats differ from what they were by 5e-4 of it.
     same = np.isclose(frame.estimate, frame.color, rtol=SAME, atol=0).all(axis=-1)
-    return "is the noisy picture" if float(np.mean(same)) > EQUAL else None
+    return "is the noisy picture" if _equal_share(frame.estimate, frame.color, same) > EQUAL else None
+
+
+def _equal_share(a: Array, b: Array, same: NDArray[np.bool_]) -> float:
+    """Share of the pixels that are the same, of those where either layer is not 0; 0 if none is such."""
+    lit = (a != 0) | (b != 0)
+    lit = lit.any(axis=-1) if lit.ndim == 3 else lit
+    return float(np.mean(same[lit])) if lit.any() else 0.0
 
 
 _JUDGES: dict[str, Callable[[Frame], str | None]] = {
@@ -485,6 +494,9 @@ def _judge_motion(layers: Layers, choice: Choice) -> Iterator[Finding]:
         found = "" if choice.found is None else f", what is found in the pictures {choice.found:.1%}"
         words = f"{name}: no reading of the vectors explains the pictures (it leaves {left}, none {still}{found})"
         yield Finding("motion", f"{words}: left out, found in the pictures")
+    elif choice.contradicted:
+        words = f"{name}: {choice.convention}, as stated, does not explain the pictures"
+        yield Finding("motion", f"{words} (it leaves {left}, no motion {still}): taken as stated", left_out=False)
     elif choice.convention != layers.motion_convention:
         contradicts = any(
             getattr(choice.convention, part) != getattr(layers.motion_convention, part) for part in layers.settled

@@ -50,8 +50,9 @@ class Layers:
     there the color is ``Noisy Image``, which stays, and ``Combined`` is replaced.
 
     `profile` says whose names and conventions were taken, `reason` why. Of `motion_convention`, its parts `settled` are
-    documented, the others assumed. `variance_of` says of what the variance is, "mean" or "sample", `variance_scale`
-    what it is multiplied by to be that of a pixel, `samples` how many samples a pixel has; None where nobody has said.
+    documented, of which the user has stated those `typed`, the others assumed. `variance_of` says of what the variance
+    is, "mean" or "sample", `variance_scale` what it is multiplied by to be that of a pixel, `samples` how many samples
+    a pixel has; None where nobody has said.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
 
@@ -76,6 +77,7 @@ class Layers:
     reason: str = ""
     motion_convention: MotionConvention | None = None
     settled: frozenset[str] = frozenset()
+    typed: frozenset[str] = frozenset()
     variance_of: str | None = None
     variance_scale: float | None = None
     samples: float | None = None
@@ -181,6 +183,7 @@ def find_layers(
         reason=taken.why,
         motion_convention=convention,
         settled=taken.settled,
+        typed=taken.typed,
         variance_of=taken.variance,
         variance_scale={"mean": 1.0, "sample": None if samples is None else 1 / samples}.get(taken.variance or ""),
         samples=samples,

@@ -67,6 +67,8 @@ class Profile:
         The header attribute that holds the samples of a pixel; ``*`` stands for anything.
     why : str
         Why it was taken.
+    typed : frozenset of str
+        The parts of `motion` that the user has stated.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Profile:
     variance: str | None = None
     samples: str | None = None
     why: str = "asked for"
+    typed: frozenset[str] = frozenset()
 
     def convention(self, channels: int) -> MotionConvention:
         """What vectors of so many channels mean, as far as is known or assumed."""
@@ -107,7 +110,7 @@ class Profile:
             return replace(self, motion={}, motion_assumed={**self.motion_assumed, **self.motion})
         parts = parse_motion(words)
         MotionConvention(**{**self.motion_assumed, **self.motion, **parts})
-        return replace(self, motion={**self.motion, **parts})
+        return replace(self, motion={**self.motion, **parts}, typed=frozenset(parts))
 
     def own_names(self, role: str) -> tuple[str, ...]:
         """What the renderer calls layers of a role, plain (`plain_name`), the preferred first."""

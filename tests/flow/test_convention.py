@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -349,3 +350,101 @@ def test_what_is_empty_explains_nothing(share, vectors_everywhere):
     choice = choose_convention([Patches(pair)], CYCLES, frozenset({"direction", "unit", "y", "scale", "encoding"}))
     assert choice.convention == CYCLES
     assert choice.unexplained < 0.05 < 0.2 < choice.still
+
+
+DOCUMENTED = {
+    "cycles": (CYCLES, lambda back, on: np.dstack([back, -on]) * [1, -1, 1, -1]),
+    "next, ndc": (MotionConvention("next", "ndc", y="up"), lambda back, on: on / [WIDTH, -HEIGHT]),
+    "half-ndc": (MotionConvention("next", "half-ndc", y="up"), lambda back, on: on / [WIDTH / 2, -HEIGHT / 2]),
+    "pixels": (PLAIN, lambda back, on: back),
+}
+
+
+def block_on_black(n: int, side: int, step: int, *, around: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(8)
+    texture = cv2.resize(rng.uniform(0.2, 1, (side // 4 + 1, side // 4 + 1, 3)).astype(np.float32), (side, side))
+    picture = np.full((HEIGHT, WIDTH, 3), around, np.float32)
+    picture[30 : 30 + side, 40 + n * step : 40 + n * step + side] = texture
+    return picture
+
+
+def block_vectors(write: Callable, n: int, side: int, step: int, outside: float = 0.0) -> np.ndarray:
+    back = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    back[..., 0] = -step
+    vectors = np.float32(write(back, -back))
+    empty = np.ones((HEIGHT, WIDTH), bool)
+    empty[30 : 30 + side, 40 + n * step : 40 + n * step + side] = False
+    vectors[empty] = outside * np.random.default_rng(n).normal(0, 9, vectors[empty].shape)
+    return vectors
+
+
+@pytest.mark.parametrize("side", [12, 24, 45])
+@pytest.mark.parametrize("outside", [0, 1], ids=["none", "garbage"])
+@pytest.mark.parametrize(("stated", "write"), DOCUMENTED.values(), ids=DOCUMENTED)
+def test_vectors_of_an_object_on_black_are_taken_as_documented(stated, write, side, outside) -> None:
+    layers = [block_vectors(write, n, side, 3, outside) for n in (0, 1)]
+    pictures = [block_on_black(n, side, 3) for n in (0, 1)]
+    choice = choose_convention([Patches(FramePair(*pictures, *layers, (HEIGHT, WIDTH)))], stated)
+    assert choice.convention == stated
+
+
+def test_a_cropped_object_gives_the_figures_of_the_same_object_on_black() -> None:
+    side = 24
+    box = np.s_[30 : 30 + side, 40 : 40 + side + 3]
+    layers = [block_vectors(lambda back, on: back, n, side, 3) for n in (0, 1)]
+    pictures = [block_on_black(n, side, 3) for n in (0, 1)]
+    whole = choose_convention([Patches(FramePair(*pictures, *layers, (HEIGHT, WIDTH)))], PLAIN)
+    small = [layer[box] for layer in (*pictures, *layers)]
+    cropped = choose_convention([Patches(FramePair(*small, (HEIGHT, WIDTH)))], PLAIN)
+    assert cropped.convention == whole.convention
+    # The patches do not lie at the same places.
+    assert (cropped.unexplained, cropped.still) == pytest.approx((whole.unexplained, whole.still), abs=0.1)
+
+
+REGIONS = [np.s_[:, :70], np.s_[:, 70:], np.s_[:45], np.s_[45:], np.s_[20:70, 30:110], np.s_[10:80]]
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=["left", "right", "top", "bottom", "middle", "letterbox"])
+def test_what_a_renderer_documents_holds_beside_a_render_region(region) -> None:
+    film = Film((8, 3))
+
+    def cut(layer: np.ndarray) -> np.ndarray:
+        inside = np.zeros_like(layer)
+        inside[region] = layer[region]
+        return inside
+
+    layers = [cut(np.float32(np.dstack([film.previous(n), -film.next(n)]) * [1, -1, 1, -1])) for n in range(3)]
+    pairs = [
+        Patches(FramePair(cut(film.colors[n]), cut(film.colors[n + 1]), layers[n], layers[n + 1], (HEIGHT, WIDTH)))
+        for n in range(2)
+    ]
+    choice = choose_convention(pairs, CYCLES)
+    assert choice.convention == CYCLES
+    assert choice.unexplained < 0.05 < 0.2 < choice.still
+
+
+def test_a_moving_sky_without_vectors_counts_for_nothing() -> None:
+    rng = np.random.default_rng(2)
+    pictures, layers = [block_on_black(n, 30, 3) for n in (0, 1)], []
+    for n, picture in enumerate(pictures):
+        sky = cv2.resize(rng.uniform(0.2, 1, (20, 30, 3)).astype(np.float32), (WIDTH, HEIGHT))
+        picture[picture == 0] = sky[picture == 0]
+        layers.append(block_vectors(lambda back, on: back, n, 30, 3))
+    choice = choose_convention([Patches(FramePair(*pictures, *layers, (HEIGHT, WIDTH)))], PLAIN)
+    assert choice.convention == PLAIN
+
+
+def test_a_black_frame_contradicts_nothing() -> None:
+    film = Film((8, 3))
+    black = np.zeros_like(film.colors[0])
+    pair = FramePair(black, black, film.previous(0), film.previous(1), (HEIGHT, WIDTH))
+    assert choose_convention([Patches(pair)], PLAIN).convention == PLAIN
+
+
+def test_typed_parts_are_obeyed_though_the_pictures_contradict_them() -> None:
+    film = Film(**MOVES, faster=1.5)
+    pairs = film.pairs(lambda n: -film.previous(n))
+    choice = choose_convention(pairs, PLAIN, typed=PARTS)
+    assert choice.convention == PLAIN
+    assert choice.contradicted
+    assert choose_convention(pairs, PLAIN).convention == replace(PLAIN, scale=-1.0)

@@ -15,9 +15,9 @@ import pytest
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import Shot, open_shot
+from hybrid.files.frames import Frame, Shot, open_shot
 from hybrid.plan import plan_shot
-from hybrid.plausibility import find_cut, find_lost_light, find_nonfinite, judge_layers
+from hybrid.plausibility import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, judge_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 
@@ -227,6 +227,20 @@ def test_a_denoised_picture_that_is_the_noisy_one_is_no_estimate(tmp_path) -> No
     layers = judgement.apply(shot).layers(10)
     assert layers.estimate is None
     assert str(layers.target) == "ViewLayer.Combined.RGB"  # which the denoised picture replaces all the same
+
+
+def test_equal_zeros_are_no_evidence() -> None:
+    rng = np.random.default_rng(4)
+    color = np.zeros((64, 96, 3), np.float32)
+    alpha = np.zeros((64, 96), np.float32)
+    color[30:34, 40:44] = rng.uniform(0.2, 1, (4, 4, 3))
+    alpha[30:34, 40:44] = 1
+    estimate = color * np.float32(1.1)
+    frame = Frame(1, color, alpha=alpha, estimate=estimate)
+    assert _judge_estimate(frame) is None
+    assert _judge_alpha(frame) is None
+    assert _judge_estimate(replace(frame, estimate=color)) == "is the noisy picture"
+    assert _judge_alpha(replace(frame, alpha=color[..., 1])) == "is the color"
 
 
 def test_what_makes_sense_gives_no_finding() -> None:
