@@ -131,8 +131,9 @@ def find_layers(
 
     Notes
     -----
-    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate, or ``Image`` in files
-    of Blender's File Output node. The other layers are taken from the color's own view layer and stereo view only.
+    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate, or ``Image`` in
+    files of Blender's File Output node. The other layers are taken from the color's own view layer and stereo view
+    only.
 
     What could be the color twice over (two view layers; ``beauty`` beside bare R, G, B) is refused: whichever was
     taken, the other would stay noisy in the file. What a known renderer calls its color goes before names that
