@@ -224,24 +224,24 @@ class Patches:
         layers = pair.earlier_vectors[box], pair.later_vectors[box]
         # Closed: noise leaves single pixels of what is seen black.
         near = np.ones((3, 3), np.uint8)
-        shown = (cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, near) for picture in self.pictures)
-        self.shown = tuple(mask.astype(bool) for mask in shown)
+        masks = (cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_CLOSE, near) for picture in self.pictures)
+        self.shown = tuple(mask.astype(bool) for mask in masks)
         height, width = self.pictures[0].shape
         self.radius = min(RADIUS, (min(height, width) - 1) // 2)
         size = 2 * self.radius + 1
         spacing = max(size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
         inner = [np.arange(self.radius, side - self.radius, spacing) for side in (height, width)]
         self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
-        shown = np.logical_or(*self.shown)
-        known = shown & np.logical_or(*(np.any(layer != 0, axis=-1) for layer in layers))
-        shown = known if known.any() else shown
-        seen = self._holds(shown, size)
+        lit = np.logical_or(*self.shown)
+        known = lit & np.logical_or(*(np.any(layer != 0, axis=-1) for layer in layers))
+        lit = known if known.any() else lit
+        seen = self._holds(lit, size)
         if seen.any() and not seen.all():
             # As many patches as the seen part of the picture holds, so that an object of 1 % of it has enough of them.
             finer = max(1, int(spacing * np.sqrt(seen.mean())))
             inner = [np.arange(self.radius, side - self.radius, finer) for side in (height, width)]
             self.rows, self.columns = (grid.ravel() for grid in np.meshgrid(*inner, indexing="ij"))
-            seen = self._holds(shown, size)
+            seen = self._holds(lit, size)
             self.rows, self.columns = self.rows[seen], self.columns[seen]
         noise = [estimate_noise(picture)[self.rows, self.columns] ** 2 for picture in self.pictures]
         deviation = np.sqrt(np.mean(noise, axis=0))
@@ -251,9 +251,9 @@ class Patches:
         self.expected = 2 * np.square(deviation / (size * self.scale))
         self.all = np.arange(len(self.rows))
         # Without motion what is seen in one frame alone has changed: it is compared with black.
-        shown, self.shown = self.shown, (np.ones_like(self.shown[0]),) * 2
+        seen_of, self.shown = self.shown, (np.ones_like(self.shown[0]),) * 2
         self.still = self._costs(1, np.zeros((len(self.rows) * size, size, 2), np.float32), self.all, ONE_PIXEL)
-        self.shown = shown
+        self.shown = seen_of
         self.few = _informative(self.still, SCREENED)
         self.vectors = [self.gather(layer, self.all) for layer in layers]
         self.few_vectors = [self.gather(layer, self.few) for layer in layers]
@@ -422,7 +422,7 @@ class _Trials:
         if np.count_nonzero(inside) < FEWEST or not _keeps(inside, still):
             return False
         difference = difference[inside]
-        return float(difference.mean()) > CLEARLY * float(difference.std()) / np.sqrt(len(difference))
+        return bool(difference.mean() > CLEARLY * difference.std() / np.sqrt(len(difference)))
 
     def overrules(self, other: MotionConvention, stated: MotionConvention) -> bool:
         """Whether another reading leaves half of what the stated one does, or that explains half of what this does."""
