@@ -20,6 +20,7 @@ from hybrid.commands.status import status
 from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
 from hybrid.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
+from hybrid.system import expand_home
 from hybrid.threads import check_thread_counts, let_waiting_threads_sleep
 
 # Where numba looks for a folder for compiled loops: its own list, and after that ours.
@@ -100,7 +101,7 @@ def _run(argv: Sequence[str] | None) -> int:
         stop_with_stdin()
         check_thread_counts()
         # Patterns are for ravg itself: on Windows typer would put the names of files in their place.
-        app(args=None if argv is None else list(argv), prog_name="ravg", windows_expand_args=False)
+        app(args=expand_home(sys.argv[1:] if argv is None else argv), prog_name="ravg", windows_expand_args=False)
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0
     except (KeyboardInterrupt, SystemError) as error:

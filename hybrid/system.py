@@ -8,8 +8,9 @@ import signal
 import stat
 import sys
 import time
+from collections.abc import Sequence
 from multiprocessing.context import BaseContext
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import psutil
 
@@ -67,6 +68,8 @@ if sys.platform == "win32":
     _FILE_FLAG_OPEN_REPARSE_POINT = 0x00200000
     _LOCKFILE_EXCLUSIVE_NOW = 0x3
     _ERROR_LOCK_VIOLATION = 33
+    # The path is not found, the name is too long: whatever the reason. MAX_PATH less the zero at its end.
+    _ERRORS_OF_LENGTH, _LONGEST_PATH = (3, 206), 259
     # High half of the position of the byte that is locked. Locks of Windows are mandatory: a byte far behind the end
     # leaves the content to the libraries that open the same file by its name.
     _LOCKED_HIGH = 2**30
@@ -104,7 +107,10 @@ if sys.platform == "win32":
         )
         if handle in (None, wintypes.HANDLE(-1).value):
             error = ctypes.get_last_error()
-            raise OSError(None, ctypes.FormatError(error).strip(), str(path), error)
+            said = ctypes.FormatError(error).strip()
+            if error in _ERRORS_OF_LENGTH and (length := len(str(path.absolute()))) > _LONGEST_PATH:
+                said = f"with its temporary name the path has {length} characters, Windows takes {_LONGEST_PATH}"
+            raise OSError(None, said, str(path), error)
         return msvcrt.open_osfhandle(handle, os.O_RDWR | os.O_BINARY | os.O_NOINHERIT)
 
     def lock_file(descriptor: int) -> None:
@@ -190,6 +196,21 @@ def is_read_only(path: Path) -> bool:
         return not path.lstat().st_mode & stat.S_IWRITE
     except OSError:
         return False
+
+
+def is_reserved(path: Path) -> bool:
+    """Whether Windows does not take the name for a file: aux, con, nul, a dot at the end; never so on other systems."""
+    if sys.platform != "win32":
+        return False
+    reserved = getattr(os.path, "isreserved", None)  # of Python 3.13, where the other is deprecated
+    return bool(reserved(path.name) if reserved else PureWindowsPath(path.name).is_reserved())
+
+
+def expand_home(words: Sequence[str]) -> list[str]:
+    """Put the user's folder in the place of ``~`` at the beginning of words, which no shell of Windows does."""
+    if sys.platform != "win32":
+        return [*words]
+    return [os.path.expanduser(word) if word == "~" or word.startswith(("~/", "~\\")) else word for word in words]
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:

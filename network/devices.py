@@ -13,7 +13,8 @@ def find_device(name: str) -> tuple[str, torch.device]:
     Parameters
     ----------
     name : str
-        One of `network.train_config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, metal, cpu.
+        One of `network.train_config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, cpu. Metal, which
+        nobody has run, is taken by its name alone.
 
     Returns
     -------
@@ -27,7 +28,7 @@ def find_device(name: str) -> tuple[str, torch.device]:
     """
     there = {**_accelerators(), "cpu": torch.device("cpu")}
     if name == "auto":
-        return next(iter(there.items()))
+        return next((kind, device) for kind, device in there.items() if kind != "metal")
     if name not in there:
         known = name in DEVICES
         what = "one that torch can use here" if known else "one that there is"

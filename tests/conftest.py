@@ -18,6 +18,7 @@ os.environ["TERM"] = "xterm"
 
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,13 @@ from typing import Any
 import pytest
 
 from tests.scenes import Scene
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs POSIX on Windows."""
+    for item in items:
+        if sys.platform == "win32" and item.get_closest_marker("posix"):
+            item.add_marker(pytest.mark.skip(reason="needs POSIX: pipes, signals, links or shells"))
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ DeviceOption = Annotated[
         "--device",
         envvar="RAVG_DEVICE",
         help="what computes networks, OIDN's and ravg's alike; auto: the first that is there of cuda, hip, sycl, "
-        "metal, cpu",
+        "cpu",
         rich_help_panel=RESOURCES,
     ),
 ]

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hybrid.system import lock_file, open_file, replace_path, same_file, sync_file
+from hybrid.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
 
 # What this process is writing to just now.
 _unfinished: set[Path] = set()
@@ -69,6 +69,8 @@ def identities(path: Path) -> Iterator[object]:
 
 def refuse_other_kinds(path: Path) -> None:
     """Raise OSError for what is there and no file: a pipe would be waited for, a device has no end."""
+    if is_reserved(path):
+        raise OSError(f"{path}: Windows does not take {path.name!r} as a name of a file, expected another")
     try:
         mode = path.stat().st_mode
     except OSError:  # nothing there, or a link to nothing, which is replaced

@@ -5,10 +5,12 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections.abc import Iterable, Mapping
+import sys
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from fnmatch import fnmatch
 from itertools import pairwise
 from pathlib import Path
 
@@ -54,7 +56,8 @@ class Pattern:
         """
         if not self.digits:
             return {1: self.single} if self.single.is_file() else {}
-        found = [(n, path) for path in _names(self.folder) if (n := self.number(path.name)) is not None]
+        names = _names(self.folder)
+        found = [(n, path) for path in names if (n := self.number(path.name)) is not None] or [*self._spelled(names)]
         shortest = min((len(path.name) for _, path in found), default=0) - len(self.before) - len(self.after)
         padded = replace(self, digits=max(shortest, 1))
         if any(path not in padded._names(n) for n, path in found):
@@ -79,6 +82,17 @@ class Pattern:
             return None
         match = re.fullmatch(f"{re.escape(self.before)}({_sign(self.before)}[0-9]+){re.escape(self.after)}", name)
         return int(match[1]) if match else None
+
+    def _spelled(self, names: list[Path]) -> Iterator[tuple[int, Path]]:
+        """Files that the file system finds under names of this pattern although its own for them differ.
+
+        Windows and macOS ignore case, macOS how accents are composed.
+        """
+        before, after = _fold(self.before), _fold(self.after)
+        for name in names:
+            match = re.fullmatch(f"{re.escape(before)}({_sign(before)}[0-9]+){re.escape(after)}", _fold(name.name))
+            if match and (path := self.folder / f"{self.before}{match[1]}{self.after}").exists():
+                yield int(match[1]), path
 
     def __str__(self) -> str:
         return f"{self.before}{'#' * self.digits}{self.after}"
@@ -129,7 +143,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
             if files := bare.files():
                 return files, match[2]
         raise FileNotFoundError(f"{spec}: no frame matches; {_listing(path.parent)}")
-    matching = [name for name in _names(path.parent) if fnmatchcase(name.name, path.name)]
+    matching = [name for name in _names(path.parent) if fnmatch(name.name, path.name)]
     if matching:
         # All files of the sequence: neighbours need not match.
         pattern = _only(_patterns(matching), spec, path.parent)
@@ -149,6 +163,11 @@ def parse_pattern(spec: str) -> tuple[Pattern, str | None]:
     place = places[-1]
     digits = len(place[1]) if place[1] else int(next(filter(None, place.groups()[1:]), "1"))
     return Pattern(path.parent, path.name[: place.start()], max(digits, 1), path.name[place.end() :]), frames
+
+
+def _fold(name: str) -> str:
+    """A name without case, accents composed."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _names(folder: Path) -> list[Path]:
@@ -177,7 +196,8 @@ def find_views(spec: str) -> list[str]:
     expression += (rf"{_sign(pattern.before)}\d+" if pattern.digits else "") + re.escape(pattern.after)
     loose = glob.escape(called).replace("%V", "*").replace("%v", "?")
     paths = glob.glob(loose + ("*" if pattern.digits else "") + glob.escape(pattern.after))
-    matches = [match for path in paths if (match := re.fullmatch(expression, path))]
+    case = re.IGNORECASE if sys.platform == "win32" else re.NOFLAG
+    matches = [match for path in paths if (match := re.fullmatch(expression, path, case))]
     views = {match.groupdict().get("long") or match.groupdict()["short"] for match in matches}
     if not views:
         raise FileNotFoundError(

@@ -103,11 +103,14 @@ def describe_sources(files: Mapping[str, Source], **facts: object) -> str:
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Versions of those of some packages that are installed."""
+    """Versions of those of some packages that are installed, without the name of the build (torch 2.13.0+cpu).
+
+    The wheels for Linux and Windows differ in that name alone, and machines of both may work on one shot.
+    """
     found = {}
     for package in packages:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
+            found[package] = version(package).partition("+")[0]
     return found
 
 

@@ -170,6 +170,10 @@ class TestDevices:
     def test_the_first_that_is_there_is_taken(self, monkeypatch):
         monkeypatch.setattr(oidn, "_has_device", lambda kind: kind in {"sycl", "cpu"})
         assert oidn.find_device("auto") == "sycl"
+        monkeypatch.setattr(oidn, "_has_device", lambda kind: kind in {"metal", "cpu"})
+        assert oidn.find_device("auto") == "cpu"  # nobody has run Metal
+        assert oidn.find_device("metal") == "metal"
+        monkeypatch.setattr(oidn, "_has_device", lambda kind: kind in {"sycl", "cpu"})
         assert oidn.find_device("cpu") == "cpu"
         with pytest.raises(
             ValueError, match=r"device is 'cuda', expected one that OIDN can use here: auto, sycl, cpu$"

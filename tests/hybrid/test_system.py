@@ -3,11 +3,14 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from hybrid import system
 from hybrid.system import (
+    expand_home,
+    is_reserved,
     load_average,
     lock_file,
     open_file,
@@ -147,3 +150,20 @@ def test_processes_are_forked_from_a_server_on_linux_alone(monkeypatch):
 def test_the_load_is_unknown_on_windows(monkeypatch):
     monkeypatch.setattr(system.sys, "platform", "win32")
     assert load_average() is None
+
+
+@pytest.mark.parametrize("name", ["aux.exr", "con", "COM1.exr", "nul"])
+def test_names_that_windows_keeps_for_itself(monkeypatch, name):
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    assert is_reserved(Path(name))
+    assert not is_reserved(Path("auxiliary.0001.exr"))
+
+
+def test_the_users_folder_is_put_in_where_no_shell_does_it(monkeypatch):
+    words = ["denoise", "~/shot.####.exr", "~\\out", "a~/b", "~", "~name"]
+    monkeypatch.setattr(system.os.path, "expanduser", lambda word: "C:\\Users\\me" + word[1:])
+    monkeypatch.setattr(system.sys, "platform", "linux")
+    assert expand_home(words) == words
+    monkeypatch.setattr(system.sys, "platform", "win32")
+    here = "C:\\Users\\me"
+    assert expand_home(words) == ["denoise", f"{here}/shot.####.exr", f"{here}\\out", "a~/b", here, "~name"]

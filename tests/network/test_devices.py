@@ -31,13 +31,19 @@ def test_a_processor_is_always_there():
         ({"cuda": True}, "cuda", "cuda"),
         ({"cuda": True, "hip": "6.2"}, "hip", "cuda"),
         ({"xpu": True}, "sycl", "xpu"),
-        ({"mps": True}, "metal", "mps"),
         ({"cuda": True, "xpu": True}, "cuda", "cuda"),
     ],
 )
 def test_auto_takes_the_first_that_is_there_by_its_name(monkeypatch, there, name, kind):
     only(monkeypatch, **there)
     assert find_device("auto") == find_device(name) == (name, torch.device(kind))
+
+
+def test_metal_is_taken_by_its_name_alone(monkeypatch):
+    """Nobody has run it; "auto" would take it on every Mac."""
+    only(monkeypatch, mps=True)
+    assert find_device("auto") == ("cpu", torch.device("cpu"))
+    assert find_device("metal") == ("metal", torch.device("mps"))
 
 
 def test_one_that_is_not_there_is_named_with_those_that_are(monkeypatch):

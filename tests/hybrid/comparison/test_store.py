@@ -40,3 +40,14 @@ def test_a_reference_is_in_halves_where_it_came_so(tmp_path: Path) -> None:
         store.save(REFERENCE, 1, np.full((2, 2, 3), value, np.float32), half)
     a, b = store.load_reference(1)
     assert (a.max(), b.min()) == (0, 1)
+
+
+def test_folders_differ_where_case_and_spaces_at_the_end_do_not_count(tmp_path: Path) -> None:
+    """On Windows and macOS the frames of one method replaced those of another."""
+    store = FrameStore(tmp_path)
+    for name in ("a", "A", "a ", "con", "é", "É"):
+        store.save(name, 1, np.ones((1, 1, 3), np.float32))
+    names = [path.name for path in tmp_path.iterdir()]
+    assert len({name.casefold().rstrip(" .") for name in names}) == 6
+    assert "con" not in names
+    assert all(name.isascii() for name in names)

@@ -1,5 +1,7 @@
 """Sequence names as people paste them."""
 
+from pathlib import Path
+
 import pytest
 
 from hybrid.files.frames import Shot
@@ -212,3 +214,17 @@ def test_millions_of_missing_frames_are_not_counted_one_by_one(tmp_path):
     assert name_holes([1, 3, 9, 11], 2) == "5-7x2"
     with pytest.raises(ValueError, match="is not a range"):
         parse_frames("1-100000000000")
+
+
+@pytest.mark.parametrize(("there", "asked"), [("Ünï.{}.exr", "ÜNÏ.####.exr"), ("u\u0308.{}.exr", "\u00fc.####.EXR")])
+def test_names_that_the_file_system_takes_for_the_same_are_one_sequence(tmp_path, monkeypatch, there, asked):
+    """Windows and macOS ignore case, macOS how accents are composed; a listing of a folder has other names then."""
+    for number in (8, 9):
+        (tmp_path / there.format(f"{number:04d}")).touch()
+    if not (tmp_path / asked.replace("####", "0008")).exists():
+        with pytest.raises(FileNotFoundError, match="no frame matches"):
+            find_files(str(tmp_path / asked))
+        monkeypatch.setattr(Path, "exists", lambda path: True)
+    files, _ = find_files(str(tmp_path / asked))
+    assert list(files) == [8, 9]
+    assert files[9].name == asked.replace("####", "0009")
