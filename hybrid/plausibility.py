@@ -19,7 +19,9 @@ from flow.convention import SCALES, Choice, FramePair, Patches, Trial, choose_co
 from flow.guide import median_luminance, tone_map
 from hybrid.files.frames import Frame, Shot
 from hybrid.files.layers import Layers
+from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES
+from hybrid.passes import judge_passes, thin_passes
 
 Array = NDArray[np.float32]
 
@@ -61,7 +63,7 @@ class Finding:
     Attributes
     ----------
     role : str
-        What the layer is to a denoiser.
+        What the layer is to a denoiser; "aov" for the further layers.
     message : str
         One line.
     warning : bool
@@ -88,11 +90,14 @@ class Judgement:
         The readings of the vectors that were tried; None where there are no vectors, or no pair of frames.
     variance_scale : float or None
         What the variance is multiplied by, where that was measured.
+    passes : Passes
+        What the further layers are to the picture.
     """
 
     findings: tuple[Finding, ...] = ()
     motion: Choice | None = None
     variance_scale: float | None = None
+    passes: Passes = NO_PASSES
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -125,7 +130,7 @@ class Judgement:
         """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""
         left_out = {finding.role for finding in self.findings if finding.left_out}
         convention = None if self.motion is None else self.motion.convention
-        return shot.judged(left_out, convention, self.variance_scale)
+        return shot.judged(left_out, convention, self.variance_scale, self.passes)
 
 
 def judge_layers(shot: Shot) -> Judgement:
@@ -214,7 +219,7 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
     evidence = _Evidence(layers)
     if not pairs:
         evidence.add(shot.read(shot.available[0]))
-        return _judge(evidence, layers, [], lambda roles: [])
+        return evidence.judge_passes(_judge(evidence, layers, [], lambda roles: []))
     light: list[Patches] = []
     surfaces: list[Patches] = []
 
@@ -230,7 +235,7 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
         judgement = _judge(evidence, layers, light, partial(look_at_surfaces, earlier, later))
         if not judgement.warnings and (judgement.motion is None or judgement.motion.certain):
             break  # nothing is left to ask
-    return judgement
+    return evidence.judge_passes(judgement)
 
 
 def _pair_of(earlier: Frame, later: Frame, here: Array, there: Array, step: int) -> FramePair | None:
@@ -285,11 +290,14 @@ class _Evidence:
         self.wrong: dict[str, list[str | None]] = {}
         self.edges: dict[str, list[tuple[float, float, float]]] = {}
         self.variances: list[Array] = []
+        self.passes: list[Frame] = []
 
     def add(self, *frames: Frame) -> None:
         """Look at one frame, or at two neighbours."""
         for frame in frames:
             thin = _thin(frame)
+            if frame.aovs:
+                self.passes.append(thin_passes(frame))
             for role, judge in _JUDGES.items():
                 if getattr(frame, role) is not None:
                     self.wrong.setdefault(role, []).append(judge(thin))
@@ -327,6 +335,14 @@ class _Evidence:
             words = f"{self._name('variance')} {said}: taken as that of {samples:g} samples"
             return 1 / samples, [Finding("variance", words, left_out=False)]
         return None, [self._leave("variance", said)]
+
+    def judge_passes(self, judgement: Judgement) -> Judgement:
+        """The same with what the further layers are to the picture, and a line for each."""
+        if not self.passes:
+            return judgement
+        passes, words = judge_passes(self.passes)
+        lines = (Finding("aov", f"aov {name}: {said}", warning=False, left_out=False) for name, said in words.items())
+        return replace(judgement, findings=(*judgement.findings, *lines), passes=passes)
 
     def _leave(self, role: str, words: str) -> Finding:
         return Finding(role, f"{self._name(role)} {words}: left out")

@@ -1,9 +1,10 @@
-"""Layers that are parts of a picture, denoised so that they still add up to it."""
+"""Layers that are parts of a picture: found by adding up the noisy pixels, and denoised so that they still add up."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,23 +16,28 @@ Floats = NDArray[np.float32]
 _RADIUS, _EPS = 4, 1e-2
 # Added to what is divided by, of the exposure: where nothing is lit, all parts have the same share of nothing.
 _EPSILON = np.float32(1e-6)
-# How far a part may exceed the whole, of both, before it is none: half floats and interpolation are within that. Of its
-# pixels a hundredth may, as fireflies are taken out of the whole alone.
-_ABOVE, _MOST = 1e-2, 0.01
-# What changes less between frames, of its mean, is not light that was sampled: a mask, a matte.
-_NOISE = 0.01
+# A sum may differ from the whole by this share of both and of the exposure: half floats round by 5e-4 for each part
+# and its color. Of the values a twentieth may differ by more: saturated halves, and pixels that are not finite.
+_NEAR, _MOST = 5e-3, 0.05
+# Subsets that are looked at, and values of a frame that each is compared on.
+_SUBSETS, _VALUES = 20_000, 1_500
+# A layer has noise where the median of its second differences, in patches of 9×9 pixels, exceeds this share of its
+# mean; so it does in this share of its patches. Edges of masks fill no patch.
+_NOISE, _PATCHES = 0.01, 0.02
+# Albedo below which there is no color to speak of.
+_DARK = 0.01
+# How often what was bounded is shared out again to the other parts.
+_ROUNDS = 3
 
 
-def is_part(layer: Floats, mean: Floats, whole: Floats, exposure: float) -> bool:
-    """Tell whether a layer is light that the whole is the sum of, with others perhaps.
+def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
+    """Tell whether layers add up to a picture, pixel by pixel.
 
     Parameters
     ----------
-    layer : (H, W, C) float32
-        As rendered.
-    mean : (H, W, C) float32
-        Over the frames of a window.
-    whole : (H, W, 3) float32
+    parts : sequence of (..., C) float32
+        Layers as rendered, each multiplied by its color where it is written without.
+    whole : (..., C) float32
         The picture as rendered.
     exposure : float
         Radiance of middle brightness.
@@ -39,69 +45,233 @@ def is_part(layer: Floats, mean: Floats, whole: Floats, exposure: float) -> bool
     Returns
     -------
     bool
-        Whether it has three channels, is nowhere negative, nowhere more than the whole, and noisy.
+        Whether 95 % of all values are within 0.5 % of each other.
     """
-    if layer.shape != whole.shape:
-        return False
-    slack = np.float32(_ABOVE) * (np.abs(whole) + np.float32(exposure))
-    beyond = (layer > whole + slack) | (layer < -slack)
-    noise, level = np.abs(layer - mean).mean(dtype=np.float64), np.abs(mean).mean(dtype=np.float64)
-    return bool(beyond.mean() < _MOST and noise > _NOISE * level)
+    total = np.zeros_like(whole)
+    for part in parts:
+        total += part
+    with np.errstate(invalid="ignore"):  # infinities of saturated halves
+        near = np.abs(total - whole) <= np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
+    return may_differ(float(1 - near.mean()))
 
 
-def adds_up(parts: Sequence[Floats], whole: Floats, factors: Sequence[Floats | None]) -> bool:
-    """Tell whether layers as rendered are all of the whole's light.
+def may_differ(share: float) -> bool:
+    """Tell whether so few values differ, as a share in [0, 1], that a sum is still one: saturated halves, fireflies."""
+    return share <= _MOST
+
+
+def above(part: Floats, whole: Floats, exposure: float) -> float:
+    """Give the share of values in which a layer is negative or above the picture.
 
     Parameters
     ----------
-    parts : sequence of (H, W, 3) float32
-        Layers of light.
-    whole : (H, W, 3) float32
-        The picture; fireflies may have been taken out of it.
-    factors : sequence of (H, W, 3) float32 or None
-        What each part is multiplied by before they are added; None: 1.
+    part, whole : (..., C) float32
+        As rendered.
+    exposure : float
+        Radiance of middle brightness.
+
+    Returns
+    -------
+    float
+        In [0, 1].
+    """
+    slack = np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
+    return float(1 - ((part <= whole + slack) & (part >= -slack)).mean())
+
+
+def in_noise(part: Floats, whole: Floats) -> bool:
+    """Tell whether a layer's noise is in a picture: its second differences are found in the picture's as they are.
+
+    Parameters
+    ----------
+    part, whole : (H, W, 3) float32
+        As rendered, finite.
 
     Returns
     -------
     bool
-        Whether a hundredth of the light at most is in none of them.
+        Whether the slope of the regression is a half or more: it is 1 for a part, and 0 for other light.
     """
-    return _found(_rest(parts, whole, factors), whole)
+    of_part, of_whole = (_second_differences(layer).astype(np.float64) for layer in (part, whole))
+    # Of the median's order alone: one bright sample has no vote of its own.
+    most = 10 * np.median(np.abs(of_part)) or np.inf
+    of_part, of_whole = (np.clip(found, -most, most) for found in (of_part, of_whole))
+    power = float(np.mean(of_part**2))
+    return power > 0 and float(np.mean(of_part * of_whole)) >= 0.5 * power
+
+
+def is_noisy(layer: Floats) -> bool:
+    """Tell whether a layer has noise anywhere: textures count as noise, edges do not.
+
+    Parameters
+    ----------
+    layer : (H, W, C) float32
+        As rendered, finite.
+    """
+    level = float(np.abs(layer).mean(dtype=np.float64))
+    response = np.abs(_second_differences(layer)).max(axis=-1)
+    height, width = response.shape
+    rows, columns = max(height // 9, 1), max(width // 9, 1)
+    patches = [
+        np.median(block)
+        for band in np.array_split(response, rows, axis=0)
+        for block in np.array_split(band, columns, axis=1)
+    ]
+    return level > 0 and float(np.mean(np.asarray(patches) > _NOISE * level)) > _PATCHES
+
+
+def is_textured(layer: Floats, albedo: Floats) -> bool:
+    """Tell whether a layer was multiplied by the surfaces' color: its detail is that of the color.
+
+    Parameters
+    ----------
+    layer : (H, W, C) float32
+        As rendered, finite.
+    albedo : (H, W, 3) float32
+        In [0, 1].
+
+    Returns
+    -------
+    bool
+        Whether the slope of layer/mean(layer) on albedo/mean(albedo), means of 9×9 pixels, is a half or more: it is 1
+        for albedo times light, and 0 for light alone.
+    """
+    color = albedo if layer.shape[-1] == albedo.shape[-1] else albedo.mean(axis=-1, keepdims=True)
+    light, level = np.abs(_blur(layer)), _blur(color)
+    lit = (light > 0) & (level > _DARK)
+    # No further than once the mean: a firefly is no texture.
+    of_layer, of_color = (
+        np.clip((image[lit] - mean[lit]) / mean[lit], -1, 1).astype(np.float64)
+        for image, mean in ((layer, light), (color, level))
+    )
+    power = float((of_color**2).sum())
+    return power > 0 and float((of_layer * of_color).sum()) >= 0.5 * power
+
+
+def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[tuple[int, ...]]:
+    """Find layers that add up to a picture; sets of them that share none, those of the fewest layers first.
+
+    Parameters
+    ----------
+    layers : sequence of (..., C) float32
+        As for `sums_to`; negative light is allowed.
+    whole : (..., C) float32
+        The picture.
+    exposure : float
+        Radiance of middle brightness.
+
+    Returns
+    -------
+    list of tuple of int
+        Indices of layers.
+
+    Notes
+    -----
+    A depth-first search. Of a set that is begun, all sums lie between that with all negative and that with all positive
+    values of the layers not yet decided: where the whole is outside of this in too many values, nothing can follow.
+    A layer of less light than the bound allows to be missing is taken in where that brings the sum nearer.
+    """
+    flat = np.asarray(whole, np.float32).ravel()
+    step = max(1, flat.size // _VALUES)
+    target = flat[::step]
+    values = [np.asarray(layer, np.float32).ravel()[::step] for layer in layers]
+    lit = sorted((k for k, v in enumerate(values) if v.any()), key=lambda k: -float(np.abs(values[k]).sum()))
+    found = _search([values[k] for k in lit], target, np.float32(_NEAR) * (np.abs(target) + np.float32(exposure)))
+    sets: list[tuple[int, ...]] = []
+    taken: set[int] = set()
+    for subset in sorted((tuple(lit[i] for i in chosen) for chosen in found), key=lambda s: (len(s), s)):
+        if taken & {*subset} or not sums_to([layers[k] for k in subset], whole, exposure):
+            continue
+        total = np.sum([values[k] for k in subset], axis=0, dtype=np.float32)
+        for k in lit:
+            nearer = np.abs(target - total - values[k]).mean() < 0.7 * np.abs(target - total).mean()
+            if k not in taken and k not in subset and nearer:
+                subset, total = (*subset, k), total + values[k]
+        sets.append(tuple(sorted(subset)))
+        taken |= {*subset}
+    return sets
+
+
+def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tuple[int, ...]]:
+    """All sets of vectors that add up to a target, of the first `_SUBSETS` that are begun; the brightest first."""
+    if not values:
+        return []
+    nothing = np.zeros_like(target)
+    lowest, highest = [nothing], [nothing]
+    for layer in reversed(values):
+        lowest.insert(0, lowest[0] + np.minimum(layer, 0))
+        highest.insert(0, highest[0] + np.maximum(layer, 0))
+    found: list[tuple[int, ...]] = []
+    begun: list[tuple[int, tuple[int, ...], Floats]] = [(0, (), np.zeros_like(target))]
+    for _ in range(_SUBSETS):
+        if not begun:
+            break
+        k, chosen, total = begun.pop()
+        with np.errstate(invalid="ignore"):
+            possible = (total + lowest[k] <= target + slack) & (total + highest[k] >= target - slack)
+        if not may_differ(1 - possible.mean()):
+            continue
+        if chosen and np.mean(np.abs(total - target) <= slack) >= 1 - _MOST:
+            found.append(chosen)
+            continue  # more of them add next to nothing
+        if k < len(values):
+            begun += [(k + 1, chosen, total), (k + 1, (*chosen, k), total + values[k])]
+    return found
+
+
+def filter_layers(
+    layers: Sequence[Floats], guide: Floats, *, moments: NDArray[np.float64] | None = None
+) -> list[Floats]:
+    """Denoise layers each by its own light, steered by what is known of the picture's edges.
+
+    Parameters
+    ----------
+    layers : sequence of (H, W, C) float32
+        Averaged over time.
+    guide : (H, W, G) float32
+        What steers the filter: the denoised light and more.
+    moments : (2, G) float64, optional
+        As for `nlm.guided.guided_filter`.
+
+    Returns
+    -------
+    list of (H, W, C) float32
+        Each within its own range; none of its mean is lost.
+    """
+    if not layers:
+        return []
+    steered = guided_filter(np.concatenate(layers, axis=-1), guide, radius=_RADIUS, eps=_EPS, moments=moments)
+    edges = np.cumsum([layer.shape[-1] for layer in layers])[:-1]
+    return [np.ascontiguousarray(layer) for layer in np.split(steered, edges, axis=-1)]
 
 
 def split_light(
-    parts: Sequence[Floats],
-    whole: Floats | None,
+    filtered: Sequence[Floats],
     denoised: Floats,
-    guide: Floats | None,
     *,
     exposure: float,
-    moments: NDArray[np.float64] | None = None,
     factors: Sequence[Floats | None] | None = None,
+    bounds: Sequence[Floats | None] | None = None,
 ) -> list[Floats]:
     """Share a denoised picture out to the parts that it is the sum of.
 
     Parameters
     ----------
-    parts : sequence of (H, W, 3) float32
-        Layers of light, averaged over time as `whole` is, at least 0 but for interpolation.
-    whole : (H, W, 3) float32 or None
-        The picture, averaged over time; None where it is known to have no other light (`adds_up`).
+    filtered : sequence of (H, W, 3) float32
+        The parts, from `filter_layers`; negative light is allowed.
     denoised : (H, W, 3) float32
         The picture, denoised.
-    guide : (H, W, G) float32, optional
-        What steers the filter of the parts, of the denoised light and more; without, the denoised picture.
     exposure : float
         Radiance of middle brightness.
-    moments : (2, G) float64, optional
-        As for `nlm.guided.guided_filter`.
     factors : sequence of (H, W, 3) float32 or None, optional
         What each part is multiplied by before they are added, at least 0; None: 1.
+    bounds : sequence of (H, W, 3) float32 or None, optional
+        A layer within whose range, over 17×17 pixels, a part stays; None: without bounds.
 
     Returns
     -------
     list of (H, W, 3) float32
-        The parts, denoised. If they add up to `whole` they add up to `denoised`.
+        The parts, denoised; they add up to `denoised` where the bounds leave it possible.
 
     Raises
     ------
@@ -110,108 +280,69 @@ def split_light(
 
     Notes
     -----
-    With F a guided filter, c the factors and R = max(whole − Σ c L, 0), what no part accounts for,
+    With F the filtered parts, c the factors, g = denoised − Σ c F what they lack:
 
-        o_k = denoised · (F(L_k) + ε) / Σ_j c_j (F(L_j) + ε) ,
+        o_k = F_k + g · (|F_k| + ε) / Σ_j c_j (|F_j| + ε) ,
 
-    the sum over all parts and R, if there is more of it than of what rounding leaves. A share of light is smoother than
-    light, and what the denoiser knows of the picture's detail is in `denoised`.
+    which is denoised · F_k / Σ c F for light that is not negative. A share of light is smoother than light, and what
+    the denoiser knows of the picture's detail is in `denoised`. What a bound cuts off is shared out to the others.
     """
-    if not parts:
+    if not filtered:
         return []
-    steered, total = _filter_parts(
-        parts, whole, denoised, guide, factors, moments, least=_EPSILON * np.float32(exposure)
-    )
-    # Where every factor is 0 no part can hold any light.
-    ratio = np.divide(denoised, total, out=np.zeros_like(total), where=total > 0)
-    return [np.asarray(ratio * part, np.float32) for part in steered]
+    for part in filtered:
+        if part.shape != denoised.shape:
+            raise ValueError(f"parts: expected shape {denoised.shape} like the picture's, got {part.shape}")
+    cs = [np.float32(1) if factor is None else factor for factor in factors or [None] * len(filtered)]
+    limits = [None if layer is None else _range(layer) for layer in bounds or [None] * len(filtered)]
+    weights = [np.abs(part) + _EPSILON * np.float32(exposure) for part in filtered]
+    parts = list(filtered)
+    for _ in range(1 if all(limit is None for limit in limits) else _ROUNDS):
+        gap = denoised - add_light(parts, cs)
+        total = add_light(weights, cs)
+        # Where every factor is 0 no part can hold any light.
+        share = np.divide(gap, total, out=np.zeros_like(gap), where=total > 0)
+        for k, limit in enumerate(limits):
+            part = parts[k] + share * weights[k]
+            if limit is not None:
+                bounded = np.clip(part, *limit)
+                weights[k] = np.where(bounded == part, weights[k], np.float32(0))
+                part = bounded
+            parts[k] = np.asarray(part, np.float32)
+    return parts
 
 
-def add_light(
-    parts: Sequence[Floats],
-    whole: Floats | None,
-    denoised: Floats,
-    guide: Floats | None,
-    *,
-    moments: NDArray[np.float64] | None = None,
-    factors: Sequence[Floats | None] | None = None,
-) -> tuple[list[Floats], Floats]:
-    """Denoise the parts of a picture each by itself, and add them up.
+def add_light(parts: Sequence[Floats], factors: Sequence[Floats | np.float32 | None]) -> Floats:
+    """Add parts up, each multiplied by its factor.
 
     Parameters
     ----------
-    parts : sequence of (H, W, 3) float32
-        As for `split_light`.
-    whole : (H, W, 3) float32 or None
-        The same.
-    denoised : (H, W, 3) float32
-        The picture, denoised; no more is taken of it than what steers the filter.
-    guide : (H, W, G) float32, optional
-        As for `split_light`.
-    moments : (2, G) float64, optional
-        The same.
-    factors : sequence of (H, W, 3) float32 or None, optional
-        The same.
+    parts : sequence of (H, W, C) float32
+        At least one.
+    factors : sequence of (H, W, C) float32 or None
+        As many; None: 1.
 
     Returns
     -------
-    parts : list of (H, W, 3) float32
-        F(L_k).
-    picture : (H, W, 3) float32
-        Σ c F(L), and F(R) if there is such.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ.
+    (H, W, C) float32
     """
-    if not parts:
-        return [], denoised
-    return _filter_parts(parts, whole, denoised, guide, factors, moments, least=np.float32(0))
+    total = np.zeros_like(parts[0])
+    for part, factor in zip(parts, factors, strict=True):
+        total += part if factor is None else factor * part
+    return total
 
 
-def _filter_parts(
-    parts: Sequence[Floats],
-    whole: Floats | None,
-    denoised: Floats,
-    guide: Floats | None,
-    factors: Sequence[Floats | None] | None,
-    moments: NDArray[np.float64] | None,
-    *,
-    least: np.float32,
-) -> tuple[list[Floats], Floats]:
-    """The parts filtered, `least` or more, and their sum with what is in none of them."""
-    for layer in (*parts, *([] if whole is None else [whole])):
-        if layer.shape != denoised.shape:
-            raise ValueError(f"parts: expected shape {denoised.shape} like the picture's, got {layer.shape}")
-    factors = factors or [None] * len(parts)
-    others = []
-    if whole is not None and not _found(rest := _rest(parts, whole, factors), whole):
-        others.append(rest)
-    layers = np.concatenate([np.maximum(layer, 0) for layer in (*parts, *others)], axis=-1)
-    steered = guided_filter(
-        layers,
-        denoised if guide is None else guide,
-        radius=_RADIUS,
-        eps=_EPS,
-        moments=None if guide is None else moments,
-    )
-    steered = np.maximum(steered, 0) + least
-    filtered = [np.ascontiguousarray(steered[..., 3 * k : 3 * k + 3]) for k in range(len(parts) + len(others))]
-    total = np.zeros_like(denoised)
-    for layer, factor in zip(filtered, [*factors, *(None for _ in others)], strict=True):
-        total += layer if factor is None else factor * layer
-    return filtered[: len(parts)], total
+def _range(layer: Floats) -> tuple[Floats, Floats]:
+    """Least and greatest of what the filter has seen around each pixel."""
+    box = np.ones((4 * _RADIUS + 1, 4 * _RADIUS + 1), np.uint8)
+    return np.asarray(cv2.erode(layer, box), np.float32), np.asarray(cv2.dilate(layer, box), np.float32)
 
 
-def _rest(parts: Sequence[Floats], whole: Floats, factors: Sequence[Floats | None]) -> Floats:
-    """The light that is in no part."""
-    rest = whole.copy()
-    for layer, factor in zip(parts, factors, strict=True):
-        rest -= layer if factor is None else factor * layer
-    return np.maximum(rest, 0)
+def _blur(layer: Floats) -> Floats:
+    return np.asarray(cv2.blur(layer, (9, 9)), np.float32).reshape(layer.shape)
 
 
-def _found(rest: Floats, whole: Floats) -> bool:
-    """Whether what is left is no more than fireflies that are in the parts alone, and the rounding of halves."""
-    return bool(rest.mean() <= _ABOVE * np.abs(whole).mean())
+def _second_differences(layer: Floats) -> Floats:
+    """[1 −2 1]ᵀ [1 −2 1] / 6, which has the variance of white noise (Immerkær 1996), without the outermost pixels."""
+    kernel = np.array([1, -2, 1], np.float32)
+    found = np.asarray(cv2.sepFilter2D(layer, -1, kernel, kernel) / 6, np.float32).reshape(layer.shape)
+    return found[1:-1, 1:-1] if min(layer.shape[:2]) > 2 else found

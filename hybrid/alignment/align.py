@@ -280,7 +280,7 @@ class Aligner:
                     whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
                     whole[outer][inner] = weight[aligned.centre + 1][inner]
         tints = {name: tint[outer] for name, tint in centre.tints.items()}
-        return replace(aligned, tints=tints, sides=sides)
+        return replace(aligned, tints=tints, passes=centre.passes, sides=sides)
 
     def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
         """The rows of a frame that these depend on, and where these are among them; all without."""

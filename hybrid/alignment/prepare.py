@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame
+from hybrid.files.passes import NO_PASSES, Passes
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Lights, add_lights
 from nlm.guided import guided_filter, measure_guide
@@ -63,9 +64,11 @@ class PreparedFrame:
     alpha : (H, W, 1) array or None
         Coverage, finite.
     aovs : dict of str to (H, W, C) array
-        Further layers to be warped along, demodulated like the color, but for those that are light without its color.
+        Further layers to be warped along, demodulated like the color where they are textured.
     tints : dict of str to (H, W, 3) array
         Of those the color, finite and at least 0.
+    passes : Passes
+        What `aovs` are to the picture, in this frame.
     demodulated : bool
         Whether the albedo has been divided out.
     fireflies : int
@@ -92,6 +95,7 @@ class PreparedFrame:
     aovs: dict[str, Array]
     demodulated: bool
     tints: dict[str, Array] = field(default_factory=dict)
+    passes: Passes = NO_PASSES
     fireflies: int = 0
     burnt: float = 0.0
     taken: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
@@ -196,11 +200,16 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     for name, layer in frame.aovs.items():
         aovs[name], bad_here = replace_nonfinite(layer)
         repaired = repaired | bad_here
+    tints = {name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.tints.items()}
+    passes = frame.passes
+    if passes.sums:
+        lights = {name: layer * tints[name] if name in tints else layer for name, layer in aovs.items()}
+        passes = passes.in_frame(color, lights, measure_exposure(color))
     demodulated = albedo is not None and demodulated
     if albedo is not None and demodulated:
         color = demodulate(color, albedo)
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
-        aovs = {name: layer if name in frame.tints else demodulate(layer, albedo) for name, layer in aovs.items()}
+        aovs = {name: demodulate(layer, albedo) if name in passes.textured else layer for name, layer in aovs.items()}
     motion = frame.flows()
     one_way = motion is not None and (motion.to_previous is None or motion.to_next is None)
     return PreparedFrame(
@@ -216,7 +225,8 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
-        tints={name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.tints.items()},
+        tints=tints,
+        passes=passes,
     )
 
 

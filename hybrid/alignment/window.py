@@ -13,6 +13,7 @@ from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import demodulate
+from hybrid.files.passes import NO_PASSES, Passes
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
@@ -56,7 +57,7 @@ class AlignedWindow:
     beyond : callable or None
         What gives `residual`.
     aovs : dict of str to (T, H, W, C) array
-        Further layers, warped and demodulated like the color, but for those with `tints`.
+        Further layers, warped and demodulated like the color where they are textured.
     repaired : int
         Pixels of the centre frame that were not finite.
     fireflies : int
@@ -79,6 +80,8 @@ class AlignedWindow:
         The centre's color of those of `aovs` that are light without it.
     sides : SampleMean or None
         The samples of the frames beside the centre, averaged at its pixels, radiance; with the stage "samples".
+    passes : Passes
+        What `aovs` are to the picture.
     """
 
     number: int
@@ -106,6 +109,7 @@ class AlignedWindow:
     shares: dict[str, float] = field(default_factory=dict)
     tints: dict[str, Array] = field(default_factory=dict)
     sides: SampleMean | None = None
+    passes: Passes = NO_PASSES
 
     @cached_property
     def color(self) -> Array:

@@ -287,6 +287,8 @@ def denoise(
     with _on_record(context, shot, opened, output):
         _expect_memory(opened, max_memory)
         (opened, *others), judgement = _judge(opened, strict=strict)
+        if give_way == "beauty":
+            _expect_sum((opened, *others))
     timings = Timings()
     if (preset == "auto") != (budget is not None) or (weights is not None and budget is not None):
         raise typer.BadParameter("--budget chooses the preset, expected it with --preset auto, and without --weights")
@@ -433,6 +435,19 @@ def _judge(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:
         for picture in pictures:
             say_cuts(plan_shot(picture), judgement.findings, strict=True)
     return pictures, judgement
+
+
+def _expect_sum(pictures: Sequence[Shot]) -> None:
+    """Refuse to make a beauty of layers that do not add up to it."""
+    from hybrid.files.passes import BEAUTY
+
+    for picture in pictures:
+        passes = picture.passes
+        if picture.aovs and not any(found.whole == BEAUTY and found.complete for found in passes.sums):
+            raise ValueError(
+                f"{picture.path(picture.numbers[0])}: --give-way beauty: no layers add up to the beauty, all of them "
+                f"together have {passes.light:.2f} times its light, expected layers of which it is the sum"
+            )
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_colors, find_layers, samples_of, summarize_layers
+from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern, pattern_of
@@ -53,6 +54,8 @@ class Frame:
         By name, those that were asked for.
     tints : mapping of str to (H, W, 3) array of float32
         What those of them are multiplied by that are light without its color.
+    passes : Passes
+        What is known of `aovs`.
     source : Path, optional
         The file, if there is one.
     """
@@ -70,6 +73,7 @@ class Frame:
     estimate: np.ndarray | None = None
     aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
     tints: Mapping[str, np.ndarray] = field(default_factory=dict)
+    passes: Passes = NO_PASSES
     source: Path | None = None
 
     def __post_init__(self) -> None:
@@ -219,6 +223,7 @@ class Shot:
         self._convention: MotionConvention | None = None
         self._variance_scale: float | None = None
         self._aovs = tuple(aovs)
+        self.passes = NO_PASSES
         self._keep = keep
         self._max_pixels = max_pixels
         self._held: OrderedDict[int, Frame] = OrderedDict()
@@ -296,10 +301,14 @@ class Shot:
         made.missing, made.picture = self.missing, self.picture
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
-        return made.judged(self._left_out, self._convention, self._variance_scale)
+        return made.judged(self._left_out, self._convention, self._variance_scale, self.passes)
 
     def judged(
-        self, left_out: Collection[str], convention: MotionConvention | None, variance_scale: float | None
+        self,
+        left_out: Collection[str],
+        convention: MotionConvention | None,
+        variance_scale: float | None,
+        passes: Passes | None = None,
     ) -> Shot:
         """The same shot, read otherwise than its files and their profile say (`hybrid.plausibility`).
 
@@ -311,12 +320,15 @@ class Shot:
             What the motion vectors mean; None: as the profile says.
         variance_scale : float, optional
             What the variance is multiplied by; None: as the profile says.
+        passes : Passes, optional
+            What the further layers are to the picture; None: nothing is known of them.
         """
         other = copy(self)
         other._held = OrderedDict()
         other.__dict__.pop("_first_layers", None)
         other._left_out = self._left_out | set(left_out)
         other._convention, other._variance_scale = convention, variance_scale
+        other.passes = NO_PASSES if passes is None else passes
         return other
 
     def path(self, number: int) -> Path:
@@ -386,7 +398,8 @@ class Shot:
     def taken(self, number: int) -> str:
         """What is taken for what of a frame, and how it is read, in words: where these differ, so does the picture."""
         layers = self.layers(number)
-        return f"{summarize_layers(layers)}; motion {layers.motion_convention}; variance {layers.variance_scale}"
+        said = f"{summarize_layers(layers)}; motion {layers.motion_convention}; variance {layers.variance_scale}"
+        return f"{said}; {self.passes}" if layers.aovs else said
 
     @cached_property
     def profile(self) -> Profile:
@@ -419,7 +432,7 @@ class Shot:
         return kind
 
     def _as_judged(self, layers: Layers) -> Layers:
-        found = layers.without(self._left_out)
+        found = layers.without(self._left_out).without_aovs(self.passes.kept)
         if found.motion is not None and self._convention is not None:
             found = replace(found, motion_convention=self._convention)
         return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)
@@ -490,7 +503,9 @@ class Shot:
             self._held.move_to_end(number)
             return self._held[number]
         image, layers = self._open(number)
-        frame = _frame(image, layers, self._canvas, number, self._open_apart(number, layers))
+        frame = replace(
+            _frame(image, layers, self._canvas, number, self._open_apart(number, layers)), passes=self.passes
+        )
         self.check_unchanged([number])
         self._held[number] = frame
         while len(self._held) > self._keep:
@@ -866,7 +881,7 @@ def _frame(
         taken["variance"] = variance_from_halves(halves[0], halves[1])
     return Frame(
         number=number,
-        **taken,
+        **taken,  # type: ignore[arg-type]
         motion_convention=convention,
         resolution=_size(image.parts[layers.color.part])[::-1],
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},

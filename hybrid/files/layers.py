@@ -28,13 +28,20 @@ _NO_GUIDE = re.compile("variance|mse|error|deviation|crypto")
 ALL = "all"
 # One lobe's direct or indirect light, as Cycles and others name it; and names of parts that are there as a whole.
 _LOBES = (
-    "diff(?:use)?|gloss(?:y)?|trans(?:mission)?|volume|subsurface|sss|spec(?:ular)?|coat|sheen|reflection|refraction"
+    "diff(?:use)?|gloss(?:y)?|trans(?:mission)?|volume|subsurface|sss|spec(?:ular)?|coat|sheen|reflect(?:ion)?s?|"
+    "refract(?:ion)?s?|caustics"
 )
 _COMPONENT = "dir|direct|ind|indirect"
 _LOBE = re.compile(f"(?P<lobe>{_LOBES})(?:{_COMPONENT})|(?:direct|indirect)(?P<other>{_LOBES})")
-_PASS = re.compile(f"{_LOBE.pattern}|{_LOBES}|direct|indirect|emit|emission|env|environment|background")
-# Blender's Combined_key, Arnold's RGBA_key.
-_LIGHT_GROUP = re.compile("(?:combined|rgba|lightgroup).")
+# After them those of V-Ray (with its prefix), Redshift and RenderMan.
+_PASS = re.compile(
+    f"{_LOBE.pattern}|{_LOBES}|direct|indirect|emit|emission|emissive|env|environment|background|"
+    "(?:vray)?(?:raw)?(?:lighting|totallighting|gi|globalillumination|reflection|refraction|specular|sss2?|caustics|"
+    "selfillumination|atmosphere|background)|(?:diffuse|specular)lighting(?:raw)?|globalillumination(?:raw)?|"
+    "subsurfacescatter|volumelighting|transmissionlighting|emissive"
+)
+# Blender's Combined_key, Arnold's RGBA_key; no picture that a renderer's own denoiser has made.
+_LIGHT_GROUP = re.compile("(?:combined|rgba|(?:vray)?light(?:group|select|mix))(?!denois|noice).")
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,8 @@ class Layers:
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
 
-    `aovs` are the further layers that were asked for, by the names they were asked for by, or all `light_kind` knows.
+    `aovs` are the further layers that were asked for, by the names they were asked for by, or all
+    that have a name for light.
     `tints` are the colors by which those of them are multiplied that a renderer writes without. `notes` say what was
     left alone that a user might think is denoised; one line each.
     """
@@ -94,6 +102,13 @@ class Layers:
         gone |= {"half_a", "half_b"} if "variance" in gone else set()
         kept = None if "motion" in gone else self.motion_convention
         return replace(self, **dict.fromkeys(gone), motion_convention=kept)  # type: ignore[arg-type]
+
+    def without_aovs(self, names: Collection[str]) -> Layers:
+        """The same with some further layers left out."""
+        aovs, tints = (
+            {name: layer for name, layer in found.items() if name not in names} for found in (self.aovs, self.tints)
+        )
+        return replace(self, aovs=aovs, tints=tints)
 
 
 def find_layers(
@@ -177,7 +192,10 @@ def find_layers(
     notes += _find_unused(image, color, {**found, "motion": found["motion"] or found["motion_next"]})
     convention, samples = _convention(found, taken), samples_of(image, taken)
     written = [layer for layer in (found["target"], found["alpha"]) if layer is not None]
-    further = _find_aovs(image, aovs, color, written)
+    guides = [guide for role in ROLES if (guide := found[role]) is not None and not guide.file]
+    further = _find_aovs(image, aovs, color, written, guides)
+    if ALL in aovs and (others := _others(image, color, [*written, *guides, *further.values()])):
+        notes.append(f"aov all: kept as they are, without a name for light (--aov NAME): {', '.join(others)}")
     return Layers(
         **found,  # type: ignore[arg-type]
         profile=taken.name,
@@ -328,33 +346,25 @@ def _find_unused(image: ExrImage, color: Layer, found: Mapping[str, Layer | None
                 yield f"{layer} is not used; if it is the {role}: --layer {role}={layer.name or layer}"
 
 
-def light_kind(name: str) -> str | None:
-    """What a layer is a part of, by its name: light is the sum of its "passes", and that of its "groups" of lamps.
-
-    Parameters
-    ----------
-    name : str
-        Of a layer, with what it belongs to before it.
-
-    Returns
-    -------
-    str or None
-        None: by its name it is no light.
-    """
-    plain = plain_name(name.rpartition(".")[2])
-    if _PASS.fullmatch(plain):
-        return "passes"
-    return "groups" if _LIGHT_GROUP.match(plain) else None
+def _is_light(layer: Layer) -> bool:
+    """Whether a layer has a name for light; its pixels say what it is a part of (`hybrid.passes`)."""
+    plain = plain_name(without_view(layer).rpartition(".")[2])
+    return bool(_PASS.fullmatch(plain) or _LIGHT_GROUP.match(plain))
 
 
 def _find_lights(image: ExrImage, color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
-    """All layers that are known to be light, each part of it once."""
+    """All layers that have a name for light."""
     taken = {channel for layer in written for channel in layer.channels}
-    there = [x for x in _same_group(image, color) if light_kind(without_view(x)) and not taken & {*x.channels}]
-    # Where direct and indirect light of a lobe are apart, their sum beside them is no further part.
-    apart = {lobe for layer in there for lobe in _lobes(image, layer)}
-    fitting = {without_view(x): _fit(image, "color", x, named=True) for x in there if not apart & {*_tails(image, x)}}
+    there = [x for x in _same_group(image, color) if _is_light(x) and not taken & {*x.channels}]
+    fitting = {without_view(x): _fit(image, "color", x, named=True) for x in there}
     return {name: layer for name, layer in fitting.items() if layer is not None}
+
+
+def _others(image: ExrImage, color: Layer, taken: Sequence[Layer]) -> list[str]:
+    """The names of all other layers beside the color that have its three channels."""
+    known = {channel for layer in taken for channel in layer.channels}
+    beside = [layer for layer in _same_group(image, color) if layer.name and not known & {*layer.channels}]
+    return sorted(without_view(layer) for layer in beside if _fit(image, "color", layer, named=False))
 
 
 def _lobes(image: ExrImage, layer: Layer) -> set[str]:
@@ -374,13 +384,15 @@ def _find_tints(image: ExrImage, aovs: Mapping[str, Layer], color: Layer) -> dic
     return tints
 
 
-def _find_aovs(image: ExrImage, names: Collection[str], color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
+def _find_aovs(
+    image: ExrImage, names: Collection[str], color: Layer, written: Sequence[Layer], guides: Sequence[Layer]
+) -> dict[str, Layer]:
     """The layers that are denoised along; each channel of a file is written once."""
     taken: dict[str, str] = {channel: "the color or its alpha" for layer in written for channel in layer.channels}
     # Hashes of names: an average of two is the name of a third thing.
     hashed = [str(v) for p in image.parts for k, v in p.header.items() if re.fullmatch(r"cryptomatte/\w+/name", k)]
     aovs = {}
-    found = _find_lights(image, color, written) if ALL in names else {}
+    found = _find_lights(image, color, [*written, *guides]) if ALL in names else {}
     if ALL in names and not found:
         raise ExrError(f"{image.path}: aov all: no layer has a name for a part of the light; {image.listing()}")
     for name in [*found, *(name for name in names if name != ALL)]:

@@ -18,7 +18,7 @@ from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import compress, measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
-from hybrid.files.layers import light_kind
+from hybrid.files.passes import BEAUTY
 from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
 from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
@@ -30,7 +30,7 @@ from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import MIRRORED, Borders, RobustUNet
 from nlm.average import average
 from nlm.gather import hold_to_window
-from nlm.parts import add_light, adds_up, is_part, split_light
+from nlm.parts import add_light, filter_layers, split_light
 
 Array = NDArray[np.float32]
 
@@ -151,18 +151,15 @@ class Denoiser:
         irradiance, filtered, parts = self._run_tiles(aligned, layers)
         if self.takes_estimate:
             irradiance = hold_to_window(irradiance, layers["estimate"], layers["residual"])
-        light, add_up = irradiance, set[str]()
-        if self.takes_estimate:
-            aovs, light, add_up = _averaged(aligned, irradiance, add=self.add_layers)
-        else:
-            aovs = _apart(filtered, aligned)
+        alone = _averaged(aligned, irradiance) if self.takes_estimate else _apart(filtered, aligned)
+        aovs, color, add_up = _share_out(aligned, alone, irradiance, add=self.add_layers)
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
             extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
             if not self.takes_estimate:
-                add_up = {name for name, layer in extra.items() if layer.ndim == 3}
-        return Denoised(light * aligned.modulation, _modulated(aovs, aligned), extra, frozenset(add_up))
+                add_up |= {name for name, layer in extra.items() if layer.ndim == 3}
+        return Denoised(color, aovs, extra, frozenset(add_up))
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
         """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
@@ -248,66 +245,73 @@ def _apart(filtered: Array, aligned: AlignedWindow) -> dict[str, Array]:
     return dict(zip(aligned.aovs, np.split(filtered, edges, axis=-1), strict=True)) if aligned.aovs else {}
 
 
-def _averaged(aligned: AlignedWindow, irradiance: Array, *, add: bool) -> tuple[dict[str, Array], Array, set[str]]:
-    """The AOVs of a window averaged over time, the light, and which of them are parts of it: they add up if they did.
-
-    Either they give way to the denoised light, or, if that is to `add` them, it to them.
-    """
+def _averaged(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
+    """The AOVs of a window averaged over time, and filtered each by its own light; alpha is averaged alone."""
     means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
-    kinds: dict[str, list[str]] = {}
-    for name in aligned.aovs:
-        if name != ALPHA and (kind := _kind_of(name, means[name], aligned)):
-            kinds.setdefault(kind, []).append(name)
-    if not kinds:
-        return means, irradiance, set()
-    centre = aligned.centre
+    names = [name for name in means if name != ALPHA]
+    if not names:
+        return means
     light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
     moments = aligned.moments[:, : guide.shape[-1]]
-    whole, picture = average(aligned.color, aligned.confidence), irradiance
-    # Light is the sum of its passes, and again that of its groups: the picture gives way to the first kind alone.
-    for number, names in enumerate(kinds.values()):
-        factors = [_factor(name, aligned) for name in names]
-        complete = adds_up([aligned.aovs[name][centre] for name in names], aligned.own, factors)
-        given = [means[name] for name in names], None if complete else whole, picture, guide
-        if add and number == 0:
-            split, picture = add_light(*given, moments=moments, factors=factors)
+    if any(not found.complete for found in aligned.passes.sums):
+        means[BEAUTY] = average(aligned.color, aligned.confidence)
+        names.append(BEAUTY)
+    return means | dict(zip(names, filter_layers([means[n] for n in names], guide, moments=moments), strict=True))
+
+
+def _share_out(
+    aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Array, *, add: bool
+) -> tuple[dict[str, Array], Array, set[str]]:
+    """The AOVs, the picture, and which of them are parts of it: they add up if they did.
+
+    Either they give way to the denoised picture, or, if that is to `add` them, it to them.
+    """
+    sums, exposure = aligned.passes.sums, aligned.exposure
+    seen = filtered.pop(BEAUTY, irradiance) * aligned.modulation
+    factors = {name: _factor(name, aligned) for name in filtered}
+    pictures = {name: add_light([part], [factors[name]]) for name, part in filtered.items()}
+    pictures[BEAUTY] = irradiance * aligned.modulation
+    aovs = dict(filtered)
+    # The picture gives way to one sum alone; other sums of the same light give way to it then.
+    first = next((found for found in sums if found.whole == BEAUTY and found.complete), None) if add else None
+    for found in ([first] if first else []) + [other for other in sums if other is not first]:
+        parts, whole = [filtered[name] for name in found.parts], found.whole
+        by = [factors[name] for name in found.parts]
+        if found is first:
+            pictures[BEAUTY] = add_light(parts, by)
+            split = parts
+        elif found.complete:
+            bounds = [
+                average(aligned.aovs[name], aligned.confidence) if name in aligned.tints else None
+                for name in found.parts
+            ]
+            split = split_light(parts, pictures[whole], exposure=exposure, factors=by, bounds=bounds)
         else:
-            split = split_light(*given, exposure=aligned.exposure, moments=moments, factors=factors)
-        means |= dict(zip(names, split, strict=True))
-    return means, picture, {name for names in kinds.values() for name in names}
-
-
-def _kind_of(name: str, mean: Array, aligned: AlignedWindow) -> str | None:
-    """What of the light a layer is a part of: by its name, or else by what it shows."""
-    layer, color = aligned.aovs[name][aligned.centre], aligned.own
-    if name in aligned.tints:
-        return "passes"
-    if layer.shape == color.shape and (kind := light_kind(name)) is not None:
-        return kind
-    return "passes" if is_part(layer, mean, color, aligned.exposure) else None
+            # Beside what is in no layer.
+            rest = np.maximum(seen - add_light(parts, by), 0)
+            split = split_light([*parts, rest], pictures[whole], exposure=exposure, factors=[*by, None])[:-1]
+        for name, part, factor in zip(found.parts, split, by, strict=True):
+            aovs[name] = part
+            pictures[name] = add_light([part], [factor])
+    among = {name for found in sums for name in found.parts}
+    for name in aovs:
+        if name == ALPHA:
+            own = aligned.aovs[name][aligned.centre]
+            aovs[name] = np.where(_solid(own), own, aovs[name])
+        elif name not in aligned.tints and (factor := factors[name]) is not None:
+            aovs[name] = aovs[name] * factor
+    return aovs, pictures[BEAUTY], among
 
 
 def _factor(name: str, aligned: AlignedWindow) -> Array | None:
-    """What a part is multiplied by to be irradiance, where it is light without its color."""
-    tint = aligned.tints.get(name)
-    return None if tint is None else tint / aligned.modulation
-
-
-def _modulated(found: dict[str, Array], aligned: AlignedWindow) -> dict[str, Array]:
-    """AOVs as they were before they were divided by the albedo."""
-    aovs = {}
-    for name, light in found.items():
-        if name == ALPHA:
-            own = aligned.aovs[name][aligned.centre]
-            aovs[name] = np.where(_solid(own), own, light)
-        elif name in aligned.tints:  # which never were
-            aovs[name] = light
-        elif light.shape[-1] == 3:
-            aovs[name] = light * aligned.modulation
-        else:
-            aovs[name] = light * aligned.modulation.mean(axis=-1, keepdims=True)
-    return aovs
+    """What a filtered AOV is multiplied by to be radiance; None: 1."""
+    if name in aligned.tints:
+        return aligned.tints[name]
+    if name not in aligned.passes.textured:
+        return None
+    modulation = aligned.modulation
+    return modulation if aligned.aovs[name].shape[-1] == 3 else modulation.mean(axis=-1, keepdims=True)
 
 
 def _solid(alpha: Array) -> NDArray[np.bool_]:
