@@ -303,6 +303,7 @@ def split_light(
         share = np.divide(gap, total, out=np.zeros_like(gap), where=total > 0)
         for k, limit in enumerate(limits):
             part = parts[k] + share * weights[k]
+            np.maximum(part, 0, out=part, where=(filtered[k] >= 0) & (denoised >= 0))  # but for rounding it is
             if limit is not None:
                 bounded = np.clip(part, *limit)
                 weights[k] = np.where(bounded == part, weights[k], np.float32(0))

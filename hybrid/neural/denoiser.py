@@ -251,6 +251,9 @@ def _averaged(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     names = [name for name in means if name != ALPHA]
     if not names:
         return means
+    for name in names:
+        if aligned.aovs[name][aligned.centre].min() >= 0:
+            np.maximum(means[name], 0, out=means[name])  # interpolation undershoots
     light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
     moments = aligned.moments[:, : guide.shape[-1]]

@@ -345,12 +345,12 @@ def test_all_is_every_layer_with_a_name_for_a_part_of_the_light(tmp_path):
     }
 
 
-def test_all_takes_each_part_of_the_light_once(tmp_path):
-    """Arnold's diffuse is the sum of diffuse_direct and diffuse_indirect; its alpha stays."""
+def test_all_takes_sums_of_parts_too_but_no_denoised_picture(tmp_path):
+    """Arnold's diffuse is the sum of diffuse_direct and diffuse_indirect; its alpha stays, and so does RGBA_denoise."""
     parts = ["diffuse_direct", "diffuse_indirect", "specular", "emission"]
-    names = [*"RGBA", *(f"{name}.{c}" for name in (*parts, "diffuse", "RGBA_key") for c in "RGBA")]
+    names = [*"RGBA", *(f"{name}.{c}" for name in (*parts, "diffuse", "RGBA_key", "RGBA_denoise") for c in "RGBA")]
     layers = find_layers(headers(tmp_path, names), aovs=["all"])
-    assert {*layers.aovs} == {*parts, "RGBA_key"}
+    assert {*layers.aovs} == {*parts, "diffuse", "RGBA_key"}
     assert {len(layer.channels) for layer in layers.aovs.values()} == {3}
     with pytest.raises(ExrError, match="aov all: no layer has a name for a part of the light"):
         find_layers(headers(tmp_path, cycles_names()), aovs=["all"])
