@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 MAGIC = 20000630  # the first four bytes of every OpenEXR file
 _PARTS = 0x1000  # the flag of files with several parts
+_LONGEST = 255  # bytes of a name, by the format
 _LARGEST = 1 << 24  # bytes of one header attribute; a broken file may claim any number
 
 
@@ -118,4 +119,6 @@ def _read_name(file: BinaryIO) -> str:
     name = b""
     while (byte := _read(file, 1)) != b"\0":
         name += byte
+        if len(name) > _LONGEST:
+            raise ValueError(f"a name of more than {_LONGEST} bytes")
     return name.decode("utf-8", "replace")

@@ -69,6 +69,12 @@ def test_a_file_that_ends_within_its_header_is_refused(tmp_path, size):
     assert "cannot be read as OpenEXR" in frames.refusal(path, cycles=True)
 
 
+def test_a_name_without_an_end_is_refused(tmp_path):
+    path = tmp_path / "a.exr"
+    path.write_bytes(frames.struct.pack("<II", frames.MAGIC, 2) + b"x" * 1000)
+    assert "a name of more than 255 bytes" in frames.refusal(path, cycles=True)
+
+
 def test_a_file_of_another_kind_is_refused(tmp_path):
     path = tmp_path / "a.exr"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" * 20)
