@@ -23,7 +23,7 @@ from hybrid.alignment.loading import REACH
 from hybrid.files.frames import Frame, Shot, open_beside, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
-from hybrid.plausibility import LOST, find_lost_light, find_other_frame
+from hybrid.plausibility import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Lights, hold_lights
@@ -274,8 +274,12 @@ def _choose(
     other = find_other_frame(shot, lambda number: read_denoised(sequence, number) if sequence.has(number) else None)
     if other is not None:
         raise ValueError(f"estimate {spec}: each picture belongs to {other}, expected those of the shot's own frames")
-    read = OfFrames(partial(_read_sequence, sequence), files=sequence)
-    return EstimateSource("sequence", read, "asked for", sequence)
+    grade = find_sequence_grade(shot, lambda n: read_denoised(sequence, n) if sequence.has(n) else None)
+    if grade is not None and grade.factors is None:
+        raise ValueError(f"estimate {spec}: it {grade.message}, expected pictures of the shot's own light")
+    factors, why = (None, "asked for") if grade is None else (grade.factors, f"it {grade.message}: brought to that")
+    read = OfFrames(partial(_read_sequence, sequence, factors), files=sequence)
+    return EstimateSource("sequence", read, why, sequence)
 
 
 def _bundled(mode: str, run: Callable[..., Array], reason: str) -> EstimateSource:
@@ -417,9 +421,12 @@ def estimate_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **m
     return (denoise or denoise_oidn)(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
 
 
-def _read_sequence(sequence: Shot, frame: Frame) -> Array | None:
+def _read_sequence(sequence: Shot, factors: tuple[float, float, float] | None, frame: Frame) -> Array | None:
     # Neighbours outside the frames that were asked for may be missing: they then count for nothing.
-    return read_denoised(sequence, frame.number) if sequence.has(frame.number) else None
+    if not sequence.has(frame.number):
+        return None
+    picture = read_denoised(sequence, frame.number)
+    return picture if factors is None else picture * np.array(factors, np.float32)
 
 
 def read_denoised(sequence: Shot, number: int) -> Array:

@@ -21,6 +21,7 @@ from hybrid.files.frames import Frame, Shot
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES
+from hybrid.grade import Grade, find_grade
 from hybrid.passes import judge_passes, thin_passes
 
 Array = NDArray[np.float32]
@@ -92,12 +93,15 @@ class Judgement:
         What the variance is multiplied by, where that was measured.
     passes : Passes
         What the further layers are to the picture.
+    estimate_factors : (float, float, float) or None
+        What the denoised picture is multiplied by, where it has another level than the samples.
     """
 
     findings: tuple[Finding, ...] = ()
     motion: Choice | None = None
     variance_scale: float | None = None
     passes: Passes = NO_PASSES
+    estimate_factors: tuple[float, float, float] | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -130,7 +134,7 @@ class Judgement:
         """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""
         left_out = {finding.role for finding in self.findings if finding.left_out}
         convention = None if self.motion is None else self.motion.convention
-        return shot.judged(left_out, convention, self.variance_scale, self.passes)
+        return shot.judged(left_out, convention, self.variance_scale, self.passes, self.estimate_factors)
 
 
 def judge_layers(shot: Shot) -> Judgement:
@@ -206,6 +210,26 @@ def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str
     return _other_frame(edges) if edges else None
 
 
+def find_sequence_grade(shot: Shot, finished: Callable[[int], Array | None]) -> Grade | None:
+    """Compare the level of denoised pictures with that of a shot's samples; None where they agree.
+
+    Parameters
+    ----------
+    shot : Shot
+        The noisy frames, of which those are read that `judge_layers` may read.
+    finished : callable
+        From a frame's number to its denoised picture (H, W, 3); None where it has none.
+    """
+    numbers = sorted({number for pair in _pair_numbers(shot) for number in pair}) or [shot.available[0]]
+    pictures = []
+    for number in numbers:
+        with suppress(ValueError, OSError):  # what cannot be read is an error when its turn comes
+            picture, color = finished(number), shot.read_color(number)
+            if picture is not None and picture.shape == color.shape:
+                pictures.append((picture, color))
+    return find_grade(pictures) if pictures else None
+
+
 def _can_read(shot: Shot, number: int) -> bool:
     try:
         shot.read(number)
@@ -263,7 +287,8 @@ def _judge(
     surfaces: Callable[[Collection[str]], Sequence[Patches]],
 ) -> Judgement:
     variance_scale, judged = evidence.judge_variance()
-    findings = [*evidence.findings(), *judged]
+    grade, graded = evidence.judge_grade()
+    findings = [*evidence.findings(), *judged, *graded]
     choice = None
     if layers.motion_convention is not None and light:
         sound = [role for role in ("albedo", "normal") if role not in {finding.role for finding in findings}]
@@ -271,7 +296,8 @@ def _judge(
             light, layers.motion_convention, layers.settled, lambda: surfaces(sound), layers.typed
         )
         findings += _judge_motion(layers, choice)
-    return Judgement(tuple(sorted(findings, key=lambda finding: ROLES.index(finding.role))), choice, variance_scale)
+    findings.sort(key=lambda finding: ROLES.index(finding.role))
+    return Judgement(tuple(findings), choice, variance_scale, estimate_factors=grade)
 
 
 def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
@@ -291,6 +317,7 @@ class _Evidence:
         self.edges: dict[str, list[tuple[float, float, float]]] = {}
         self.variances: list[Array] = []
         self.passes: list[Frame] = []
+        self.pictures: list[tuple[Array, Array]] = []
 
     def add(self, *frames: Frame) -> None:
         """Look at one frame, or at two neighbours."""
@@ -301,6 +328,8 @@ class _Evidence:
             for role, judge in _JUDGES.items():
                 if getattr(frame, role) is not None:
                     self.wrong.setdefault(role, []).append(judge(thin))
+            if frame.estimate is not None:
+                self.pictures.append((frame.estimate, frame.color))
             if frame.variance is not None:
                 self.variances.append(_variance_ratios(frame))
         if len(frames) == 2:
@@ -343,6 +372,15 @@ class _Evidence:
         passes, words = judge_passes(self.passes)
         lines = (Finding("aov", f"aov {name}: {said}", warning=False, left_out=False) for name, said in words.items())
         return replace(judgement, findings=(*judgement.findings, *lines), passes=passes)
+
+    def judge_grade(self) -> tuple[tuple[float, float, float] | None, list[Finding]]:
+        """What the denoised picture is multiplied by to have the level of the samples, and what there is to say."""
+        if not self.pictures or all(self.wrong["estimate"]) or (grade := find_grade(self.pictures)) is None:
+            return None, []
+        if grade.factors is None:
+            return None, [self._leave("estimate", grade.message)]
+        words = f"{self._name('estimate')} {grade.message}: brought to that"
+        return grade.factors, [Finding("estimate", words, left_out=False)]
 
     def _leave(self, role: str, words: str) -> Finding:
         return Finding(role, f"{self._name(role)} {words}: left out")

@@ -222,6 +222,7 @@ class Shot:
         self._left_out: frozenset[str] = frozenset({"motion"} if motion == "none" else ())
         self._convention: MotionConvention | None = None
         self._variance_scale: float | None = None
+        self._estimate_factors: tuple[float, float, float] | None = None
         self._aovs = tuple(aovs)
         self.passes = NO_PASSES
         self._keep = keep
@@ -301,7 +302,8 @@ class Shot:
         made.missing, made.picture = self.missing, self.picture
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
-        return made.judged(self._left_out, self._convention, self._variance_scale, self.passes)
+        taken = self._left_out, self._convention, self._variance_scale
+        return made.judged(*taken, self.passes, self._estimate_factors)
 
     def judged(
         self,
@@ -309,6 +311,7 @@ class Shot:
         convention: MotionConvention | None,
         variance_scale: float | None,
         passes: Passes | None = None,
+        estimate_factors: tuple[float, float, float] | None = None,
     ) -> Shot:
         """The same shot, read otherwise than its files and their profile say (`hybrid.plausibility`).
 
@@ -322,6 +325,8 @@ class Shot:
             What the variance is multiplied by; None: as the profile says.
         passes : Passes, optional
             What the further layers are to the picture; None: nothing is known of them.
+        estimate_factors : (float, float, float), optional
+            What the denoised picture is multiplied by, channel by channel; None: nothing.
         """
         other = copy(self)
         other._held = OrderedDict()
@@ -329,6 +334,7 @@ class Shot:
         other._left_out = self._left_out | set(left_out)
         other._convention, other._variance_scale = convention, variance_scale
         other.passes = NO_PASSES if passes is None else passes
+        other._estimate_factors = estimate_factors
         return other
 
     def path(self, number: int) -> Path:
@@ -399,6 +405,8 @@ class Shot:
         """What is taken for what of a frame, and how it is read, in words: where these differ, so does the picture."""
         layers = self.layers(number)
         said = f"{summarize_layers(layers)}; motion {layers.motion_convention}; variance {layers.variance_scale}"
+        if layers.estimate_factors is not None:
+            said += f"; estimate times {layers.estimate_factors}"
         return f"{said}; {self.passes}" if layers.aovs else said
 
     @cached_property
@@ -435,6 +443,8 @@ class Shot:
         found = layers.without(self._left_out).without_aovs(self.passes.kept)
         if found.motion is not None and self._convention is not None:
             found = replace(found, motion_convention=self._convention)
+        if self._estimate_factors is not None:
+            found = replace(found, estimate_factors=self._estimate_factors)
         return found if self._variance_scale is None else replace(found, variance_scale=self._variance_scale)
 
     @cached_property
@@ -865,6 +875,8 @@ def _frame(
         taken["variance"] = np.repeat(taken["variance"], 3, axis=2)
     if "variance" in taken and layers.variance_scale not in (None, 1):
         taken["variance"] = taken["variance"] * np.float32(layers.variance_scale)
+    if "estimate" in taken and layers.estimate_factors is not None:
+        taken["estimate"] = taken["estimate"] * np.array(layers.estimate_factors, np.float32)
     following = taken.pop("motion_next", None)
     if following is not None and layers.motion_convention is not None:
         one = layers.motion_convention.channels // 2

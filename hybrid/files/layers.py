@@ -59,7 +59,7 @@ class Layers:
     `profile` says whose names and conventions were taken, `reason` why. Of `motion_convention`, its parts `settled` are
     documented, of which the user has stated those `typed`, the others assumed. `variance_of` says of what the variance
     is, "mean" or "sample", `variance_scale` what it is multiplied by to be that of a pixel, `samples` how many samples
-    a pixel has; None where nobody has said.
+    a pixel has; None where nobody has said. The estimate is multiplied by `estimate_factors`, where they were measured.
 
     `views` are the names of the stereo views; those other than `view` are not denoised.
 
@@ -88,6 +88,7 @@ class Layers:
     typed: frozenset[str] = frozenset()
     variance_of: str | None = None
     variance_scale: float | None = None
+    estimate_factors: tuple[float, float, float] | None = None
     samples: float | None = None
     view: str | None = None
     views: tuple[str, ...] = ()

@@ -243,6 +243,25 @@ def test_equal_zeros_are_no_evidence() -> None:
     assert _judge_alpha(replace(frame, alpha=color[..., 1])) == "is the color"
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.8])
+def test_an_estimate_of_another_level_is_brought_to_that_of_the_samples(factor, tmp_path) -> None:
+    def edit(index: int, channels: Channels) -> None:
+        noisy = np.stack([channels[f"{LIGHT}.{c}"] for c in "RGB"], axis=-1)
+        clean = cv2.blur(noisy, (5, 5)) * np.float32(factor)
+        channels.update({f"ViewLayer.Noisy Image.{c}": channels[f"{LIGHT}.{c}"] for c in "RGBA"})
+        channels.update(layer(LIGHT, "RGB", clean))
+
+    shot = open_shot(write(tmp_path, edit))
+    judgement = judge_layers(shot)
+    before, after = (opened.read(10).estimate for opened in (shot, judgement.apply(shot)))
+    if factor == 1:
+        assert judgement.estimate_factors is None
+        np.testing.assert_array_equal(before, after)
+    else:
+        assert "times the level of the samples" in judgement.warnings[0]
+        assert after.mean() == pytest.approx(shot.read(10).color.mean(), rel=0.03)
+
+
 def test_what_makes_sense_gives_no_finding() -> None:
     judgement = judge_layers(open_shot(SHOT / "noisy.####.exr"))
     assert judgement.findings == ()

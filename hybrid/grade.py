@@ -1,0 +1,107 @@
+"""Whether denoised pictures have the level and the color of their samples, and what brings them there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+# Sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise.
+TILE = 8
+# Fewer tiles say nothing.
+FEWEST = 16
+# Tiles below this share of the mean light count for nothing: empty areas are equal in any grade.
+LIT = 0.01
+# Levels that differ by less than this factor, or by fewer standard errors, are left to the mean of the samples:
+# denoisers are off by some percent, and noise that is skewed moves a median by as much.
+LEVEL, ERRORS = 1.1, 5.0
+# Tiles may differ from one factor by this, in units of the logarithm, and by so many times their noise: no factor
+# explains half of the light otherwise.
+SPREAD, NOISE = 0.15, 1.0
+
+
+@dataclass(frozen=True)
+class Grade:
+    """How denoised pictures differ from their samples.
+
+    Attributes
+    ----------
+    factors : (float, float, float) or None
+        By which the pictures are multiplied to have the level of their samples; None: no factor explains the
+        difference.
+    message : str
+        What was found, in words.
+    """
+
+    factors: tuple[float, float, float] | None
+    message: str
+
+
+def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
+    """Compare the level of denoised pictures with that of their samples, channel by channel.
+
+    Parameters
+    ----------
+    pictures : sequence of ((H, W, 3) array, (H, W, 3) array)
+        The denoised picture and the samples of some frames, linear radiance. Pixels that are not finite count for
+        nothing.
+
+    Returns
+    -------
+    Grade or None
+        None where the levels agree within their uncertainty.
+
+    Notes
+    -----
+    Of tiles of 8 x 8 pixels with the means e of the picture and s of the samples, the factor is the median of s / e,
+    weighted by e. It differs from 1 only if the ratio of the sums of s and e does so too: the median of noise that is
+    skewed lies below its mean, and fireflies, which denoisers remove, lie above.
+    """
+    tiles = [_tiles(*pair) for pair in pictures]
+    e, s, noise = (np.concatenate(parts) for parts in zip(*tiles, strict=True))
+    factors, graded = [], False
+    for c in range(3):
+        lit = (e[:, c] > LIT * max(float(e[:, c].sum()), 0) / max(len(e), 1)) & (e[:, c] > 0) & (s[:, c] > 0)
+        if np.count_nonzero(lit) < FEWEST:
+            factors.append(1.0)
+            continue
+        weights, ratio = e[lit, c], np.log(s[lit, c] / e[lit, c])
+        middle = _median(ratio, weights)
+        spread = _median(np.abs(ratio - middle), weights)
+        if spread > SPREAD + NOISE * _median(noise[lit, c] / s[lit, c], weights):
+            return Grade(None, "differs from the samples by another curve than one factor for each channel")
+        total = float(np.log(s[lit, c].sum() / weights.sum()))
+        # 1.5: spread of a normal distribution, 1.25: error of its median.
+        least = max(np.log(LEVEL), ERRORS * 1.5 * 1.25 * spread / np.sqrt(np.count_nonzero(lit)))
+        graded |= min(abs(middle), abs(total)) > least and middle * total > 0
+        factors.append(float(np.exp(middle)))
+    if not graded:
+        return None
+    red, green, blue = factors
+    said = ", ".join(f"{1 / factor:.3g}" for factor in factors)
+    return Grade((red, green, blue), f"has {said} times the level of the samples in R, G, B")
+
+
+def _tiles(picture: Array, samples: Array) -> tuple[Array, Array, Array]:
+    """Means of both over tiles, (T, 3), and the standard error of those of the samples."""
+    height, width = (side // TILE * TILE for side in picture.shape[:2])
+    split = height // TILE, TILE, width // TILE, TILE, 3
+    both = [
+        np.asarray(layer[:height, :width], np.float64).reshape(split).swapaxes(1, 2).reshape(-1, TILE**2, 3)
+        for layer in (picture, samples)
+    ]
+    known = np.isfinite(both[0]).all(axis=(1, 2)) & np.isfinite(both[1]).all(axis=(1, 2))
+    e, s = both[0][known], both[1][known]
+    level = s.mean(axis=1) / np.maximum(e.mean(axis=1), np.finfo(np.float32).tiny)  # no division by 0 on black
+    return e.mean(axis=1), s.mean(axis=1), (s - level[:, None] * e).std(axis=1) / TILE
+
+
+def _median(values: Array, weights: Array) -> float:
+    """Weighted median."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
