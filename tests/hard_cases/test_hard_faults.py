@@ -219,6 +219,7 @@ except KeyboardInterrupt:  # it came before that code did; the command ends with
 """
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.usefixtures("interrupts")
 def test_a_stop_is_heard_in_the_midst_of_compiled_code(tmp_path, number):
@@ -249,6 +250,7 @@ with interruptible(lambda: print("2 of 5", file=sys.stderr, flush=True)):
 """
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("seconds", [0.5, 600])
 @pytest.mark.usefixtures("interrupts")
 def test_the_report_of_a_stop_is_seen_while_a_file_is_read_beside_the_work(seconds):
@@ -284,6 +286,7 @@ def begin(script, path):
     return child
 
 
+@pytest.mark.posix
 def test_what_a_killed_process_has_left_is_removed_and_nothing_else(tmp_path, monkeypatch):
     """Ownership was told by host name and process number: two containers cleared each other's live files."""
     child = begin(WRITING, tmp_path / "shot.0001.exr")

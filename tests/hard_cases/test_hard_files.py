@@ -133,6 +133,7 @@ def test_parts_may_be_called_anything(tmp_path):
     assert (tmp_path / "b.exr").read_bytes() == (folder / "a.exr").read_bytes()
 
 
+@pytest.mark.posix
 def test_the_output_is_never_an_input_by_another_name(tmp_path, capsys):
     folder = Scene(frames=1).write(tmp_path / "in")
     source = folder / "shot.1001.exr"
@@ -189,6 +190,7 @@ def test_tiled_files_stay_tiled(tmp_path):
     assert header["tiles"].xSize == 8
 
 
+@pytest.mark.posix
 def test_side_outputs_spare_all_that_is_read_and_all_that_is_made(tmp_path, capsys):
     """Previews and breakdowns went over frames of estimates, over weights, over each other and over devices."""
     folder, estimates = (
@@ -220,6 +222,7 @@ def test_side_outputs_spare_all_that_is_read_and_all_that_is_made(tmp_path, caps
     assert not out.exists()
 
 
+@pytest.mark.posix
 def test_a_folder_for_records_that_leads_elsewhere_is_refused(tmp_path, capsys):
     folder, out = Scene(frames=1).write(tmp_path / "in"), tmp_path / "out"
     for path in (out, tmp_path / "elsewhere"):

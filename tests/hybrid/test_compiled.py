@@ -91,6 +91,7 @@ def test_where_nothing_can_be_written_to_loops_are_compiled_in_each_run(installe
     assert said.count("cannot be kept anywhere") == 1
 
 
+@pytest.mark.posix
 def test_a_folder_that_somebody_else_has_made_is_not_trusted(installed, temporary):
     """What is read from it is run."""
     user = NOBODY if os.geteuid() == 0 else os.geteuid()
@@ -102,6 +103,7 @@ def test_a_folder_that_somebody_else_has_made_is_not_trusted(installed, temporar
     assert not path.exists()  # it was this run's own, and is gone
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("share", [0, 0.5, 0.99])
 def test_a_damaged_file_is_made_again(tmp_path, kind, share):

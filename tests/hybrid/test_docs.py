@@ -32,6 +32,7 @@ def said(line: str) -> str:
     return re.sub(r"\d+(\.\d+)? (s|min|h)\b", "TIME", line)
 
 
+@pytest.mark.posix
 def test_in_a_shell(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")

@@ -92,6 +92,7 @@ def test_the_template_is_valid(openjd):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.posix
 @pytest.mark.openjd
 @pytest.mark.neural
 def test_open_job_description_runs_chunks_and_reads_their_progress(openjd, tmp_path):

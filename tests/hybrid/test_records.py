@@ -38,6 +38,7 @@ def test_runs_of_one_shot_write_one_record_each(tmp_path):
     assert status.seconds_left == 6 * 2 / 3
 
 
+@pytest.mark.posix
 def test_what_ended_is_not_running(tmp_path):
     for state in ("finished", "stopped"):
         record = Record(tmp_path, state, [1, 2])
@@ -141,6 +142,7 @@ def test_a_record_that_says_what_cannot_be_is_none(tmp_path, change):
         Record(tmp_path, "shot", [1])
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("kind", ["nested", "pipe", "folder", "link to itself"])
 def test_what_is_no_file_among_the_records_is_left_out(tmp_path, kind):
     made(tmp_path, Record(tmp_path, "shot", [1]), 1)

@@ -53,6 +53,7 @@ def test_an_error_in_any_band_comes_back_when_all_have_ended(monkeypatch, bad):
     assert sorted(ended) == sorted({0, 1, 2} - {bad})
 
 
+@pytest.mark.posix
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_process_that_was_forked_has_threads_of_its_own(monkeypatch):

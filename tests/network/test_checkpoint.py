@@ -96,6 +96,7 @@ def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
         load_model(bad)
 
 
+@pytest.mark.posix
 def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path) -> None:
     """The name to write to first is known to everybody; a link of that name led elsewhere."""
     precious = tmp_path / "precious"
@@ -109,6 +110,7 @@ def test_weights_are_not_written_through_a_link_that_was_planted(tmp_path: Path)
         save_model(tmp_path, make_model())
 
 
+@pytest.mark.posix
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
 @pytest.mark.parametrize("mask", [0o022, 0o027])
 def test_weights_have_the_mode_that_the_umask_gives(tmp_path: Path, mask: int) -> None:

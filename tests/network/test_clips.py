@@ -155,6 +155,7 @@ def test_fireflies_beyond_a_half_are_stored_as_its_largest(tmp_path: Path) -> No
     assert float(values["color"].max()) == 65504
 
 
+@pytest.mark.posix
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
 def test_clips_have_the_mode_that_the_umask_gives(tmp_path: Path) -> None:
     before = os.umask(0o027)

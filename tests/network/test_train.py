@@ -299,6 +299,7 @@ def _sets_of(folder: str | Path) -> tuple[Clips, Clips]:
     return split_by_shot(open_clips(folder), ["shot1"])
 
 
+@pytest.mark.posix
 def test_a_training_that_is_killed_is_resumed_as_if_nothing_had_happened(tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
     for seed in range(2):

@@ -98,6 +98,7 @@ def test_options_are_passed_on_as_they_were_given():
     assert seen[0][1:] == ["--output=-b", "--layer=color=x", "--layer=normal=y", "--resume", "--", "a", "-c"]
 
 
+@pytest.mark.posix
 def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -112,6 +113,7 @@ def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
             assert said(line).replace(documented, cluster[0]) in lines
 
 
+@pytest.mark.posix
 def test_random_shots_are_rendered_by_the_workers(cluster, tmp_path, capsys):
     """By a stand-in for Blender, which writes frames that say who has made them."""
     script, python = tmp_path / "stub.py", tmp_path / "python"
@@ -140,6 +142,7 @@ def test_clips_are_made_by_the_workers(cluster, tmp_path, capsys):
     }
 
 
+@pytest.mark.posix
 def test_a_shot_is_the_same_bytes_though_a_worker_dies(cluster, shot, whole, tmp_path, capsys):
     address, workers = cluster
     out = tmp_path / "out"
@@ -172,6 +175,7 @@ def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
     assert {f"shot.{number}.exr" for number in range(1001, 1005)} <= contents(out).keys()
 
 
+@pytest.mark.posix
 @pytest.mark.usefixtures("interrupts")
 def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_path):
     out = tmp_path / "out"

@@ -128,6 +128,7 @@ def test_a_closed_pipe_does_not_end_the_work(shot_folder, tmp_path, stream):
     assert len(list((tmp_path / "out").glob("*.exr"))) == 3
 
 
+@pytest.mark.posix
 def test_streams_that_were_never_open(shot_folder):
     command, options = ravg("inspect", shot_folder)
     script = 'exec "$0" "$@" >&- 2>&-'

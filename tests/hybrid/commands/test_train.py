@@ -257,6 +257,7 @@ def test_every_option_arrives_where_it_belongs(asked):
     }  # fmt: skip
 
 
+@pytest.mark.posix
 def test_training_writes_over_no_clip_and_not_over_what_it_starts_from(tmp_path, capsys):
     for name in ("wall.0000.safetensors", "mine.safetensors", "own.safetensors.state"):
         (tmp_path / name).write_text(name)

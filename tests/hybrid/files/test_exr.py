@@ -54,6 +54,7 @@ def cycles_names(layers=CYCLES, prefix="ViewLayer.") -> list[str]:
     return [f"{prefix}{layer}.{c}" for layer, components in layers.items() for c in components]
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("kind", ["pipe", "socket"])
 @pytest.mark.parametrize("look", [read_exr, identify])
 def test_what_is_no_file_is_not_waited_for(tmp_path, kind, look):
@@ -374,6 +375,7 @@ def test_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, monkey
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
+@pytest.mark.posix
 def test_folder_that_cannot_be_written_is_an_oserror_naming_the_file(tmp_path):
     source = read_exr(save(tmp_path / "a.exr", planes(["R"])))
     with pytest.raises(FileNotFoundError, match=r"cannot write: No such file.*none.out\.exr'$"):

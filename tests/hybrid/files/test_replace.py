@@ -19,6 +19,7 @@ from hybrid.files.pictures import write_png
 from hybrid.files.replace import check_outputs, remove_leftovers, replace_file, temporary_folder, write_file
 
 
+@pytest.mark.posix
 def test_a_temporary_name_cannot_be_guessed_and_is_not_opened_through_a_link(tmp_path, monkeypatch):
     """Names were made of host, process and thread; a link of such a name was written through."""
     precious = tmp_path / "precious"
@@ -50,6 +51,7 @@ def test_a_temporary_file_that_was_exchanged_is_not_put_in_place(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.posix
 def test_a_link_is_replaced_and_not_written_through(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("precious")
@@ -71,6 +73,7 @@ def make(kind: str, path: Path) -> None:
         path.mkdir()
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device", "folder"])
 def test_what_is_no_file_is_not_replaced(tmp_path, kind, monkeypatch):
     """A preview to /dev/null, as root, made a file of the device."""
@@ -135,6 +138,7 @@ def test_where_nothing_can_be_locked_nothing_is_cleared(tmp_path, monkeypatch):
     assert (tmp_path / "a").read_text() == "whole"
 
 
+@pytest.mark.posix
 def test_a_folder_whose_lock_is_gone_is_cleared_and_links_to_folders_are_not(tmp_path):
     other = tmp_path / "other"
     other.mkdir()
@@ -152,6 +156,7 @@ def test_a_folder_whose_lock_is_gone_is_cleared_and_links_to_folders_are_not(tmp
 # --- what may not be written
 
 
+@pytest.mark.posix
 def test_an_output_is_no_input_by_any_name(tmp_path):
     source = tmp_path / "in" / "a"
     source.parent.mkdir()
@@ -171,6 +176,7 @@ def test_an_output_is_no_input_by_any_name(tmp_path):
         check_outputs([("preview", loop)], [("weights", loop)])
 
 
+@pytest.mark.posix
 def test_two_outputs_are_two_files(tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "in")

@@ -128,6 +128,7 @@ def test_the_rest_of_a_name_is_taken_as_it_is_written(tmp_path, name):
     assert list(find_files(f"{tmp_path}/{name}.####.exr")[0]) == [1, 2]
 
 
+@pytest.mark.posix
 def test_hidden_files_folders_and_other_digits_are_no_frames(tmp_path):
     for name in ("a.0001.exr", "._a.0001.exr", ".a.0002.exr", "a.\u0663.exr"):
         (tmp_path / name).touch()
