@@ -10,9 +10,12 @@ from itertools import takewhile
 from pathlib import Path
 
 from hybrid.files.exr import ExrError, ExrImage, Layer, read_exr
-from hybrid.files.layers import fit_alone
+from hybrid.files.layers import find_layers, fit_alone
 from hybrid.files.profile import COMMON, ROLES, Profile, find_profile, plain_name, read_profiles
 from hybrid.files.sequences import Pattern, find_files, format_frames, list_patterns, pattern_of
+
+# What is taken from a sequence that the user has not named: no other picture of the frame.
+GUIDES = ("albedo", "normal", "depth", "motion", "motion_next", "variance")
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Apart:
     def expect(self, numbers: Sequence[int]) -> None:
         """Raise FileNotFoundError unless all these frames are there."""
         if missing := [number for number in numbers if number not in self.files]:
-            there = f"it has {format_frames(self.files)}"
+            there = f"it has {format_frames(self.files)}, expected all frames of the color"
             raise FileNotFoundError(f"{self.role} ({self.spec}): no frame {format_frames(missing)}; {there}")
 
 
@@ -87,12 +90,22 @@ def open_apart(role: str, value: str) -> Apart:
 def find_companions(files: Mapping[int, Path]) -> tuple[Profile | None, list[Apart]]:
     """Sequences that a renderer writes beside the color's, under names made from its name.
 
+    Parameters
+    ----------
+    files : mapping of int to Path
+        Those of the color.
+
     Returns
     -------
     Profile or None
         The renderer, which its other file tells where the color's may not.
     list of Apart
-        A layer each; those that the other files do not have are left out.
+        A layer each; those that the other files do not have, or that the color's files have themselves, are left out.
+
+    Raises
+    ------
+    ValueError
+        If several sequences have the name of one layer.
     """
     own = pattern_of(files[min(files)])
     stem = own.before.rstrip("._-")
@@ -113,7 +126,28 @@ def find_companions(files: Mapping[int, Path]) -> tuple[Profile | None, list[Apa
                     found.append(apart)
         if found:
             return replace(profile, why=f"{found[0].spec} beside it"), found
-    return None, []
+    return _find_elements(own, files)
+
+
+def _find_elements(own: Pattern, files: Mapping[int, Path]) -> tuple[Profile | None, list[Apart]]:
+    """Guides that lie beside the color, a sequence each, under its name and their own (``view.normals.####.exr``)."""
+    stem = _stem(own)
+    beside = [p for p in list_patterns(own.folder) if p.after == own.after and _begins(_stem(p), stem)] if stem else []
+    if not own.digits or not beside:
+        return None, []
+    try:
+        image = read_exr(files[min(files)], pixels=False)
+        known = find_layers(image)
+    except (ExrError, OSError):  # said where the layers are needed
+        return None, []
+    assigned = _assign([("", own), *((plain_name(_stem(p)[len(stem) :].lstrip("._-")), p) for p in beside)])
+    if assigned is None:
+        return None, []
+    profile, roles = assigned
+    missing = {role: found for role, found in roles.items() if role in GUIDES and getattr(known, role) is None}
+    apart = _only_each(own.folder, missing)
+    why = f"{', '.join(other.spec for other in apart)} beside it"
+    return (_told_by(image, profile, why) if apart else None), apart
 
 
 def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] | None:
@@ -140,7 +174,18 @@ def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] 
             profile, apart = find_companions(color.files())
             if profile is not None and {companion.spec for companion in apart} == {str(other)}:
                 return color.files(), profile, apart
-    sequences = _label(folder, direct)
+    assigned = _assign(_label(folder, direct))
+    if assigned is None:
+        return None
+    profile, roles = assigned
+    first, *others = _only_each(folder, roles)  # the color, as in `ROLES`
+    image = read_exr(first.files[min(first.files)], pixels=False)
+    names = ", ".join(other.spec for other in (first, *others))
+    return dict(first.files), _told_by(image, profile, f"sequences {names}"), others
+
+
+def _assign(sequences: Sequence[tuple[str, Pattern]]) -> tuple[Profile, dict[str, list[Pattern]]] | None:
+    """The sequences by their roles, as the profile has them that knows most; None without a color and another."""
     best: tuple[Profile, dict[str, list[Pattern]]] | None = None
     score = (0, 0)
     for profile in read_profiles().values():
@@ -152,24 +197,41 @@ def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] 
         this = typical, sum(map(bool, roles.values()))
         if roles["color"] and this > score:
             best, score = (profile, {role: found for role, found in roles.items() if found}), this
-    if best is None or score[1] < 2:
-        return None
-    profile, found = best
-    for role, several in found.items():
+    return best if score[1] > 1 else None
+
+
+def _only_each(folder: Path, roles: Mapping[str, Sequence[Pattern]]) -> list[Apart]:
+    """The one sequence of each role; raise ValueError where there are several."""
+    for role, several in roles.items():
         if len(several) > 1:
             raise ValueError(f"{folder}: {role} can be {', '.join(map(str, several))}, expected one sequence")
-    (color,) = found.pop("color")
-    apart = [Apart(role, str(pattern), pattern.files()) for role, (pattern,) in found.items()]
-    known = find_profile(read_exr(next(iter(color.files().values())), pixels=False))
-    names = ", ".join(str(pattern) for pattern in (color, *(p for (p,) in found.values())))
-    taken = known if known.name != read_profiles()[COMMON].name else replace(profile, why=f"sequences {names}")
-    return color.files(), taken, apart
+    return [Apart(role, str(pattern), pattern.files()) for role, (pattern,) in roles.items()]
+
+
+def _told_by(image: ExrImage, profile: Profile, why: str) -> Profile:
+    """The profile that the color's header tells, or else the one that knows the names, and why."""
+    known = find_profile(image)
+    return known if known.name != read_profiles()[COMMON].name else replace(profile, why=why)
+
+
+def _stem(pattern: Pattern) -> str:
+    """The name of a sequence, without its number and without what separates them."""
+    return pattern.before.removesuffix(".exr").rstrip("._-")
+
+
+def _begins(stem: str, with_: str) -> bool:
+    """Whether a name is another and a further word."""
+    return stem.startswith((f"{with_}.", f"{with_}_", f"{with_}-"))
 
 
 def _label(folder: Path, direct: Sequence[Pattern]) -> list[tuple[str, Pattern]]:
     """The sequences in a folder, or in its folders, each with the part of its name that tells it from the others."""
     if len(direct) > 1:
-        stems = [pattern.before.removesuffix(".exr").rstrip("._-") for pattern in direct]
+        stems = [_stem(pattern) for pattern in direct]
+        shortest = min(stems, key=len)
+        if shortest and all(_begins(stem, shortest) for stem in stems if stem != shortest):
+            # The color has no name of its own: view.####.exr beside view.normals.####.exr.
+            return [(plain_name(s[len(shortest) :].lstrip("._-")), p) for s, p in zip(stems, direct, strict=True)]
         alike = "".join(
             letters[0] for letters in takewhile(lambda letters: len({*letters}) == 1, zip(*stems, strict=False))
         )

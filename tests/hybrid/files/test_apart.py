@@ -52,11 +52,12 @@ def split(folder: Path, names: dict[str, str]) -> None:
 def made(spec: Path, out: Path, *options: str) -> bytes:
     arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
     assert main(arguments) == 0
-    image = read_exr(next(out.glob("*.0010.exr")))
+    image = read_exr(next(out.glob("*0010.exr")))
     return b"".join(image.channel(name).tobytes() for name in "RGBA")
 
 
 ROLES = ("albedo", "normal", "depth", "motion")
+VRAY = ("DiffuseFilter", "Normals", "ZDepth", "Velocity")
 APART = {role: f"{role}/{role}.####.exr" for role in ROLES} | {"color": "beauty/beauty.####.exr"}
 
 
@@ -80,6 +81,59 @@ def test_a_folder_for_each_layer_is_found_by_their_names(whole: bytes, tmp_path:
 def test_a_file_for_each_layer_is_found_by_their_names(whole: bytes, tmp_path: Path) -> None:
     split(tmp_path, {role: f"sh_010.{role}.####.exr" for role in ROLES} | {"color": "sh_010.beauty.####.exr"})
     assert made(tmp_path, tmp_path.parent / "out of files") == whole
+
+
+ELEMENTS = {
+    "V-Ray for Maya": {r: f"view.{n}.####.exr" for r, n in zip(ROLES, VRAY, strict=True)} | {"color": "view.####.exr"},
+    "3ds Max": {r: f"view_VRay{n}####.exr" for r, n in zip(ROLES, VRAY, strict=True)} | {"color": "view####.exr"},
+    "hyphens": {r: f"s-v2-{r}-####.exr" for r in ROLES} | {"color": "s-v2-####.exr"},
+    "plain": {r: f"010_{r}.####.exr" for r in ROLES} | {"color": "010.####.exr"},
+}
+
+
+@pytest.mark.parametrize("names", ELEMENTS.values(), ids=ELEMENTS)
+@pytest.mark.parametrize("folder", [True, False])
+def test_elements_beside_a_color_without_a_name_of_its_own(
+    whole: bytes, names: dict[str, str], folder: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder was refused; named by its pattern the color was denoised without its guides, and nothing was said."""
+    home = tmp_path / "in"
+    split(home, names)
+    for truth in FRAMES:  # further elements are left alone
+        save(
+            home
+            / names["albedo"]
+            .replace("iffuseFilter", "iffuse")
+            .replace("albedo", "glow")
+            .replace("####", f"{truth.number:04d}"),
+            layer("", "RGB", truth.color),
+        )
+    # How long vectors are in V-Ray's files is measured; these are Blender's.
+    assert made(home if folder else home / names["color"], tmp_path / "out", "--profile", "cycles") == whole
+    said = capsys.readouterr().err
+    for role in ROLES:
+        assert f"{role} {names[role]}:" in said
+
+
+def test_what_the_color_has_itself_and_other_pictures_are_not_taken_from_beside_it(tmp_path: Path) -> None:
+    for truth in FRAMES:
+        own = color(truth) | layer("albedo", "RGB", truth.albedo)
+        save(tmp_path / f"view.{truth.number:04d}.exr", own)
+        for name in ("albedo", "denoised", "alpha", "beauty", "2"):
+            save(tmp_path / f"view.{name}.{truth.number:04d}.exr", layer("", "RGB", truth.color))
+        save(tmp_path / f"view2.normals.{truth.number:04d}.exr", layer("", "XYZ", truth.normal))
+    layers = open_shot(tmp_path / "view.####.exr").layers(10)
+    assert str(layers.albedo) == "albedo.RGB"
+    assert (layers.normal, layers.estimate) == (None, None)
+    assert str(layers.alpha) == "A"
+
+
+def test_elements_that_lack_a_frame_are_refused(tmp_path: Path) -> None:
+    split(tmp_path, ELEMENTS["plain"])
+    (tmp_path / "010_normal.0011.exr").unlink()
+    for spec in (tmp_path, tmp_path / "010.####.exr"):
+        with pytest.raises(FileNotFoundError, match=r"normal .*: no frame 11; it has 9-10,12, expected all frames"):
+            open_shot(spec)
 
 
 def test_in_any_mixture(whole: bytes, tmp_path: Path) -> None:
