@@ -290,7 +290,8 @@ def denoise_frames(
                         if read is not None:
                             read.check_unchanged(n for n in shot.near(number, reach) if read.has(n))
                     headed = {**(attributes or {}), **own}
-                    return replace(finished, clamped=shot.write(path, number, layers[0], extra, headed, pictures))
+                    clamped = shot.write(path, number, layers[0], extra, headed, pictures)
+                    return replace(finished, clamped=clamped + sum(counts.beyond for counts in counted))
 
             return write
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner
+from hybrid.alignment.kept import as_gray
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import measure_exposure
@@ -67,6 +68,8 @@ class Counts:
         What its window was planned by (`LoadedFrames.facts_of`).
     beside : tuple of int
         The frames whose pictures were there to be averaged, itself among them.
+    beyond : int
+        Values that half cannot hold.
     """
 
     repaired: int
@@ -76,6 +79,7 @@ class Counts:
     shares: dict[str, float]
     facts: tuple[Sequence[FrameFacts], Sequence[PairFacts]]
     beside: tuple[int, ...] = ()
+    beyond: int = 0
 
 
 class Pictures:
@@ -138,6 +142,7 @@ class Pictures:
             denoised = self._correct(denoised, frame, sides, counts.stages)
             if frame.lamps is not None:
                 denoised = _with_lamps(denoised, frame.lamps)
+            denoised, counts = _with_kept(denoised, frame), replace(counts, beyond=frame.kept.count)
         return denoised, replace(counts, beside=tuple(sorted(self._made)))
 
     def beside(self, number: int) -> list[int]:
@@ -248,3 +253,9 @@ def _with_lamps(denoised: Denoised, lamps: Lights) -> Denoised:
         for layers in (denoised.aovs, denoised.extra)
     )
     return replace(denoised, color=color, aovs=aovs, extra=extra)
+
+
+def _with_kept(denoised: Denoised, frame: PreparedFrame) -> Denoised:
+    """The picture with what no filter took (`hybrid.alignment.kept`)."""
+    gray = {name: as_gray(layer) for name, layer in denoised.aovs.items() if name in frame.kept.gray}
+    return replace(denoised, color=frame.kept.restore(denoised.color, frame.guide), aovs={**denoised.aovs, **gray})

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.motion import Motion, invert_flow
+from hybrid.alignment.kept import Kept, set_apart
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.files.frames import Frame
 from hybrid.files.passes import NO_PASSES, Passes
@@ -53,6 +54,8 @@ class PreparedFrame:
         Guides, finite.
     valid : (H, W) bool array
         False where the renderer's color was not finite.
+    kept : Kept
+        What no filter takes, to be put back into the picture.
     repaired : int
         How many pixels of any layer were not finite and have been filled in.
     motion : Motion or None
@@ -96,6 +99,7 @@ class PreparedFrame:
     demodulated: bool
     tints: dict[str, Array] = field(default_factory=dict)
     passes: Passes = NO_PASSES
+    kept: Kept = field(default_factory=Kept)
     fireflies: int = 0
     burnt: float = 0.0
     taken: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
@@ -185,8 +189,9 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     demodulated : bool
         Whether to divide by the albedo, where there is one.
     """
-    color, bad = replace_nonfinite(frame.color)
-    repaired = bad
+    color, kept = set_apart(frame)
+    color, bad = replace_nonfinite(color)
+    repaired = bad if kept.lights is None else bad & ~kept.lights
     layers: dict[str, Array | None] = {}
     for name in ("albedo", "normal", "variance"):
         layer = getattr(frame, name)
@@ -225,6 +230,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
+        kept=kept,
         tints=tints,
         passes=passes,
     )

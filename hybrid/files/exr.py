@@ -57,7 +57,7 @@ class Layer:
 
     `channels` are qualified names, in the order R G B A or X Y Z W, any others after those. `name` is what
     they share (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file. `file` names the
-    sequence that it lies in where that is not the frame's own.
+    sequence that it lies in where that is not the frame's own. Gray that is read as a color is one channel three times.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Layer:
     file: str = ""
 
     def __str__(self) -> str:
-        components = [channel.rpartition(".")[2] for channel in self.channels]
+        components = [channel.rpartition(".")[2] for channel in dict.fromkeys(self.channels)]
         joined = ("" if all(len(c) == 1 for c in components) else ",").join(components)
         own = f"{self.name}.{joined}" if self.name else joined
         return f"{self.file}:{own}" if self.file else own

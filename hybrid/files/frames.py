@@ -58,6 +58,8 @@ class Frame:
         What is known of `aovs`.
     source : Path, optional
         The file, if there is one.
+    beyond : (H, W, 3) array of bool, optional
+        Where the color is +Inf as its light is beyond the range of half; the color is NaN there.
     """
 
     number: int
@@ -75,6 +77,7 @@ class Frame:
     tints: Mapping[str, np.ndarray] = field(default_factory=dict)
     passes: Passes = NO_PASSES
     source: Path | None = None
+    beyond: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.color.ndim != 3 or self.color.shape[2] != 3:
@@ -602,6 +605,8 @@ class Shot:
                 raise ValueError(f"{source.path}: nothing was read as {name!r}, expected one of {', '.join(places)}")
             part = source.parts[layer.part]
             cut = self._cut(image, part)
+            if len({*layer.channels}) == 1 and cut.ndim == 3:
+                cut = cut.mean(axis=2)  # one channel that was read as red, green and blue
             # Another part may reach beyond the color of all frames; what is there was not read, and stays.
             inside = self._cut(np.ones(image.shape[:2], bool), part)
             planes = [cut] if cut.ndim == 2 else list(np.moveaxis(cut, 2, 0))
@@ -886,6 +891,9 @@ def _frame(
         convention = replace(convention, premultiplied=False)
         if (alpha := taken.get("alpha")) is not None:
             np.divide(taken["motion"], alpha[..., None], out=taken["motion"], where=alpha[..., None] > 0)
+    # Of float32 it is the result of a division, and as lost as NaN.
+    half = all(image.channel(channel).dtype == np.float16 for channel in layers.color.channels)
+    beyond = taken["color"] == np.inf if half else None
     for role in LIMITED & taken.keys():
         taken[role] = _limited(taken[role], LARGEST**2 if role == "variance" else LARGEST)
     halves = taken.pop("half_a", None), taken.pop("half_b", None)
@@ -899,6 +907,7 @@ def _frame(
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
         tints={name: _pixels(image, layer, canvas) for name, layer in layers.tints.items()},
         source=image.path,
+        beyond=None if beyond is None or not beyond.any() else beyond,
     )
 
 

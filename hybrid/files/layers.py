@@ -147,9 +147,9 @@ def find_layers(
 
     Notes
     -----
-    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate, or ``Image`` in
-    files of Blender's File Output node. The other layers are taken from the color's own view layer and stereo view
-    only.
+    Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate (``Image``, where
+    Blender's File Output node has written them). The other layers are taken from the color's own view layer and stereo
+    view only. Gray is read as a color, of one channel three times, where there is no other.
 
     What could be the color twice over (two view layers; ``beauty`` beside bare R, G, B) is refused: whichever was
     taken, the other would stay noisy in the file. What a known renderer calls its color goes before names that
@@ -163,12 +163,13 @@ def find_layers(
     found: dict[str, Layer | None] = {**(elsewhere or {})}
     for role, name in overrides.items():
         layer = image.layer(name) if isinstance(name, str) else image.again(name)
-        found[role] = _fit(image, role, layer, named=True)
+        found[role] = _fit(image, role, layer, named=True) or (_as_gray(layer) if role == "color" else None)
         if found[role] is None:
             raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {_NEEDS[role]}")
 
     notes: list[str] = []
     color = found.get("color") or _find_color(image, taken, notes) or _only_picture(image, taken)
+    color = color or _find_gray(image, taken)
     if color is None:
         raise ExrError(f"{image.path}: no color layer (--layer color=NAME); {image.listing()}")
     found["color"] = found["target"] = color
@@ -467,10 +468,30 @@ def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:
     return _fit(image, "color", only[0], named=True) if len(only) == 1 else None
 
 
+def _find_gray(image: ExrImage, profile: Profile) -> Layer | None:
+    """The one gray layer with a name for the color, of the default view."""
+    seen = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
+    named = [x for x in seen if {*(_tails(image, x) if x.name else [""])} & {*profile.names("color")}]
+    found = [gray for layer in named if (gray := _as_gray(layer)) and component_of(gray.channels[0]) in _LUMINANCE]
+    return _only(image, "color", found) if found else None
+
+
+# What the channel of a gray picture is called; a Z alone is a depth.
+_LUMINANCE = ("Y", "L", "V", "R", "GRAY", "GREY", "LUMINANCE")
+
+
+def _as_gray(layer: Layer) -> Layer | None:
+    """A layer of one channel, or with a Y beside A and Z, as a color that has it three times."""
+    by_component = {component_of(channel): channel for channel in layer.channels}
+    alone = layer.channels[0] if len(layer.channels) == 1 else by_component.get("Y")
+    gray = alone is not None and (len(layer.channels) == 1 or by_component.keys() <= {"Y", "A", "Z"})
+    return replace(layer, channels=(alone,) * 3) if gray and alone is not None else None
+
+
 _NEEDS = {
-    "color": "it needs channels R, G and B",
-    "albedo": "it needs channels R, G and B",
-    "estimate": "it needs channels R, G and B",
+    "color": "it needs channels R, G and B, or one channel",
+    "albedo": "it needs channels R, G and B, or one channel",
+    "estimate": "it needs channels R, G and B, or one channel",
     "normal": "it needs channels X, Y and Z, or R, G and B",
     "depth": "it needs one channel, or Z",
     "motion": "it needs channels X and Y, U and V, or R and G, or X, Y, Z and W",
@@ -511,7 +532,7 @@ def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | No
             return Layer(layer.name, layer.part, layer.view, tuple(by_component[c] for c in components))
     if named and role in ("depth", "variance", "alpha") and len(layer.channels) == 1:
         return layer
-    return None
+    return _as_gray(layer) if named and role in ("albedo", "estimate") else None
 
 
 def _group(layer: Layer) -> str:

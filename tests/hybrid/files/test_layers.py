@@ -48,6 +48,32 @@ def test_where_cycles_has_denoised_combined_is_the_estimate_and_is_replaced(tmp_
     assert str(layers.estimate) == str(layers.target) == "ViewLayer.Combined.RGB"
 
 
+@pytest.mark.parametrize(
+    ("names", "color"),
+    [
+        ("Y", "Y"),
+        ("Y A Z", "Y"),
+        ("L", "L"),
+        ("R", "R"),
+        ("beauty.Y albedo.Y N.X N.Y N.Z", "beauty.Y"),
+        ("ViewLayer.Combined.V ViewLayer.Depth.Z", "ViewLayer.Combined.V"),
+    ],
+)
+def test_gray_is_a_color_of_one_channel(tmp_path, names, color):
+    layers = find_layers(headers(tmp_path, names.split()))
+    assert str(layers.color) == color
+    assert layers.color.channels == (color,) * 3
+    assert str(layers.albedo) == ("albedo.Y" if "albedo" in names else "None")
+
+
+@pytest.mark.parametrize("names", ["Z", "A", "X Y Z", "N.X N.Y N.Z", "depth.Y", "Y RY BY"])
+def test_a_map_is_no_gray_color(tmp_path, names):
+    image = headers(tmp_path, names.split())
+    with pytest.raises(ExrError, match="no color layer"):
+        find_layers(image)
+    assert find_layers(headers(tmp_path, ["mine.Y", "x.Z"]), {"color": "mine"}).color.channels == ("mine.Y",) * 3
+
+
 @pytest.mark.parametrize("group", ["", "ViewLayer."])
 def test_of_a_file_output_node_the_image_is_replaced(tmp_path, group):
     """The Noisy Image was, which nobody opens."""

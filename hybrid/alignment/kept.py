@@ -1,0 +1,134 @@
+"""Parts of a frame's color that no filter takes: set apart before anything is made of it, and put back last.
+
+A sun beyond the range of half would shine over the frame, the negative light of a color outside of the gamut would be
+cut off by every denoiser, and a gray picture would be tinted by networks that learned from colors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.transfer import compress, measure_exposure
+from hybrid.files.exr import HALF_MAX
+from hybrid.files.frames import Frame
+from nlm.guided import guided_filter
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Fewer pixels of +Inf that touch are fireflies: one bright sample covers a pixel, a renderer's filter up to 2×2.
+_LIGHT = 5
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is put back into the picture of a frame.
+
+    Attributes
+    ----------
+    beyond : (H, W, 3) array or None
+        Radiance of lights brighter than half can hold: `HALF_MAX` where it is +Inf; NaN in all other pixels.
+    negative : (H, W, 3) array or None
+        Negative radiance of colors outside of the gamut, noisy.
+    gray : frozenset of str
+        Of "color" and the AOVs those whose three channels are the same everywhere.
+    """
+
+    beyond: Array | None = None
+    negative: Array | None = None
+    gray: frozenset[str] = frozenset()
+
+    @property
+    def lights(self) -> Mask | None:
+        """The pixels of lights beyond half (H, W), or None."""
+        return None if self.beyond is None else ~np.isnan(self.beyond[..., 0])
+
+    @property
+    def count(self) -> int:
+        """How many values are `HALF_MAX` in the place of +Inf."""
+        return 0 if self.beyond is None else int(np.count_nonzero(self.beyond == np.float32(HALF_MAX)))
+
+    def restore(self, picture: Array, guide: Array | None) -> Array:
+        """Put all of it back into a picture.
+
+        Parameters
+        ----------
+        picture : (H, W, 3) array
+            Denoised radiance, of what `set_apart` has left.
+        guide : (H, W, G) array or None
+            Albedo and normal, finite.
+
+        Returns
+        -------
+        (H, W, 3) array
+            The picture plus the local mean of the negative light.
+        """
+        if "color" in self.gray:
+            picture = as_gray(picture)
+        if self.negative is not None:
+            shown = compress(picture, measure_exposure(picture))
+            shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
+            picture = picture + guided_filter(self.negative, shown, radius=4, eps=1e-3)
+        if self.beyond is not None:
+            picture = np.where(np.isnan(self.beyond), picture, self.beyond)
+        return np.asarray(picture, np.float32)
+
+
+def set_apart(frame: Frame) -> tuple[Array, Kept]:
+    """Divide a frame's color into what is denoised and what is kept.
+
+    Parameters
+    ----------
+    frame : Frame
+        As read.
+
+    Returns
+    -------
+    color : (H, W, 3) array
+        Radiance; as before not finite where it is lost.
+    kept : Kept
+        The rest.
+
+    Notes
+    -----
+    A color outside of the gamut has negative channels and light in others: what is negative in a channel counts up to
+    the light of the brightest one. A pixel that is negative altogether is one that a filter with negative lobes has
+    left beside a lamp, and stays.
+    """
+    color, negative = frame.color, None
+    if (color < 0).any():
+        light = np.maximum(color.max(axis=-1, keepdims=True), 0)
+        negative = np.nan_to_num(np.maximum(np.minimum(color, 0), -light), nan=0, posinf=0, neginf=0)
+        color = color - negative
+        negative = negative if negative.any() else None
+    layers = {"color": frame.color, **frame.aovs}
+    gray = frozenset(name for name, layer in layers.items() if _is_gray(layer))
+    return color, Kept(_lights(frame), negative, gray)
+
+
+def as_gray(picture: Array) -> Array:
+    """The mean of three channels, in all three."""
+    return np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
+
+
+def _is_gray(layer: Array) -> bool:
+    """Whether three channels are the same everywhere."""
+    if layer.shape[-1] != 3:
+        return False
+    first = layer[..., 0]
+    return all(np.array_equal(first, layer[..., c], equal_nan=True) for c in (1, 2))
+
+
+def _lights(frame: Frame) -> Array | None:
+    """The radiance of lights beyond half, NaN elsewhere; None without such lights."""
+    if frame.beyond is None:
+        return None
+    known = np.where(frame.beyond, np.float32(HALF_MAX), frame.color)
+    mask = frame.beyond.any(axis=-1) & np.isfinite(known).all(axis=-1)
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(np.asarray(mask, np.uint8), connectivity=8)
+    mask &= sizes[labels, cv2.CC_STAT_AREA] >= _LIGHT
+    return np.where(mask[..., None], known, np.float32(np.nan)) if mask.any() else None

@@ -1,0 +1,136 @@
+"""Suns beyond half, negative light of wide gamuts and gray pictures come out as they were rendered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.alignment.kept import set_apart
+from hybrid.alignment.prepare import prepare
+from hybrid.cli import main
+from hybrid.files.exr import HALF_MAX, read_exr, write_layers
+from hybrid.files.frames import Frame, open_shot
+
+SIZE = (40, 56)
+COMMANDS = [["pseudoref", "--preset", "draft"], ["denoise", "--preset", "fast"]]
+BLOCK = slice(12, 28), slice(16, 36)
+
+
+def colors() -> list[np.ndarray]:
+    """Three still frames of 0.5 under gamma-distributed noise."""
+    rng = np.random.default_rng(3)
+    return [np.repeat(rng.gamma(16, 0.5 / 16, (*SIZE, 1)), 3, axis=2).astype(np.float32) for _ in range(3)]
+
+
+def denoised(folder: Path, frames: list[np.ndarray], command: list[str], name: str = "color", half: bool = True) -> str:
+    """Run a command on frames; what it has said is left to the caller's capture."""
+    (folder / "in").mkdir()
+    for number, color in enumerate(frames):
+        albedo = np.full((*SIZE, 3), 0.5, np.float32)
+        albedo[BLOCK] = 0.8
+        layers = {name: color, "albedo": albedo, "motion": np.zeros((*SIZE, 4), np.float32)}
+        write_layers(folder / "in" / f"a.{number:04d}.exr", layers, half=half)
+    if command[0] == "denoise":
+        pytest.importorskip("torch")
+    assert main([command[0], str(folder / "in"), "-o", str(folder / "out"), *command[1:]]) == 0
+    return str(folder / "out" / "a.0001.exr")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_sun_of_inf_becomes_the_largest_half(tmp_path, capsys, command):
+    """It was filled in from its surroundings like NaN."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    sun = (y - 20) ** 2 + (x - 28) ** 2 < 20
+    frames = colors()
+    for frame in frames:
+        frame[sun] = np.inf
+        frame[5, 5], frame[30, 9] = np.inf, np.nan  # a firefly, and a lost pixel
+        frame[20, 28, 2] = 900
+    found = read_exr(denoised(tmp_path, frames, command)).pixels(("color.R", "color.G", "color.B"))
+    assert (found[sun][:, :2] == HALF_MAX).all()
+    assert found[20, 28, 2] == 900
+    assert found[~sun].max() < 1  # and it does not shine over the rest
+    values = 3 * np.count_nonzero(sun) - 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"frame 1: {values} values too large for half, written as 65504" in said
+    assert "frame 1: 2 pixels were not finite, filled in" in said
+
+
+def test_inf_of_floats_and_other_infinities_are_lost(tmp_path):
+    color = colors()[0]
+    color[10:20, 10:20] = np.inf
+    write_layers(tmp_path / "a.0001.exr", {"color": color}, half=False)
+    frame = open_shot(tmp_path).read(1)
+    assert frame.beyond is None
+    assert np.isnan(frame.color[12, 12]).all()
+    beyond = np.zeros((*SIZE, 3), bool)
+    beyond[10:20, 10:20] = True
+    color[beyond] = np.nan
+    prepared = prepare(Frame(1, color, beyond=beyond))
+    assert (prepared.repaired, prepared.kept.count, int((~prepared.valid).sum())) == (0, 300, 100)
+    lost = beyond.copy()
+    lost[..., 0] = False  # red is NaN in the file itself
+    prepared = prepare(Frame(1, color, beyond=lost))
+    assert (prepared.repaired, prepared.kept.count) == (100, 0)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("scale", [1.0, 64.0])
+def test_negative_light_of_a_wide_gamut_is_kept_in_the_mean(tmp_path, command, scale):
+    """It was cut off at 0."""
+    frames = [frame * np.float32(scale) for frame in colors()]
+    for frame in frames:
+        frame[BLOCK][..., 0] *= -0.125
+    found = read_exr(denoised(tmp_path, frames, command, half=False)).pixels(("color.R", "color.G", "color.B"))
+    inner = found[15:25, 19:33]
+    assert inner[..., 0].mean() == pytest.approx(-0.0625 * scale, rel=0.05)
+    assert inner[..., 1].mean() == pytest.approx(0.5 * scale, rel=0.05)
+    outside = np.delete(found[..., 0], np.s_[9:31], axis=0)
+    assert outside.min() > 0.4 * scale
+
+
+def test_what_a_filter_leaves_beside_a_lamp_is_no_color():
+    """Negative in all channels: spread over its surroundings it would darken them."""
+    color = colors()[0]
+    color[20, 20] = -30, -40, -20
+    color[30, 30] = -30, 0.25, -0.125
+    apart, kept = set_apart(Frame(1, color))
+    assert kept.negative is not None
+    assert np.count_nonzero(kept.negative) == 2
+    np.testing.assert_array_equal(kept.negative[30, 30], [-0.25, 0, -0.125])
+    np.testing.assert_array_equal(apart + kept.negative, color)
+    assert set_apart(Frame(1, np.abs(color)))[1].negative is None
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, ["pseudoref", "--preset", "gathered"]])
+def test_gray_stays_gray(tmp_path, command):
+    """Networks that learned from colors tinted it by half a percent."""
+    found = read_exr(denoised(tmp_path, colors(), command, half=False)).pixels(("color.R", "color.G", "color.B"))
+    np.testing.assert_array_equal(found, np.repeat(found[..., :1], 3, axis=2))
+    assert found.mean() == pytest.approx(0.5, rel=0.02)
+
+
+def test_of_layers_only_those_that_are_gray_everywhere_count():
+    color = colors()[0]
+    color[3, 4] = np.nan
+    tinted = color.copy()
+    tinted[20, 20, 1] *= 1.01
+    frame = Frame(1, color, aovs={"tinted": tinted, "gray": color * 2, "one": color[..., :1]})
+    assert set_apart(frame)[1].gray == {"color", "gray"}
+    assert set_apart(replace(frame, color=tinted))[1].gray == {"gray"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("name", ["", "beauty", "ViewLayer.Combined"])
+def test_a_file_of_luminance_alone_is_denoised(tmp_path, command, name):
+    """The error proposed a layer that was refused."""
+    frames = [frame[..., 0] for frame in colors()]
+    image = read_exr(denoised(tmp_path, frames, command, name=name))
+    channel = f"{name}.Y" if name else "Y"
+    assert [n for n in image.channel_names if n.endswith("Y") and "motion" not in n] == [channel]
+    found = image.channel(channel).astype(float)
+    assert found.mean() == pytest.approx(0.5, rel=0.02)
+    assert found.std() < 0.5 * frames[1].std()
