@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -87,13 +87,15 @@ def open_apart(role: str, value: str) -> Apart:
     return Apart(role, value, find_files(spec)[0], layer)
 
 
-def find_companions(files: Mapping[int, Path]) -> tuple[Profile | None, list[Apart]]:
+def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> tuple[Profile | None, list[Apart]]:
     """Sequences that a renderer writes beside the color's, under names made from its name.
 
     Parameters
     ----------
     files : mapping of int to Path
         Those of the color.
+    named : collection of str
+        Roles whose layers the user names, which are not searched for.
 
     Returns
     -------
@@ -126,10 +128,12 @@ def find_companions(files: Mapping[int, Path]) -> tuple[Profile | None, list[Apa
                     found.append(apart)
         if found:
             return replace(profile, why=f"{found[0].spec} beside it"), found
-    return _find_elements(own, files)
+    return _find_elements(own, files, named)
 
 
-def _find_elements(own: Pattern, files: Mapping[int, Path]) -> tuple[Profile | None, list[Apart]]:
+def _find_elements(
+    own: Pattern, files: Mapping[int, Path], named: Collection[str]
+) -> tuple[Profile | None, list[Apart]]:
     """Guides that lie beside the color, a sequence each, under its name and their own (``view.normals.####.exr``)."""
     stem = _stem(own)
     beside = [p for p in list_patterns(own.folder) if p.after == own.after and _begins(_stem(p), stem)] if stem else []
@@ -144,7 +148,8 @@ def _find_elements(own: Pattern, files: Mapping[int, Path]) -> tuple[Profile | N
     if assigned is None:
         return None, []
     profile, roles = assigned
-    missing = {role: found for role, found in roles.items() if role in GUIDES and getattr(known, role) is None}
+    wanted = {role for role in GUIDES if role not in named and getattr(known, role) is None}
+    missing = {role: found for role, found in roles.items() if role in wanted}
     apart = _only_each(own.folder, missing)
     why = f"{', '.join(other.spec for other in apart)} beside it"
     return (_told_by(image, profile, why) if apart else None), apart

@@ -728,7 +728,7 @@ def open_shot(
     if "color" in said:
         raise ValueError(f"color is {said['color']!r}, expected that sequence as the shot, over whose files is written")
     files, named, beside = _gather(str(spec))
-    known, companions = beside or find_companions(files)
+    known, companions = beside or find_companions(files, {*(layers or {})})
     own = [open_apart(role, value) for role, value in said.items()]
     apart = [other for other in companions if other.role not in {*(layers or {})}]
     shot = Shot(

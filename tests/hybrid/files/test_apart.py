@@ -261,3 +261,17 @@ def test_what_names_a_sequence_and_what_a_layer() -> None:
         assert names_sequence(value)
     for value in ("albedo", "ViewLayer.Denoising Albedo", "exr", "a.exrs", "no/folder"):
         assert not names_sequence(value)
+
+
+def test_a_guide_that_is_named_settles_which_of_two_beside_the_color(tmp_path: Path) -> None:
+    for truth in FRAMES:
+        number = f"{truth.number:04d}.exr"
+        save(tmp_path / f"shot.{number}", color(truth))
+        for name in ("N", "normal"):
+            save(tmp_path / f"shot.{name}.{number}", layer("", "XYZ", truth.normal))
+    spec, chosen = tmp_path / "shot.####.exr", str(tmp_path / "shot.N.####.exr")
+    with pytest.raises(ValueError, match="normal can be"):
+        open_shot(spec)
+    normal = open_shot(spec, layers={"normal": chosen}).layers(10).normal
+    assert normal is not None
+    assert normal.file == chosen
