@@ -121,6 +121,8 @@ def test_another_file_is_not_overwritten(tmp_path):
         lambda d: d["frames"].update({"1": {"state": "made", "file": "../1.exr", "seconds": 1}}),
         lambda d: d["frames"].update({"1": {"state": "made", "file": "/dev/null", "seconds": 1}}),
         lambda d: d["frames"].update({"1": {"state": "made", "file": "a\0", "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "..\\1.exr", "seconds": 1}}),
+        lambda d: d["frames"].update({"1": {"state": "made", "file": "C:1.exr", "seconds": 1}}),
         lambda d: d["frames"].update({"1": {"state": "made", "file": "1.exr", "seconds": "x"}}),
         lambda d: d["frames"].update({"2": d["frames"]["1"]}),
         lambda d: d["frames"].update({"1": {"state": "failed"}}),

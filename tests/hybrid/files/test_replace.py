@@ -182,3 +182,10 @@ def test_two_outputs_are_two_files(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "in")
     with pytest.raises(ValueError, match=r"breakdown .*link/a' would overwrite preview .*in/a'"):
         check_outputs([("preview", tmp_path / "in" / "a"), ("breakdown", tmp_path / "link" / "a")], [])
+
+
+def test_a_name_that_windows_keeps_for_itself_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(replace, "is_reserved", lambda path: path.name.startswith("aux"))
+    with pytest.raises(OSError, match=r"aux\.0001\.exr: Windows does not take 'aux\.0001\.exr' as a name"):
+        check_outputs([("output", tmp_path / "aux.0001.exr")], [])
+    check_outputs([("output", tmp_path / "shot.0001.exr")], [])

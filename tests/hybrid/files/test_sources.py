@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid.files import sources
 from hybrid.files.exr import write_layers
 from hybrid.files.sources import HASHED, MADE_FROM, Source, describe_sources, identify, sources_in, why_stale
 
@@ -89,3 +90,9 @@ def test_a_damaged_picture_is_stale_and_of_a_kept_one_the_header_is_enough(tmp_p
     assert why_stale(path, now, whole=False) is None
     (tmp_path / "none.exr").write_text("no picture")
     assert sources_in(tmp_path / "none.exr") == {}
+
+
+def test_versions_are_the_same_for_the_wheels_of_all_systems(monkeypatch):
+    """torch is 2.13.0+cpu on Linux and 2.13.0 on Windows; `--resume` made all frames again on the other."""
+    monkeypatch.setattr(sources, "version", lambda package: "2.13.0+cpu" if package == "torch" else "1.0")
+    assert sources.versions("torch", "numpy") == {"torch": "2.13.0", "numpy": "1.0"}
