@@ -45,6 +45,9 @@ for frame in job["frames"]:
 
 @pytest.fixture
 def stub(tmp_path):
+    if sys.platform == "win32":
+        pytest.skip("the stub is a script of a shell")
+
     def make(found=0, fail="False"):
         script = tmp_path / "stub.py"
         script.write_text(STUB.format(found=found, fail=fail))
