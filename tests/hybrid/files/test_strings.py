@@ -33,6 +33,11 @@ def exchange(path: Path, strings: dict[bytes, bytes]) -> Path:
     return path
 
 
+def decode(data):
+    """Not `os.fsdecode`, which refuses such bytes on Windows."""
+    return data.decode("utf-8", "surrogateescape")
+
+
 @pytest.mark.parametrize("value", STRINGS.values(), ids=STRINGS)
 def test_strings_of_any_encoding_are_kept_to_the_byte(tmp_path, value):
     """A file of a studio that writes Latin-1 was "damaged"."""
@@ -42,10 +47,10 @@ def test_strings_of_any_encoding_are_kept_to_the_byte(tmp_path, value):
     assert image.parts[0].header["owner"].encode("utf-8", "surrogateescape") == value
     assert image.parts[0].header["comments"] == "Zoë"
     assert read_exr(source, pixels=False).parts[0].header["owner"] == image.parts[0].header["owner"]
-    write_exr(tmp_path / "b.exr", image, {"G": channels["B"]}, attributes={"note": os.fsdecode(b"caf\xe9")})
+    write_exr(tmp_path / "b.exr", image, {"G": channels["B"]}, attributes={"note": decode(b"caf\xe9")})
     again = read_exr(tmp_path / "b.exr")
     assert again.parts[0].header["owner"] == image.parts[0].header["owner"]
-    assert again.parts[0].header["note"] == os.fsdecode(b"caf\xe9")
+    assert again.parts[0].header["note"] == decode(b"caf\xe9")
     np.testing.assert_array_equal(again.channel("G"), channels["B"])
     data = (tmp_path / "b.exr").read_bytes()
     assert b"owner\0string\0" + len(value).to_bytes(4, "little") + value in data
@@ -56,12 +61,12 @@ def test_names_of_parts_in_any_encoding_are_kept_too(tmp_path):
     source = save_parts(tmp_path / "a.exr", parts, {"AAAA": {"owner": "BBBB"}})
     exchange(source, {b"AAAA": b"caf\xe9", b"BBBB": b"\x83\x8c\x83\x93"})
     image = read_exr(source)
-    assert image.parts[1].name == os.fsdecode(b"caf\xe9")
-    assert os.fsdecode(b"caf\xe9.X") in image.channel_names
+    assert image.parts[1].name == decode(b"caf\xe9")
+    assert decode(b"caf\xe9.X") in image.channel_names
     write_exr(tmp_path / "b.exr", image, {"first.R": image.channel("first.G")})
     again = read_exr(tmp_path / "b.exr")
     assert again.channel_names == image.channel_names
-    assert again.parts[1].header["owner"] == os.fsdecode(b"\x83\x8c\x83\x93")
+    assert again.parts[1].header["owner"] == decode(b"\x83\x8c\x83\x93")
 
 
 @given(st.binary(max_size=400))
