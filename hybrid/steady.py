@@ -22,6 +22,7 @@ from hybrid.alignment.window import AlignedWindow
 from hybrid.plausibility import find_lost_light, find_nonfinite
 from nlm.average import average
 from nlm.fireflies import Lights, add_lights
+from nlm.moving_lights import find_bright, witnessed
 from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
@@ -140,6 +141,8 @@ class Pictures:
         if (frame := self.aligner.frames.get(number)) is not None:
             self._check_light(denoised.color, frame)
             denoised = self._correct(denoised, frame, sides, counts.stages)
+            if "samples" in counts.stages:
+                denoised = self._with_moving_lights(denoised, frame)
             if frame.lamps is not None:
                 denoised = _with_lamps(denoised, frame.lamps)
             denoised, counts = _with_kept(denoised, frame), replace(counts, beyond=frame.kept.count)
@@ -211,6 +214,22 @@ class Pictures:
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
         return _changed(denoised, color) if denoised.parts else replace(denoised, color=color)
 
+    def _with_moving_lights(self, denoised: Denoised, frame: PreparedFrame) -> Denoised:
+        """The denoised frame with bright pixels as rendered that the pictures beside it show to move together."""
+        step = self.aligner.shot.step
+        others = [n for n in (frame.number - step, frame.number + step) if n in self._made]
+        with self.aligner.timings.stage("samples"):
+            own = _excess(frame, self._made[frame.number][0].color)
+            bright = find_bright(own)
+            if not (others and bright.any()):
+                return denoised
+            seen = np.zeros_like(bright)
+            for n in others:
+                other = _excess(self.aligner.frames[n], self._made[n][0].color)
+                seen |= witnessed(own, bright, other, find_bright(other))
+            color = np.where(seen[..., None], frame.rendered, denoised.color)
+        return _changed(denoised, color) if denoised.parts else replace(denoised, color=color)
+
     def _steady(self, number: int, denoised: Denoised, pictures: Mapping[int, Array]) -> Denoised:
         """The denoised frame averaged with those beside it, and its parts changed alike."""
         color = np.empty_like(denoised.color)
@@ -224,6 +243,12 @@ class Pictures:
     def _bands(self) -> list[slice]:
         height = self.aligner.shot.shape[0]
         return [slice(top, min(top + self.rows, height)) for top in range(0, height, self.rows)]
+
+
+def _excess(frame: PreparedFrame, picture: Array) -> Array:
+    """By how much a frame as rendered exceeds its picture, relative to the picture plus the exposure (H, W)."""
+    light = picture.mean(axis=-1) + np.float32(measure_exposure(picture))
+    return np.asarray((frame.rendered - picture).mean(axis=-1) / light * frame.valid, np.float32)
 
 
 def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array:

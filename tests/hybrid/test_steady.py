@@ -285,7 +285,8 @@ class TestMean:
         """Twenty pixels of each frame, others in each, shine, and are taken out. Held to the limit, they are 2.5 %."""
 
         def places(index):
-            return np.s_[10 + 5 * index :: 40, 10 + 5 * index :: 40]
+            cells = np.mgrid[10:160:40, 10:200:40].reshape(2, -1)
+            return tuple(cells + np.random.default_rng(index).integers(0, 20, cells.shape))  # none near another
 
         def shine(index, layers):
             color = layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"].copy()
@@ -449,3 +450,28 @@ class TestSamples:
         shot = open_shot(scene.write(tmp_path))
         whole, parts = (made(shot, self.blurred, rules=Rules(), rows=rows) for rows in (None, 32))
         np.testing.assert_array_equal(whole, parts)
+
+    def test_snow_that_a_denoiser_takes_for_noise_stays(self, tmp_path):
+        """Flakes of a pixel that fall by seven rows a frame, which no vector says."""
+        flakes = np.random.default_rng(5).integers(0, (96, 160), (90, 2))
+        scene = Scene(height=96, width=160, frames=5, step=(0, 0), noise=0.1)
+
+        def snow(index, layers):
+            color = layers["ViewLayer.Combined"]
+            rows, columns = (flakes + np.array([7 * index, 0])).T
+            color[rows % 96, columns] = 5
+
+        shot = open_shot(scene.write(tmp_path, edit=snow))
+        number = scene.first + 2
+        blind = OfFrames(lambda frame: cv2.medianBlur(np.ascontiguousarray(frame.color), 5))
+
+        def median(aligned):
+            return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.own * aligned.modulation), 5))
+
+        result = made(shot, median, number, Rules(), estimates=blind)
+        rows, columns = (flakes + np.array([14, 0])).T
+        inside = (rows >= 8) & (rows < 88)
+        assert np.mean(result[rows[inside] % 96, columns[inside]].mean(axis=-1) > 4) > 0.9
+        elsewhere = np.ones((96, 160), bool)
+        elsewhere[rows % 96, columns] = False
+        assert np.abs(result - truth(scene, number))[elsewhere].mean() < 0.1

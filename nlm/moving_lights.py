@@ -1,0 +1,106 @@
+"""Bright pixels that move together, such as snow, rain and sparks: content that no motion vector describes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# A pixel is bright where it exceeds the picture by half of the light, and by eight deviations of what most pixels do.
+_ABOVE, _DEVIATIONS = 0.5, 8.0
+# So few bright pixels tell no motion, and so great a share of all is noise.
+_LEAST, _MOST = 20, 0.05
+# Motion is searched for within so many pixels a frame, on a block of so many pixels on a side.
+_REACH, _BLOCK = 32, 512
+# A motion is one that this share of the bright pixels have, and more than chance by six deviations and eight pixels.
+_SHARE, _SIGMAS, _MORE = 0.05, 6.0, 8
+# The same light differs by a factor of two at most.
+_ALIKE = 2.0
+
+
+def find_bright(excess: Floats) -> Mask:
+    """Find the bright pixels of a frame.
+
+    Parameters
+    ----------
+    excess : (H, W) float32
+        What the frame shows beyond its denoised picture, relative to the light.
+
+    Returns
+    -------
+    (H, W) bool
+        All False where there are too few to tell a motion, or too many.
+    """
+    bulk = 1.4826 * float(np.median(np.abs(excess)))
+    bright = excess > max(_ABOVE, _DEVIATIONS * bulk)
+    count = np.count_nonzero(bright)
+    return bright if _LEAST <= count <= _MOST * bright.size else np.zeros_like(bright)
+
+
+def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
+    """Find by how many rows and columns the bright pixels of a frame move together to those of another.
+
+    Parameters
+    ----------
+    here, there : (H, W) bool
+        From `find_bright`.
+
+    Returns
+    -------
+    list of (int, int)
+        Motions of more pixels than chance explains; none of at most one pixel, which noise of one seed has as well.
+
+    Notes
+    -----
+    The cross-correlation of both masks counts for each motion the pixels that have it. Independent bright pixels, N
+    and M of A, give N M / A, with Poisson's deviation.
+    """
+    rows, columns = (_busiest(here.sum(axis=1 - axis)) for axis in (0, 1))
+    a, b = (mask[rows, columns].astype(np.float64) for mask in (here, there))
+    if a.sum() < _LEAST or b.sum() < _LEAST:
+        return []
+    size = [length + _REACH for length in a.shape]
+    counts = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size).round()
+    steps = np.arange(-_REACH, _REACH + 1)
+    counts = counts[np.ix_(steps % size[0], steps % size[1])]
+    counts[_REACH - 1 : _REACH + 2, _REACH - 1 : _REACH + 2] = 0
+    chance = a.sum() * b.sum() / a.size
+    enough = max(chance + _SIGMAS * np.sqrt(chance) + _MORE, _SHARE * a.sum())
+    return [(int(y) - _REACH, int(x) - _REACH) for y, x in np.argwhere(counts >= enough)]
+
+
+def witnessed(excess: Floats, bright: Mask, other_excess: Floats, other_bright: Mask) -> Mask:
+    """Tell which bright pixels of a frame another frame shows where their shared motion leads.
+
+    Parameters
+    ----------
+    excess, other_excess : (H, W) float32
+        As for `find_bright`, of the frame and of the other one.
+    bright, other_bright : (H, W) bool
+        From `find_bright`.
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    found = np.zeros_like(bright)
+    height, width = bright.shape
+    rows, columns = np.nonzero(bright)
+    for down, right in shared_motions(bright, other_bright):
+        y, x = rows + down, columns + right
+        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        y, x, own_y, own_x = y[inside], x[inside], rows[inside], columns[inside]
+        own, other = excess[own_y, own_x], other_excess[y, x]
+        alike = other_bright[y, x] & (other <= _ALIKE * own) & (own <= _ALIKE * other)
+        found[own_y[alike], own_x[alike]] = True
+    return found
+
+
+def _busiest(counts: NDArray[np.intp]) -> slice:
+    """The stretch of at most `_BLOCK` rows or columns that holds most bright pixels."""
+    length = min(_BLOCK, len(counts))
+    sums = np.convolve(counts, np.ones(length), "valid")
+    first = int(np.argmax(sums))
+    return slice(first, first + length)

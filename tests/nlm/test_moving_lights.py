@@ -1,0 +1,63 @@
+"""Bright pixels that move together are content; those that do not are noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nlm.moving_lights import find_bright, shared_motions, witnessed
+
+SHAPE = (96, 128)
+
+
+def excess(places: np.ndarray, light: float = 2.0, seed: int = 1) -> np.ndarray:
+    """Weak noise, and bright pixels at these rows and columns, as far as they are in the frame."""
+    image = np.random.default_rng(seed).normal(0, 0.03, SHAPE).astype(np.float32)
+    inside = (places >= 0).all(axis=1) & (places < SHAPE).all(axis=1)
+    image[tuple(places[inside].T)] = light
+    return image
+
+
+@pytest.fixture
+def flakes() -> np.ndarray:
+    return np.random.default_rng(2).integers(0, SHAPE, (120, 2))
+
+
+@pytest.mark.parametrize("motion", [(9, 0), (-3, 14), (2, 0), (0, -31)])
+def test_flakes_that_fall_together_are_found(flakes, motion) -> None:
+    here, there = excess(flakes), excess(flakes + motion, seed=3)
+    bright = find_bright(here), find_bright(there)
+    assert shared_motions(*bright) == [motion]
+    found = witnessed(here, bright[0], there, bright[1])
+    moved = flakes + motion
+    stay = flakes[(moved >= 0).all(axis=1) & (moved < SHAPE).all(axis=1)]
+    assert found[tuple(stay.T)].all()
+    assert np.count_nonzero(found) == len(np.unique(stay, axis=0))
+
+
+def test_two_speeds_at_once_are_found(flakes) -> None:
+    moved = flakes + np.where(np.arange(120)[:, None] < 40, [13, 1], [9, 0])
+    assert sorted(shared_motions(find_bright(excess(flakes)), find_bright(excess(moved)))) == [(9, 0), (13, 1)]
+
+
+@pytest.mark.parametrize("share", [0.002, 0.01, 0.04])
+@pytest.mark.parametrize("seed", range(5))
+def test_fireflies_share_no_motion(share, seed) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [excess(rng.integers(0, SHAPE, (int(share * 96 * 128), 2)), seed=seed + k) for k in (0, 9)]
+    assert shared_motions(*map(find_bright, frames)) == []
+
+
+def test_noise_that_stands_still_is_no_motion(flakes) -> None:
+    bright = find_bright(excess(flakes))
+    assert shared_motions(bright, bright) == []
+
+
+def test_another_light_at_the_same_place_is_no_witness(flakes) -> None:
+    here, there = excess(flakes), excess(flakes + np.array([9, 0]), light=9.0)
+    assert not witnessed(here, find_bright(here), there, find_bright(there)).any()
+
+
+def test_too_few_and_too_many_bright_pixels_tell_nothing() -> None:
+    assert not find_bright(excess(np.array([[3, 4], [50, 60]]))).any()
+    assert not find_bright(np.where(np.random.default_rng(4).random(SHAPE) < 0.2, 5, 0).astype(np.float32)).any()
