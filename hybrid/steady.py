@@ -27,9 +27,9 @@ from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
 
-# By how much a pixel may change at most where pictures are averaged, or where it has parts: these change with it, and a
-# part of next to nothing must not become a light.
-MOST = 2.0
+# By how much a pixel may change at most where pictures are averaged; and where samples correct a pixel that has parts,
+# which change with it, so that the color is the same with and without them but where it was next to nothing.
+MOST, CORRECTED = 2.0, 1e4
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class Pictures:
             with self.aligner.timings.stage("samples"):
                 noisy = _where_rendered(frame, frame.radiance, color)
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
-        return _changed(denoised, color) if denoised.parts else replace(denoised, color=color)
+        return _changed(denoised, color, CORRECTED)
 
     def _with_moving_lights(self, denoised: Denoised, frame: PreparedFrame) -> Denoised:
         """The denoised frame with bright pixels as rendered that the pictures beside it show to move together."""
@@ -228,7 +228,7 @@ class Pictures:
                 other = _excess(self.aligner.frames[n], self._made[n][0].color)
                 seen |= witnessed(own, bright, other, find_bright(other))
             color = np.where(seen[..., None], frame.rendered, denoised.color)
-        return _changed(denoised, color) if denoised.parts else replace(denoised, color=color)
+        return _changed(denoised, color, CORRECTED)
 
     def _steady(self, number: int, denoised: Denoised, pictures: Mapping[int, Array]) -> Denoised:
         """The denoised frame averaged with those beside it, and its parts changed alike."""
@@ -256,10 +256,12 @@ def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array
     return noisy if frame.valid.all() else np.where(frame.valid[..., None], noisy, picture)
 
 
-def _changed(denoised: Denoised, color: Array) -> Denoised:
-    """The picture with another color, and its parts changed alike: by a factor of `MOST` at most."""
-    own = denoised.color
-    bounded = np.clip(color, own / MOST, own * MOST)  # before the division, which may exceed float32
+def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
+    """The picture with another color, and its parts, if any, changed alike: by a factor of `most` at most."""
+    own, most = denoised.color, np.float32(most)
+    if most > MOST and not denoised.parts:
+        return replace(denoised, color=color)
+    bounded = np.clip(color, own / most, own * most)  # before the division, which may exceed float32
     change = np.divide(bounded, own, out=np.ones_like(own), where=own > 0)
     within = (own <= 0) | (bounded == color)
     aovs, extra = (
