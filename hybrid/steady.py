@@ -258,10 +258,10 @@ def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array
 
 def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
     """The picture with another color, and its parts, if any, changed alike: by a factor of `most` at most."""
-    own, most = denoised.color, np.float32(most)
+    own, factor = denoised.color, np.float32(most)
     if most > MOST and not denoised.parts:
         return replace(denoised, color=color)
-    bounded = np.clip(color, own / most, own * most)  # before the division, which may exceed float32
+    bounded = np.clip(color, own / factor, own * factor)  # before the division, which may exceed float32
     change = np.divide(bounded, own, out=np.ones_like(own), where=own > 0)
     within = (own <= 0) | (bounded == color)
     aovs, extra = (

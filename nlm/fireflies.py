@@ -200,10 +200,12 @@ def in_calm(own: Lights, color: Floats, pixels: Places, other: Floats) -> Mask:
     ----------
     own : Lights
         Of the frame, K, within it.
-    color, other : (H, W, C) float32
-        The frame, and another, finite.
+    color : (H, W, C) float32
+        The frame, finite.
     pixels : (K, 2) intp
         Where the motion leads in the other.
+    other : (H, W, C) float32
+        The other frame, finite.
 
     Returns
     -------
@@ -225,10 +227,12 @@ def bright_near(places: Places, color: Floats, pixels: Places, other: Floats) ->
     ----------
     places : (K, 2) intp
         From `find_fireflies` on `color`.
-    color, other : (H, W, C) float32
-        The frame, and another, finite.
+    color : (H, W, C) float32
+        The frame, finite.
     pixels : (K, 2) intp
         Where the motion leads in the other.
+    other : (H, W, C) float32
+        The other frame, finite.
 
     Returns
     -------

@@ -324,13 +324,31 @@ def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
 
 
 def repeats(grainy: Array, equal: Array) -> bool:
-    """Whether a frame is another once more, by their `equal_noise`; never where there is hardly any."""
+    """Tell whether a frame is another once more; never where there is hardly any noise or detail.
+
+    Parameters
+    ----------
+    grainy, equal : (H, W) array
+        From `equal_noise`.
+    """
     count = np.count_nonzero(grainy)
     return bool(count >= FEW and np.count_nonzero(equal) >= REPEATED * count)
 
 
 def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
-    """Tell around which pixels (K, 2), rows and columns, two frames have the same noise, by their `equal_noise`."""
+    """Tell around which pixels two frames have the same noise.
+
+    Parameters
+    ----------
+    grainy, equal : (H, W) array
+        From `equal_noise`.
+    pixels : (K, 2) array
+        Rows and columns.
+
+    Returns
+    -------
+    (K,) array of bool
+    """
     share = float(equal.sum() / max(grainy.sum(), 1))
     rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))
     side = (NOISE_AROUND, NOISE_AROUND)
