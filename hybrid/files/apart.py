@@ -135,8 +135,7 @@ def _find_elements(
     own: Pattern, files: Mapping[int, Path], named: Collection[str]
 ) -> tuple[Profile | None, list[Apart]]:
     """Guides that lie beside the color, a sequence each, under its name and their own (``view.normals.####.exr``)."""
-    stem = _stem(own)
-    beside = [p for p in list_patterns(own.folder) if p.after == own.after and _begins(_stem(p), stem)] if stem else []
+    beside = [(plain_name(rest), p) for p in list_patterns(own.folder) if (rest := _rest(p, own))]
     if not own.digits or not beside:
         return None, []
     try:
@@ -144,7 +143,7 @@ def _find_elements(
         known = find_layers(image)
     except (ExrError, OSError):  # said where the layers are needed
         return None, []
-    assigned = _assign([("", own), *((plain_name(_stem(p)[len(stem) :].lstrip("._-")), p) for p in beside)])
+    assigned = _assign([("", own), *beside])
     if assigned is None:
         return None, []
     profile, roles = assigned
@@ -224,19 +223,25 @@ def _stem(pattern: Pattern) -> str:
     return pattern.before.removesuffix(".exr").rstrip("._-")
 
 
-def _begins(stem: str, with_: str) -> bool:
-    """Whether a name is another and a further word."""
-    return stem.startswith((f"{with_}.", f"{with_}_", f"{with_}-"))
+def _rest(pattern: Pattern, other: Pattern) -> str:
+    """What the name of a sequence has beyond that of another, before or behind the number; "" where that has more."""
+    name, stem = _stem(pattern), _stem(other)
+    if pattern.after == other.after and stem and name.startswith((f"{stem}.", f"{stem}_", f"{stem}-")):
+        return name[len(stem) :].lstrip("._-")
+    if pattern.before == other.before and pattern.after.endswith(other.after):
+        return pattern.after.removesuffix(other.after).strip("._-")
+    return ""
 
 
 def _label(folder: Path, direct: Sequence[Pattern]) -> list[tuple[str, Pattern]]:
     """The sequences in a folder, or in its folders, each with the part of its name that tells it from the others."""
     if len(direct) > 1:
         stems = [_stem(pattern) for pattern in direct]
-        shortest = min(stems, key=len)
-        if shortest and all(_begins(stem, shortest) for stem in stems if stem != shortest):
-            # The color has no name of its own: view.####.exr beside view.normals.####.exr.
-            return [(plain_name(s[len(shortest) :].lstrip("._-")), p) for s, p in zip(stems, direct, strict=True)]
+        for color in direct:
+            # It has no name of its own: view.####.exr beside view.normals.####.exr.
+            rests = {pattern: _rest(pattern, color) for pattern in direct if pattern != color}
+            if all(rests.values()):
+                return [("", color), *((plain_name(rest), pattern) for pattern, rest in rests.items())]
         alike = "".join(
             letters[0] for letters in takewhile(lambda letters: len({*letters}) == 1, zip(*stems, strict=False))
         )

@@ -52,7 +52,7 @@ def split(folder: Path, names: dict[str, str]) -> None:
 def made(spec: Path, out: Path, *options: str) -> bytes:
     arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
     assert main(arguments) == 0
-    image = read_exr(next(out.glob("*0010.exr")))
+    image = read_exr(next(out.glob("*0010*exr")))
     return b"".join(image.channel(name).tobytes() for name in "RGBA")
 
 
@@ -87,6 +87,8 @@ ELEMENTS = {
     "V-Ray for Maya": {r: f"view.{n}.####.exr" for r, n in zip(ROLES, VRAY, strict=True)} | {"color": "view.####.exr"},
     "3ds Max": {r: f"view_VRay{n}####.exr" for r, n in zip(ROLES, VRAY, strict=True)} | {"color": "view####.exr"},
     "hyphens": {r: f"s-v2-{r}-####.exr" for r in ROLES} | {"color": "s-v2-####.exr"},
+    "behind": {r: f"view.####.{r}.exr" for r in ROLES} | {"color": "view.####.exr"},
+    "numbers": {r: f"####_{r}.exr" for r in ROLES} | {"color": "####.exr"},
     "plain": {r: f"010_{r}.####.exr" for r in ROLES} | {"color": "010.####.exr"},
 }
 
