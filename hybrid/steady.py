@@ -283,6 +283,11 @@ def _with_lamps(denoised: Denoised, lamps: Lights) -> Denoised:
 
 
 def _with_kept(denoised: Denoised, frame: PreparedFrame) -> Denoised:
-    """The picture with what no filter took (`hybrid.alignment.kept`)."""
-    gray = {name: as_gray(layer) for name, layer in denoised.aovs.items() if name in frame.kept.gray}
-    return replace(denoised, color=frame.kept.restore(denoised.color, frame.guide), aovs={**denoised.aovs, **gray})
+    """The picture and its parts with what no filter took (`hybrid.alignment.kept`)."""
+    kept, aovs = frame.kept, dict(denoised.aovs)
+    for name in aovs.keys() & kept.gray:
+        aovs[name] = as_gray(aovs[name])
+    for name in aovs.keys() & kept.negative.keys() & denoised.parts:
+        # Shared out of the picture, which had no negative light, parts have none.
+        aovs[name] = np.maximum(aovs[name], 0) + kept.smooth_negative(name, denoised.color, frame.guide)
+    return replace(denoised, color=kept.restore(denoised.color, frame.guide), aovs=aovs)

@@ -6,7 +6,8 @@ cut off by every denoiser, and a gray picture would be tinted by networks that l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -32,14 +33,14 @@ class Kept:
     ----------
     beyond : (H, W, 3) array or None
         Radiance of lights brighter than half can hold: `HALF_MAX` where it is +Inf; NaN in all other pixels.
-    negative : (H, W, 3) array or None
-        Negative radiance of colors outside of the gamut, noisy.
+    negative : dict of str to (H, W, 3) array
+        Of "color" and the AOVs the negative radiance of colors outside of the gamut, noisy; those that have some.
     gray : frozenset of str
         Of "color" and the AOVs those whose three channels are the same everywhere.
     """
 
     beyond: Array | None = None
-    negative: Array | None = None
+    negative: Mapping[str, Array] = field(default_factory=dict)
     gray: frozenset[str] = frozenset()
 
     @property
@@ -69,13 +70,31 @@ class Kept:
         """
         if "color" in self.gray:
             picture = as_gray(picture)
-        if self.negative is not None:
-            shown = compress(picture, measure_exposure(picture))
-            shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
-            picture = picture + guided_filter(self.negative, shown, radius=4, eps=1e-3)
+        if "color" in self.negative:
+            picture = picture + self.smooth_negative("color", picture, guide)
         if self.beyond is not None:
             picture = np.where(np.isnan(self.beyond), picture, self.beyond)
         return np.asarray(picture, np.float32)
+
+    def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
+        """The local mean of negative radiance.
+
+        Parameters
+        ----------
+        name : str
+            Of a layer that has some.
+        picture : (H, W, 3) array
+            Denoised radiance, whose edges it follows.
+        guide : (H, W, G) array or None
+            Albedo and normal, finite.
+
+        Returns
+        -------
+        (H, W, 3) array
+        """
+        shown = compress(picture, measure_exposure(picture))
+        shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
+        return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
 
 
 def set_apart(frame: Frame) -> tuple[Array, Kept]:
@@ -99,13 +118,9 @@ def set_apart(frame: Frame) -> tuple[Array, Kept]:
     the light of the brightest one. A pixel that is negative altogether is one that a filter with negative lobes has
     left beside a lamp, and stays.
     """
-    color, negative = frame.color, None
-    if (color < 0).any():
-        light = np.maximum(color.max(axis=-1, keepdims=True), 0)
-        negative = np.nan_to_num(np.maximum(np.minimum(color, 0), -light), nan=0, posinf=0, neginf=0)
-        color = color - negative
-        negative = negative if negative.any() else None
     layers = {"color": frame.color, **frame.aovs}
+    negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}
+    color = frame.color - negative["color"] if "color" in negative else frame.color
     gray = frozenset(name for name, layer in layers.items() if _is_gray(layer))
     return color, Kept(_lights(frame), negative, gray)
 
@@ -121,6 +136,15 @@ def _is_gray(layer: Array) -> bool:
         return False
     first = layer[..., 0]
     return all(np.array_equal(first, layer[..., c], equal_nan=True) for c in (1, 2))
+
+
+def _negative(layer: Array) -> Array | None:
+    """What is negative in a channel of three, up to the light of the others; None where nothing is."""
+    if layer.shape[-1] != 3 or not (layer < 0).any():
+        return None
+    light = np.maximum(layer.max(axis=-1, keepdims=True), 0)
+    found = np.nan_to_num(np.maximum(np.minimum(layer, 0), -light), nan=0, posinf=0, neginf=0)
+    return found if found.any() else None
 
 
 def _lights(frame: Frame) -> Array | None:

@@ -32,8 +32,7 @@ DeviceOption = Annotated[
     typer.Option(
         "--device",
         envvar="RAVG_DEVICE",
-        help="what computes networks, OIDN's and ravg's alike; auto: the first that is there of cuda, hip, sycl, "
-        "cpu",
+        help="what computes networks, OIDN's and ravg's alike; auto: the first that is there of cuda, hip, sycl, cpu",
         rich_help_panel=RESOURCES,
     ),
 ]

@@ -169,7 +169,8 @@ def find_layers(
 
     notes: list[str] = []
     color = found.get("color") or _find_color(image, taken, notes) or _only_picture(image, taken)
-    color = color or _find_gray(image, taken)
+    if color is None and (gray := _name_grays(image, taken, image.views[0] if image.views else None)):
+        color = _only(image, "color", gray)
     if color is None:
         raise ExrError(f"{image.path}: no color layer (--layer color=NAME); {image.listing()}")
     found["color"] = found["target"] = color
@@ -278,7 +279,7 @@ def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
     """
     colors = []
     for view in image.views or (None,):
-        named = _name_colors(image, profile, view, [])
+        named = _name_colors(image, profile, view, []) or _name_grays(image, profile, view)
         groups = {_group(layer) for layer in named}
         # Layers of no view layer beside those of one are no picture of their own, but in doubt.
         split = [named] if "" in groups else [[x for x in named if _group(x) == group] for group in sorted(groups)]
@@ -468,12 +469,12 @@ def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:
     return _fit(image, "color", only[0], named=True) if len(only) == 1 else None
 
 
-def _find_gray(image: ExrImage, profile: Profile) -> Layer | None:
-    """The one gray layer with a name for the color, of the default view."""
-    seen = [layer for layer in image.layers if layer.view in (None, *image.views[:1])]
-    named = [x for x in seen if {*(_tails(image, x) if x.name else [""])} & {*profile.names("color")}]
-    found = [gray for layer in named if (gray := _as_gray(layer)) and component_of(gray.channels[0]) in _LUMINANCE]
-    return _only(image, "color", found) if found else None
+def _name_grays(image: ExrImage, profile: Profile, view: str | None) -> list[Layer]:
+    """The gray layers of a view that have a name for the color."""
+    seen = [layer for layer in image.layers if layer.view in (None, view)]
+    named = [x for x in seen if ({*_tails(image, x)} - {""} or {""}) & {*profile.names("color"), *image.views}]
+    grays = [gray for layer in named if (gray := _as_gray(layer))]
+    return [gray for gray in grays if component_of(gray.channels[0]) in _LUMINANCE]
 
 
 # What the channel of a gray picture is called; a Z alone is a depth.

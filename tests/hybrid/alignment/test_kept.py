@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from hybrid.alignment.kept import set_apart
@@ -98,11 +99,25 @@ def test_what_a_filter_leaves_beside_a_lamp_is_no_color():
     color[20, 20] = -30, -40, -20
     color[30, 30] = -30, 0.25, -0.125
     apart, kept = set_apart(Frame(1, color))
-    assert kept.negative is not None
-    assert np.count_nonzero(kept.negative) == 2
-    np.testing.assert_array_equal(kept.negative[30, 30], [-0.25, 0, -0.125])
-    np.testing.assert_array_equal(apart + kept.negative, color)
-    assert set_apart(Frame(1, np.abs(color)))[1].negative is None
+    negative = kept.negative["color"]
+    assert np.count_nonzero(negative) == 2
+    np.testing.assert_array_equal(negative[30, 30], [-0.25, 0, -0.125])
+    np.testing.assert_array_equal(apart + negative, color)
+    assert set_apart(Frame(1, np.abs(color)))[1].negative == {}
+
+
+def test_parts_keep_their_negative_light(tmp_path):
+    """The parts of a beauty of -0.05 came out at 0."""
+    pytest.importorskip("torch")
+    (tmp_path / "in").mkdir()
+    for number, color in enumerate(colors()):
+        color[BLOCK][..., 0] *= -0.125
+        layers = {"RGBA": color, "RGBA_key": color * np.float32(0.25), "RGBA_fill": color * np.float32(0.75)}
+        write_layers(tmp_path / "in" / f"a.{number:04d}.exr", layers, half=False)
+    assert main(["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--aov", "all"]) == 0
+    image = read_exr(tmp_path / "out" / "a.0001.exr")
+    for name, mean in (("RGBA", -0.0625), ("RGBA_key", -0.015625), ("RGBA_fill", -0.046875)):
+        assert image.channel(f"{name}.R")[15:25, 19:33].mean() == pytest.approx(mean, rel=0.06)
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, ["pseudoref", "--preset", "gathered"]])
@@ -111,6 +126,18 @@ def test_gray_stays_gray(tmp_path, command):
     found = read_exr(denoised(tmp_path, colors(), command, half=False)).pixels(("color.R", "color.G", "color.B"))
     np.testing.assert_array_equal(found, np.repeat(found[..., :1], 3, axis=2))
     assert found.mean() == pytest.approx(0.5, rel=0.02)
+
+
+def test_both_views_of_a_gray_stereo_file_are_denoised(tmp_path):
+    """The right one stayed as it was."""
+    for number, (left, right) in enumerate(zip(colors(), colors()[::-1], strict=True)):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "multiView": ["left", "right"]}
+        channels = {"left.Y": left[..., 0].copy(), "right.Y": right[..., 0].copy()}
+        OpenEXR.File([OpenEXR.Part(header, channels, "")]).write(str(tmp_path / f"a.{number:04d}.exr"))
+    assert main(["pseudoref", str(tmp_path), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
+    before, after = (read_exr(folder / "a.0001.exr") for folder in (tmp_path, tmp_path / "out"))
+    for name in ("left.Y", "right.Y"):
+        assert after.channel(name).std() < 0.95 * before.channel(name).std()
 
 
 def test_of_layers_only_those_that_are_gray_everywhere_count():
