@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+from pathlib import Path
 
 import pytest
 
@@ -199,3 +200,20 @@ def test_status_of_two_chunks(shot_folder, tmp_path, capsys):
     assert len(first["plan"]) > 5
     assert run(capsys, "status", tmp_path)[0] == 1
     assert FOLDER not in [path.name for path in tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("shot.0001 shot.-002 shot.1000", "shot"),
+        ("shot0001 shot-0002", "shot"),
+        ("0001 -0002", ""),
+        ("0001.beauty -0001.beauty 0010.beauty", "beauty"),
+        ("view.0001.beauty view.-0001.beauty", "view.beauty"),
+        ("v2_final", "v2_final"),
+        ("v2.beauty.0001", "v2.beauty"),
+    ],
+)
+def test_all_files_of_a_sequence_have_one_name(names, expected):
+    """Where more stands behind the number, each frame was of a sequence of its own."""
+    assert {sequence_name(Path(f"{name}.exr")) for name in names.split()} == {expected}
