@@ -301,5 +301,5 @@ def _range(numbers: Sequence[int]) -> str:
 
 def sequence_name(file: Path) -> str:
     """The name of a sequence, of one of its files: without number and extension."""
-    behind = re.fullmatch(r"(|.*[._-])-?[0-9]+[._-]([^0-9]*)", file.stem)  # 0001.beauty, view.0001.beauty
+    behind = re.fullmatch(r"(|.*?[._-])-?[0-9]+[._-]([^0-9]*)", file.stem)  # 0001.beauty, view.0001.beauty
     return f"{behind[1]}{behind[2]}" if behind else re.sub(r"[._-]?-?[0-9]+$", "", file.stem)
