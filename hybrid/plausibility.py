@@ -179,7 +179,13 @@ def find_cut(a: int, b: int) -> Finding:
 
 
 def find_repeat(a: int, b: int) -> Finding:
-    """Say that the later of two neighbouring frames is the earlier one once more (`PairFacts.repeated`)."""
+    """Say that the later of two neighbouring frames is the earlier one once more (`PairFacts.repeated`).
+
+    Parameters
+    ----------
+    a, b : int
+        Numbers of the frames.
+    """
     return Finding(
         "color", f"frame {b} is frame {a} once more: the same noise, whose samples count once", left_out=False
     )

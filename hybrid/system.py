@@ -214,7 +214,13 @@ def expand_home(words: Sequence[str]) -> list[str]:
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:
-    """Whether two statuses are of one file, as far as its file system numbers files; network drives may not."""
+    """Whether two statuses are of one file, as far as its file system numbers files; network drives may not.
+
+    Parameters
+    ----------
+    one, other : os.stat_result
+        Of two paths.
+    """
     return not (one.st_ino and other.st_ino) or os.path.samestat(one, other)
 
 

@@ -275,7 +275,15 @@ def mean_light(own: Lights, others: Sequence[tuple[Lights, Points, Mask]]) -> Li
 
 
 def add_lights(picture: Floats, lights: Lights) -> Floats:
-    """Return a picture (H, W, C) with lights added to it, each in its pattern, which sums to 1."""
+    """Return a picture (H, W, C) with lights added to it, each in its pattern, which sums to 1.
+
+    Parameters
+    ----------
+    picture : (H, W, C) float32
+        Radiance.
+    lights : Lights
+        Of its frame.
+    """
     made = picture.copy()
     height, width = picture.shape[:2]
     for (y, x), light, pattern in zip(lights.pixels, lights.light, lights.pattern, strict=True):
@@ -286,7 +294,15 @@ def add_lights(picture: Floats, lights: Lights) -> Floats:
 
 
 def take_lights(color: Floats, pixels: Places) -> Floats:
-    """Return a frame (H, W, C) without what `measure_lights` finds at these pixels, (K, 2)."""
+    """Return a frame (H, W, C) without what `measure_lights` finds at these pixels, (K, 2).
+
+    Parameters
+    ----------
+    color : (H, W, C) float32
+        Radiance or irradiance, finite.
+    pixels : (K, 2) intp
+        Rows and columns of the lights.
+    """
     rows, columns, inside = _blocks(pixels, color.shape)
     around, core = _around(color[rows, columns].astype(np.float64), inside), inside[:, 1:4, 1:4]
     clean = color.copy()

@@ -76,10 +76,12 @@ def witnessed(excess: Floats, bright: Mask, other_excess: Floats, other_bright: 
 
     Parameters
     ----------
-    excess, other_excess : (H, W) float32
-        As for `find_bright`, of the frame and of the other one.
-    bright, other_bright : (H, W) bool
+    excess : (H, W) float32
+        As for `find_bright`, of the frame.
+    bright : (H, W) bool
         From `find_bright`.
+    other_excess, other_bright : (H, W) array
+        The same of the other frame.
 
     Returns
     -------
