@@ -30,6 +30,8 @@ Array = NDArray[np.float32]
 # By how much a pixel may change at most where pictures are averaged; and where samples correct a pixel that has parts,
 # which change with it, so that the color is the same with and without them but where it was next to nothing.
 MOST, CORRECTED = 2.0, 1e4
+# Where this share of a frame's bright pixels move together, the others are content too: hidden, or leaving the frame.
+CONTENT = 0.6
 
 
 @dataclass(frozen=True)
@@ -227,6 +229,8 @@ class Pictures:
             for n in others:
                 other = _excess(self.aligner.frames[n], self._made[n][0].color)
                 seen |= witnessed(own, bright, other, find_bright(other))
+            if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(bright):
+                seen = bright
             color = np.where(seen[..., None], frame.rendered, denoised.color)
         return _changed(denoised, color, CORRECTED)
 
@@ -290,4 +294,5 @@ def _with_kept(denoised: Denoised, frame: PreparedFrame) -> Denoised:
     for name in aovs.keys() & kept.negative.keys() & denoised.parts:
         # Shared out of the picture, which had no negative light, parts have none.
         aovs[name] = np.maximum(aovs[name], 0) + kept.smooth_negative(name, denoised.color, frame.guide)
+    aovs = {name: kept.without_outside(layer) for name, layer in aovs.items()}
     return replace(denoised, color=kept.restore(denoised.color, frame.guide), aovs=aovs)

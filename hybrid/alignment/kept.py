@@ -1,13 +1,14 @@
 """Parts of a frame's color that no filter takes: set apart before anything is made of it, and put back last.
 
-A sun beyond the range of half would shine over the frame, the negative light of a color outside of the gamut would be
-cut off by every denoiser, and a gray picture would be tinted by networks that learned from colors.
+Beside a render region a frame is black, which filters would mix into its edges. A sun beyond the range of half would
+shine over the frame, the negative light of a color outside of the gamut would be cut off by every denoiser, and a gray
+picture would be tinted by networks that learned from colors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -20,7 +21,13 @@ from nlm.guided import guided_filter
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Region = tuple[slice, slice]
 
+# A frame is mirrored by so many pixels beyond the edges of a render region: as far as most weights of a filter
+# reach.
+_MIRRORED = 32
+# An edge is that of a region where this share of its pixels are lit; the outline of an object touches its box in less.
+_EDGE = 0.6
 # Fewer pixels of +Inf that touch are fireflies: one bright sample covers a pixel, a renderer's filter up to 2×2.
 _LIGHT = 5
 
@@ -37,11 +44,14 @@ class Kept:
         Of "color" and the AOVs the negative radiance of colors outside of the gamut, noisy; those that have some.
     gray : frozenset of str
         Of "color" and the AOVs those whose three channels are the same everywhere.
+    region : (slice, slice) or None
+        Rows and columns of a render region, beside which all is black.
     """
 
     beyond: Array | None = None
     negative: Mapping[str, Array] = field(default_factory=dict)
     gray: frozenset[str] = frozenset()
+    region: Region | None = None
 
     @property
     def lights(self) -> Mask | None:
@@ -74,7 +84,69 @@ class Kept:
             picture = picture + self.smooth_negative("color", picture, guide)
         if self.beyond is not None:
             picture = np.where(np.isnan(self.beyond), picture, self.beyond)
-        return np.asarray(picture, np.float32)
+        return np.asarray(self.without_outside(picture), np.float32)
+
+    def without_outside(self, layer: Array) -> Array:
+        """A layer (H, W, ...) that is 0 outside of the render region, if there is one."""
+        if self.region is None:
+            return layer
+        inside = np.zeros_like(layer)
+        inside[self.region] = layer[self.region]
+        return inside
+
+
+def find_region(color: Array) -> Region | None:
+    """Find the rectangle outside of which a frame is black, as beside a render region.
+
+    Parameters
+    ----------
+    color : (H, W, 3) array
+        Radiance.
+
+    Returns
+    -------
+    (slice, slice) or None
+        Rows and columns; None where the frame is lit as a whole, or where what is lit is no rectangle.
+    """
+    # Closed: noise leaves single pixels of what is seen black.
+    lit = cv2.morphologyEx((color != 0).any(axis=-1).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    shown = [np.flatnonzero(lit.any(axis=1 - axis)) for axis in (0, 1)]
+    if not shown[0].size:
+        return None
+    rows, columns = (slice(int(places[0]), int(places[-1]) + 1) for places in shown)
+    # Of three rows or columns at each edge: noise leaves pixels of one black.
+    edges = [lit[rows.start : rows.start + 3, columns].max(axis=0)] if rows.start > 0 else []
+    edges += [lit[max(rows.stop - 3, 0) : rows.stop, columns].max(axis=0)] if rows.stop < len(lit) else []
+    edges += [lit[rows, columns.start : columns.start + 3].max(axis=1)] if columns.start > 0 else []
+    edges += [lit[rows, max(columns.stop - 3, 0) : columns.stop].max(axis=1)] if columns.stop < lit.shape[1] else []
+    return (rows, columns) if edges and min(edge.mean() for edge in edges) >= _EDGE else None
+
+
+def mirror_region(frame: Frame, region: Region) -> Frame:
+    """Mirror the color and the guides of a frame beyond the edges of its render region.
+
+    Parameters
+    ----------
+    frame : Frame
+        As read.
+    region : (slice, slice)
+        From `find_region`.
+    """
+    height, width = frame.color.shape[:2]
+    (rows, columns), size = region, (region[0].stop - region[0].start, region[1].stop - region[1].start)
+    top, left = min(rows.start, _MIRRORED), min(columns.start, _MIRRORED)
+    bottom, right = min(height - rows.stop, _MIRRORED), min(width - columns.stop, _MIRRORED)
+    outer = slice(rows.start - top, rows.stop + bottom), slice(columns.start - left, columns.stop + right)
+    y, x = (
+        np.pad(np.arange(length), border, mode="symmetric")
+        for length, border in zip(size, ((top, bottom), (left, right)), strict=True)
+    )
+    mirrored = {}
+    for name in ("color", "albedo", "normal"):
+        if (layer := getattr(frame, name)) is not None:
+            mirrored[name] = layer.copy()
+            mirrored[name][outer] = layer[region][y][:, x]
+    return replace(frame, **mirrored)
 
     def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
         """The local mean of negative radiance.

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from hybrid.alignment.kept import find_region, mirror_region
 from hybrid.alignment.measure import (
     MOVED_NOISE,
     FrameFacts,
@@ -180,7 +181,14 @@ class LoadedFrames:
             with self.timings.stage("read"):
                 frame = self.shot.read(number)
             with self.timings.stage("prepare"):
-                self._read[number] = frame, prepare(frame, demodulated="demodulate" in self.allowed)
+                region = find_region(frame.color)
+                frame = frame if region is None else mirror_region(frame, region)
+                prepared = prepare(frame, demodulated="demodulate" in self.allowed)
+                if region is not None:
+                    inside = np.zeros_like(prepared.valid)
+                    inside[region] = prepared.valid[region]
+                    prepared = replace(prepared, kept=replace(prepared.kept, region=region), valid=inside)
+                self._read[number] = frame, prepared
         return self._read[number]
 
     def _without_fireflies(self, frame: Frame | None, prepared: PreparedFrame) -> tuple[Frame | None, PreparedFrame]:

@@ -133,19 +133,22 @@ class SmallFrame:
         Means over these pixels, and the same without most of the noise.
     albedo : (h, w, 3) array or None
         What the irradiance was divided by.
+    valid : (h, w) bool array
+        Where the frame has been rendered.
     """
 
     factor: int
     irradiance: Array
     light: Array
     albedo: Array | None
+    valid: Mask
 
     def textured(self) -> SmallFrame:
         """Multiply by the albedo again: what moves shows in its texture first."""
         if self.albedo is None:
             return self
         irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
-        return SmallFrame(self.factor, irradiance, light, None)
+        return SmallFrame(self.factor, irradiance, light, None, self.valid)
 
 
 def shrink(frame: PreparedFrame) -> SmallFrame:
@@ -153,11 +156,13 @@ def shrink(frame: PreparedFrame) -> SmallFrame:
     height, width = frame.irradiance.shape[:2]
     factor = round(min(height, width) / SHORT_SIDE)
     if min(height, width) < 2 * SHORT_SIDE:
-        return SmallFrame(1, frame.irradiance, frame.light, frame.albedo if frame.demodulated else None)
+        albedo = frame.albedo if frame.demodulated else None
+        return SmallFrame(1, frame.irradiance, frame.light, albedo, frame.valid)
     irradiance = _means(frame.irradiance, factor)
     albedo, normal = (None if layer is None else _means(layer, factor) for layer in (frame.albedo, frame.normal))
     light = rough_light(irradiance, albedo, normal)
-    return SmallFrame(factor, irradiance, light, albedo if frame.demodulated else None)
+    valid = _means(frame.valid.astype(np.float32)[..., None], factor)[..., 0] > 0.5
+    return SmallFrame(factor, irradiance, light, albedo if frame.demodulated else None, valid)
 
 
 def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
@@ -404,7 +409,7 @@ def _seen(here: SmallFrame, there: SmallFrame) -> Mask:
     Beside a render region, and behind an object, nothing is seen: what an object uncovers there is no change of light.
     """
     # Closed: noise leaves single pixels of what is seen black.
-    lit = ((_level(frame.irradiance) > 0).astype(np.uint8) for frame in (here, there))
+    lit = ((frame.valid & (_level(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
     shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]
     if 2 * np.count_nonzero(shown[0]) > np.count_nonzero(shown[1]):
         return np.asarray(shown[0])

@@ -5,15 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenEXR
 import pytest
 
-from hybrid.alignment.kept import set_apart
+from hybrid.alignment.align import Aligner
+from hybrid.alignment.kept import find_region, mirror_region, set_apart
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
+from hybrid.estimates import OfFrames
 from hybrid.files.exr import HALF_MAX, read_exr, write_layers
 from hybrid.files.frames import Frame, open_shot
+from hybrid.plan import Rules
+from hybrid.pseudo_reference import gated_average
+from hybrid.steady import Denoised, Pictures
+from tests.scenes import Scene
 
 SIZE = (40, 56)
 COMMANDS = [["pseudoref", "--preset", "draft"], ["denoise", "--preset", "fast"]]
@@ -161,3 +168,69 @@ def test_a_file_of_luminance_alone_is_denoised(tmp_path, command, name):
     found = image.channel(channel).astype(float)
     assert found.mean() == pytest.approx(0.5, rel=0.02)
     assert found.std() < 0.5 * frames[1].std()
+
+
+class TestRegion:
+    """Beside a render region a frame is black, and no pixel of the region is mixed with that."""
+
+    @staticmethod
+    def cut(color, rows, columns):
+        inside = np.zeros_like(color)
+        inside[rows, columns] = color[rows, columns]
+        return inside
+
+    @pytest.mark.parametrize(
+        ("rows", "columns"),
+        [
+            (slice(8, 30), slice(12, 40)),
+            (slice(0, 40), slice(12, 56)),
+            (slice(0, 25), slice(0, 56)),
+            (slice(5, 6), slice(7, 9)),
+        ],
+    )
+    def test_a_region_is_found_and_mirrored(self, rows, columns):
+        color = np.random.default_rng(1).uniform(0.1, 1, (40, 56, 3)).astype(np.float32)
+        region = find_region(self.cut(color, rows, columns))
+        assert region == (rows, columns)
+        frame = mirror_region(Frame(1, self.cut(color, rows, columns), normal=self.cut(color, rows, columns)), region)
+        np.testing.assert_array_equal(frame.color[rows, columns], color[rows, columns])
+        np.testing.assert_array_equal(frame.color, frame.normal)
+        if columns.start:
+            np.testing.assert_array_equal(frame.color[rows, columns.start - 1], color[rows, columns.start])
+        if rows.stop < 40:
+            np.testing.assert_array_equal(frame.color[rows.stop, columns], color[rows.stop - 1, columns])
+
+    def test_what_is_no_rectangle_is_no_region(self):
+        y, x = np.mgrid[:40, :56]
+        ball = (np.hypot(y - 20, x - 28) < 10)[..., None] * np.ones(3, np.float32)
+        for color in (ball, np.ones((40, 56, 3), np.float32), np.zeros((40, 56, 3), np.float32)):
+            assert find_region(color) is None
+
+    def test_noise_that_leaves_pixels_black_hides_no_region(self):
+        rng = np.random.default_rng(2)
+        color = np.zeros((40, 56, 3), np.float32)
+        color[8:30, 12:40] = (rng.random((22, 28, 1)) < 0.6) * rng.random((22, 28, 3))
+        assert find_region(color) == (slice(8, 30), slice(12, 40))
+
+    def test_the_edge_of_a_region_has_its_own_light_and_all_beside_it_is_black(self, tmp_path):
+        """Averages over space mixed black into the outermost pixels: they were a third too dark."""
+        scene = Scene(height=48, width=64, frames=3, step=(0, 0), noise=0.1)
+
+        def crop(index, layers):
+            for name in ("Combined", "Denoising Albedo", "Denoising Normal"):
+                layers[f"ViewLayer.{name}"] = self.cut(layers[f"ViewLayer.{name}"], slice(12, 36), slice(16, 48))
+
+        shot = open_shot(scene.write(tmp_path, edit=crop))
+        blur = OfFrames(lambda frame: cv2.blur(frame.color, (7, 7)))
+        maker = Pictures(
+            Aligner(shot, Rules(off=frozenset({"mean", "samples"})), estimates=blur),
+            lambda aligned: Denoised(gated_average(aligned)),
+        )
+        color = maker.make(scene.first + 1)[0].color
+        truth = scene.clean(1)["ViewLayer.Combined"]
+        mirrored = np.pad(truth[12:36, 16:48], ((3, 3), (3, 3), (0, 0)), mode="symmetric")
+        wanted = cv2.blur(mirrored, (7, 7))[3:-3, 3:-3]
+        np.testing.assert_allclose(color[12:36, 16].mean(axis=0), wanted[:, 0].mean(axis=0), rtol=0.03)
+        outside = np.ones((48, 64), bool)
+        outside[12:36, 16:48] = False
+        assert not color[outside].any()
