@@ -26,8 +26,9 @@ Region = tuple[slice, slice]
 # A frame is mirrored by so many pixels beyond the edges of a render region: as far as most weights of a filter
 # reach.
 _MIRRORED = 32
-# An edge is that of a region where this share of its pixels are lit; the outline of an object touches its box in less.
-_EDGE = 0.6
+# A region has no fewer pixels on a side, and of each of its edges this share is lit; the outline of an object touches
+# its box in less.
+_LEAST, _EDGE = 16, 0.9
 # Fewer pixels of +Inf that touch are fireflies: one bright sample covers a pixel, a renderer's filter up to 2×2.
 _LIGHT = 5
 
@@ -86,6 +87,26 @@ class Kept:
             picture = np.where(np.isnan(self.beyond), picture, self.beyond)
         return np.asarray(self.without_outside(picture), np.float32)
 
+    def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
+        """The local mean of negative radiance.
+
+        Parameters
+        ----------
+        name : str
+            Of a layer that has some.
+        picture : (H, W, 3) array
+            Denoised radiance, whose edges it follows.
+        guide : (H, W, G) array or None
+            Albedo and normal, finite.
+
+        Returns
+        -------
+        (H, W, 3) array
+        """
+        shown = compress(picture, measure_exposure(picture))
+        shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
+        return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
+
     def without_outside(self, layer: Array) -> Array:
         """A layer (H, W, ...) that is 0 outside of the render region, if there is one."""
         if self.region is None:
@@ -114,11 +135,13 @@ def find_region(color: Array) -> Region | None:
     if not shown[0].size:
         return None
     rows, columns = (slice(int(places[0]), int(places[-1]) + 1) for places in shown)
+    if min(rows.stop - rows.start, columns.stop - columns.start) < _LEAST:
+        return None
     # Of three rows or columns at each edge: noise leaves pixels of one black.
     edges = [lit[rows.start : rows.start + 3, columns].max(axis=0)] if rows.start > 0 else []
-    edges += [lit[max(rows.stop - 3, 0) : rows.stop, columns].max(axis=0)] if rows.stop < len(lit) else []
+    edges += [lit[rows.stop - 3 : rows.stop, columns].max(axis=0)] if rows.stop < len(lit) else []
     edges += [lit[rows, columns.start : columns.start + 3].max(axis=1)] if columns.start > 0 else []
-    edges += [lit[rows, max(columns.stop - 3, 0) : columns.stop].max(axis=1)] if columns.stop < lit.shape[1] else []
+    edges += [lit[rows, columns.stop - 3 : columns.stop].max(axis=1)] if columns.stop < lit.shape[1] else []
     return (rows, columns) if edges and min(edge.mean() for edge in edges) >= _EDGE else None
 
 
@@ -147,27 +170,6 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
             mirrored[name] = layer.copy()
             mirrored[name][outer] = layer[region][y][:, x]
     return replace(frame, **mirrored)
-
-    def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
-        """The local mean of negative radiance.
-
-        Parameters
-        ----------
-        name : str
-            Of a layer that has some.
-        picture : (H, W, 3) array
-            Denoised radiance, whose edges it follows.
-        guide : (H, W, G) array or None
-            Albedo and normal, finite.
-
-        Returns
-        -------
-        (H, W, 3) array
-        """
-        shown = compress(picture, measure_exposure(picture))
-        shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
-        return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
-
 
 def set_apart(frame: Frame) -> tuple[Array, Kept]:
     """Divide a frame's color into what is denoised and what is kept.

@@ -185,7 +185,7 @@ class TestRegion:
             (slice(8, 30), slice(12, 40)),
             (slice(0, 40), slice(12, 56)),
             (slice(0, 25), slice(0, 56)),
-            (slice(5, 6), slice(7, 9)),
+            (slice(20, 40), slice(36, 56)),
         ],
     )
     def test_a_region_is_found_and_mirrored(self, rows, columns):
@@ -202,8 +202,8 @@ class TestRegion:
 
     def test_what_is_no_rectangle_is_no_region(self):
         y, x = np.mgrid[:40, :56]
-        ball = (np.hypot(y - 20, x - 28) < 10)[..., None] * np.ones(3, np.float32)
-        for color in (ball, np.ones((40, 56, 3), np.float32), np.zeros((40, 56, 3), np.float32)):
+        balls = [(np.hypot(y - 20, x - 28) < r)[..., None] * np.ones(3, np.float32) for r in (1, 3, 8, 10, 15)]
+        for color in (*balls, np.ones((40, 56, 3), np.float32), np.zeros((40, 56, 3), np.float32)):
             assert find_region(color) is None
 
     def test_noise_that_leaves_pixels_black_hides_no_region(self):
