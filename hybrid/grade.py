@@ -19,6 +19,8 @@ LIT = 0.01
 # Levels that differ by less than this factor, or by fewer standard errors, are left to the mean of the samples:
 # denoisers are off by some percent, and noise that is skewed moves a median by as much.
 LEVEL, ERRORS = 1.1, 5.0
+# Frames whose pictures differ from their samples by levels that are so many times apart have no grade in common.
+ONE_LEVEL = 1.5
 # Tiles may differ from one factor by this, in units of the logarithm, and by so many times their noise: no factor
 # explains half of the light otherwise.
 SPREAD, NOISE = 0.15, 1.0
@@ -53,7 +55,7 @@ def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
     Returns
     -------
     Grade or None
-        None where the levels agree within their uncertainty.
+        None where the levels agree within their uncertainty, or where frames have no level in common.
 
     Notes
     -----
@@ -62,6 +64,9 @@ def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
     skewed lies below its mean, and fireflies, which denoisers remove, lie above.
     """
     tiles = [_tiles(*pair) for pair in pictures]
+    levels = [np.log(part[1].sum() / part[0].sum()) for part in tiles if part[0].sum() > 0 and part[1].sum() > 0]
+    if levels and max(levels) - min(levels) > np.log(ONE_LEVEL):
+        return None  # it is the frames that differ: each is checked when it is read
     e, s, noise = (np.concatenate(parts) for parts in zip(*tiles, strict=True))
     factors, graded = [], False
     for c in range(3):
