@@ -72,7 +72,7 @@ class Version:
         Parameters
         ----------
         expected : str
-            The first two numbers of the version, such as ``0.1``.
+            The first two numbers of the version, such as ``0.2``.
         """
         if self._process is not None:
             try:

@@ -24,7 +24,7 @@ class Source:
     Attributes
     ----------
     version : str
-        The version of this extension, such as ``0.1.0``.
+        The version of this extension, such as ``0.2.0``.
     wheel : Path or None
         A wheel file of ravg; its requirements are taken from wheels beside it first. None: the package index.
     online : bool

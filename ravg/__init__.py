@@ -1,0 +1,42 @@
+"""Denoise rendered animation from other programs: `open_shot` finds the frames, `denoise_shot` denoises them.
+
+Both are those of `hybrid`, and are imported when they are first used, so that ``import ravg`` is quick.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybrid.denoising import denoise_shot
+    from hybrid.files.frames import open_shot
+
+__all__ = ["check_packages", "denoise_shot", "open_shot"]
+
+
+def check_packages() -> None:
+    """Check that the packages installed with this one are those that Python imports.
+
+    Raises
+    ------
+    ImportError
+        If another package of the same name comes first on the path or is imported already, or if one is missing.
+    """
+    place = Path(__file__).resolve().parent.parent
+    for name in ("loops", "flow", "nlm", "network", "hybrid"):
+        spec = find_spec(name)
+        expected = place / name / "__init__.py"
+        if spec is None or not spec.origin or Path(spec.origin).resolve() != expected:
+            found = spec.origin or "a folder without __init__.py" if spec else "nothing"
+            raise ImportError(f"ravg needs its own package {name}, expected {expected}, found {found}")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("denoise_shot", "open_shot"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    check_packages()
+    import hybrid
+
+    return getattr(hybrid, name)

@@ -1,0 +1,103 @@
+"""The wheel and the sdist hold the packages with their data, and nothing else of the repository."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+
+from tests.test_house import OURS, ROOT
+
+# The license's form in setup.cfg needs it; what is built in the tree's own environment asks for no network.
+pytest.importorskip("setuptools", minversion="77", reason="builds the wheel: pip install setuptools>=77")
+pytest.importorskip("pip", reason="builds the wheel with pip")
+
+CONFIG = ConfigParser()
+CONFIG.read(ROOT / "setup.cfg", encoding="utf-8")
+VERSION = CONFIG["metadata"]["version"]
+
+
+def run(folder: Path, *words: str | Path, path: Path | None = None) -> str:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    if path:
+        environment["PYTHONPATH"] = str(path)
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository without the pixels of examples and docs, since building leaves files in it."""
+    place = tmp_path_factory.mktemp("packaging") / "tree"
+    left_out = shutil.ignore_patterns(".*", "__pycache__", "build", "dist", "out", "*.egg-info", "*.webp", "*.mp4")
+    shutil.copytree(ROOT, place, ignore=left_out, copy_function=copy_small)
+    return place
+
+
+def copy_small(source: str, target: str) -> None:
+    """Copy a file; of frames and images the name alone."""
+    if source.endswith((".exr", ".png", ".jpg", ".npz")):
+        Path(target).touch()
+    else:
+        shutil.copyfile(source, target)
+
+
+def files_of_packages(tree: Path) -> set[str]:
+    return {path.relative_to(tree).as_posix() for name in OURS for path in (tree / name).rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_the_packages_and_runs_from_a_file(tree, tmp_path):
+    run(tmp_path, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index", "-w", tmp_path, tree)
+    wheel = tmp_path / f"ravg-{VERSION}-py3-none-any.whl"
+    place = tmp_path / "installed"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(place)
+    info = f"ravg-{VERSION}.dist-info/"
+    names = {path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()}
+    assert {name for name in names if not name.startswith(info)} == files_of_packages(tree)
+    assert {f"{info}licenses/LICENSE", f"{info}licenses/NOTICE"} <= names
+    for name in OURS:
+        assert f"{name}/py.typed" in names
+    some = {"network/weights/fast.safetensors", "hybrid/files/profiles/cycles.toml", "hybrid/viewer/page.html"}
+    assert some <= names
+    assert run(tmp_path, "-m", "ravg", "--version", path=place) == f"ravg {VERSION}\n"
+    where = run(tmp_path, "-c", "import ravg; print(ravg.open_shot.__code__.co_filename)", path=place)
+    assert Path(where.strip()).is_relative_to(place)
+
+
+@pytest.mark.slow
+def test_the_sdist_holds_what_builds_the_wheel(tree, tmp_path):
+    code = f"from setuptools import build_meta; build_meta.build_sdist({str(tmp_path)!r})"
+    run(tree, "-c", code)
+    with tarfile.open(tmp_path / f"ravg-{VERSION}.tar.gz") as archive:
+        files = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
+    assert {name for name in files if name.partition("/")[0] in OURS} == files_of_packages(tree)
+    assert {"setup.cfg", "pyproject.toml", "README.md", "LICENSE", "NOTICE", "constraints.txt", "CHANGELOG.md"} <= files
+    folders = {name.partition("/")[0] for name in files if "/" in name}
+    assert folders == OURS | {"docs", "ravg.egg-info"}
+
+
+def test_versions_are_the_same_everywhere():
+    manifest = (ROOT / "blender" / "blender_manifest.toml").read_text(encoding="utf-8")
+    assert f'\nversion = "{VERSION}"\n' in manifest
+    assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f'version = "{VERSION}"' in (ROOT / "packaging" / "conda" / "meta.yaml").read_text(encoding="utf-8")
+    assert f"\n## {VERSION}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"`ravg-{VERSION}.zip`" in (ROOT / "docs" / "blender.md").read_text(encoding="utf-8")
+
+
+def test_the_recipe_for_conda_asks_for_the_same_packages():
+    recipe = (ROOT / "packaging" / "conda" / "meta.yaml").read_text(encoding="utf-8")
+    names = {"opencv-contrib-python-headless": "py-opencv", "OpenEXR": "openexr-python"}
+    for line in CONFIG["options"]["install_requires"].split():
+        name, _, lowest = line.partition(">=")
+        assert f"- {names.get(name, name)} >={lowest}\n" in recipe
