@@ -265,7 +265,7 @@ def _choose(
         return _bundled(mode, bundled, "asked for")
     if spec in OIDN_MODES:
         if (lacking := why_no_oidn()) is not None:
-            raise ImportError(f'estimate {spec}: {lacking}; expected: pip install "ravg[compare]"')
+            raise ImportError(f'estimate {spec}: {lacking}; expected: pip install "pyoidn"')
         return _oidn(spec, keep, "asked for", device)
     sequence = open_beside(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]

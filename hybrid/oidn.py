@@ -1,6 +1,6 @@
 """Intel Open Image Denoise, frame by frame: the peer to compare with, and a source of estimates.
 
-Needs the optional package ``pyoidn`` (extra ``ravg[compare]``), imported at the first call.
+Needs the optional package ``pyoidn`` (extra ``compare``), imported at the first call.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def _device(threads: int, kind: str) -> tuple[Any, Any]:
     try:
         import pyoidn  # an optional peer
     except ImportError as error:
-        raise ImportError("OIDN needs the package pyoidn: install the extra ravg[compare]") from error
+        raise ImportError('OIDN needs the package pyoidn; expected: pip install "pyoidn"') from error
     device = pyoidn.Device(getattr(pyoidn, f"OIDN_DEVICE_TYPE_{kind.upper()}"))
     _check(device)
     if kind == "cpu":

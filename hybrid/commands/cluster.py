@@ -102,7 +102,7 @@ def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: s
     try:
         from distributed import Client, Event, as_completed
     except ModuleNotFoundError as error:
-        raise ImportError('distributed is not installed; expected: pip install "ravg[cluster]"') from error
+        raise ImportError('distributed is not installed; expected: pip install "distributed"') from error
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

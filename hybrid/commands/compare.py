@@ -231,7 +231,8 @@ def compare(
 def _need_page() -> None:
     """Refuse a page that cannot be made here."""
     if missing := [name for name in ("jinja2", "resvg_py", "font_manrope") if find_spec(name) is None]:
-        words = 'expected: pip install "ravg[compare]" (the table alone is made without)'
+        packages = " ".join(f'"{name}"' for name in missing)
+        words = f"expected: pip install {packages} (the table alone is made without)"
         raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
 
 

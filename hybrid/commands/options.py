@@ -224,7 +224,7 @@ def import_neural() -> ModuleType:
         if error.name not in ("torch", "safetensors"):
             raise
         raise ValueError(
-            f'{error.name} is not installed; expected: pip install "ravg[neural]" (`ravg pseudoref` works without)'
+            f'{error.name} is not installed; expected: pip install "{error.name}" (`ravg pseudoref` works without)'
         ) from None
     finally:
         gc.enable()

@@ -400,7 +400,7 @@ def train(
         try:
             from tensorboardX import SummaryWriter
         except ModuleNotFoundError:
-            raise ValueError("tensorboardX is not installed; expected: pip install tensorboardX") from None
+            raise ValueError('tensorboardX is not installed; expected: pip install "tensorboardX"') from None
         writer = SummaryWriter(str(tensorboard))
     recent: list[float] = []
     bar = Progress("train", 100, "%")

@@ -34,7 +34,7 @@ def check_movie(path: Path) -> None:
     if path.suffix.lower() not in LARGEST:
         raise ValueError(f"{path} is no movie, expected a name that ends in {' or '.join(LARGEST)}")
     if path.suffix.lower() == ".mp4" and importlib.util.find_spec("av") is None:
-        raise ImportError(f'{path} needs PyAV, which is not installed; expected: pip install "ravg[video]"')
+        raise ImportError(f'{path} needs PyAV, which is not installed; expected: pip install "av"')
 
 
 def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:

@@ -24,7 +24,7 @@ from hybrid.files.replace import write_file
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, spp_of
 
 NO_BLENDER = (
-    'Blender\'s Python module (bpy) is not installed in {python}: `pip install "ravg[simulate]"` with Python 3.11, '
+    'Blender\'s Python module (bpy) is not installed in {python}: `pip install "bpy==5.0.1"` with Python 3.11, '
     "or name an interpreter that has it with --python"
 )
 

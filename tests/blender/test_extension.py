@@ -23,7 +23,7 @@ import OpenEXR
 import pytest
 
 pytestmark = pytest.mark.cycles
-pytest.importorskip("bpy", reason="runs Blender: pip install ravg[simulate]")
+pytest.importorskip("bpy", reason="runs Blender: pip install bpy==5.0.1")
 
 ROOT = Path(__file__).parents[2]
 EXTENSION = ROOT / "blender"

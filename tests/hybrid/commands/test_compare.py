@@ -52,7 +52,7 @@ def test_without_jinja_the_page_is_refused_before_anything_runs(shots: tuple[Pat
     assert done.returncode == 1
     assert done.stderr.strip().splitlines() == [
         "error: the page of --output needs jinja2, which is not installed; "
-        'expected: pip install "ravg[compare]" (the table alone is made without)'
+        'expected: pip install "jinja2" (the table alone is made without)'
     ]
     assert not (tmp_path / "report").exists()
 

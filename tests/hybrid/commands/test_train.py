@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import sys
 from dataclasses import fields
 
 import cv2
@@ -152,7 +153,7 @@ def test_levels_that_are_no_list_are_an_error(text):
         parse_samples(text)
 
 
-def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
+def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
     clips, out = tmp_path / "clips", tmp_path / "w.safetensors"
     other = tmp_path / "other"
     shutil.copytree(shot, other)
@@ -164,6 +165,11 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys):
     assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
 
     train = ["train", clips, "-o", out, "--crop", "32", "--batch", "1", "--threads", "1", "--float32"]
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "tensorboardX", None)
+        assert run(*train, "--steps", "2", "--tensorboard", tmp_path / "logs") == 1
+    said = 'error: tensorboardX is not installed; expected: pip install "tensorboardX"'
+    assert capsys.readouterr().err.splitlines()[-1] == said
     assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
     assert "denoised" in capsys.readouterr().err
     assert load_notes(out)["training"]["steps"] == 2

@@ -16,7 +16,7 @@ def flats(count=6, height=36, width=64):
 
 def decode(path):
     """Pictures of an MP4 as a player that heeds its tags shows them, and frames per second."""
-    av = pytest.importorskip("av", reason="decodes MP4: pip install ravg[video]")
+    av = pytest.importorskip("av", reason="decodes MP4: pip install av")
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
@@ -26,7 +26,7 @@ def decode(path):
 
 @pytest.mark.parametrize("rate", [24, 23.976, 60])
 def test_an_mp4_holds_every_picture_at_its_rate(tmp_path, rate):
-    pytest.importorskip("av", reason="pip install ravg[video]")
+    pytest.importorskip("av", reason="pip install av")
     write_movie(tmp_path / "new" / "a.mp4", iter(flats()), rate)
     pictures, played = decode(tmp_path / "new" / "a.mp4")
     assert played == pytest.approx(rate, rel=1e-4)
@@ -37,7 +37,7 @@ def test_an_mp4_holds_every_picture_at_its_rate(tmp_path, rate):
 
 
 def test_odd_sizes_are_made_even_by_their_own_edge(tmp_path):
-    pytest.importorskip("av", reason="pip install ravg[video]")
+    pytest.importorskip("av", reason="pip install av")
     write_movie(tmp_path / "a.mp4", flats(1, 35, 63), 24)
     (picture,), _ = decode(tmp_path / "a.mp4")
     assert picture.shape == (36, 64, 3)
@@ -61,7 +61,7 @@ def test_a_webp_plays_for_ever_in_true_time(tmp_path):
 @pytest.mark.parametrize("name", ["a.mp4", "a.webp"])
 def test_what_is_larger_than_a_screen_is_made_smaller(tmp_path, name):
     if name == "a.mp4":
-        pytest.importorskip("av", reason="pip install ravg[video]")
+        pytest.importorskip("av", reason="pip install av")
     write_movie(tmp_path / name, flats(1, 540, 2400), 24)
     largest = LARGEST[(tmp_path / name).suffix]
     if name == "a.mp4":
@@ -74,7 +74,7 @@ def test_what_is_larger_than_a_screen_is_made_smaller(tmp_path, name):
 @pytest.mark.parametrize("name", ["a.mp4", "a.webp"])
 def test_a_movie_is_whole_or_not_there(tmp_path, name):
     if name == "a.mp4":
-        pytest.importorskip("av", reason="pip install ravg[video]")
+        pytest.importorskip("av", reason="pip install av")
 
     def broken():
         yield from flats(3)

@@ -12,7 +12,7 @@ from hybrid.simulate.run import simulate
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
 pytestmark = pytest.mark.cycles
-pytest.importorskip("bpy", reason="renders with Cycles: pip install ravg[simulate]")
+pytest.importorskip("bpy", reason="renders with Cycles: pip install bpy==5.0.1")
 
 SIZE = (64, 36)
 
