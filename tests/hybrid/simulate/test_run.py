@@ -224,7 +224,7 @@ def test_a_renderer_that_fails_is_reported_with_its_last_word(tmp_path, stub):
 
 
 def test_without_blender_the_message_says_how_to_get_it(stub):
-    with pytest.raises(SimulationError, match=r"pip install \"ravg\[simulate\]\".*Python 3\.11.*--python"):
+    with pytest.raises(SimulationError, match=r"pip install \"bpy==5\.0\.1\".*Python 3\.11.*--python"):
         check_blender(stub(found=3))
     with pytest.raises(SimulationError, match="cannot run"):
         check_blender("/no/such/python")
