@@ -89,6 +89,6 @@ def test_what_cannot_be_written_is_said_first(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"a\.gif is no movie, expected a name that ends in \.mp4 or \.webp"):
         check_movie(tmp_path / "a.gif")
     monkeypatch.setattr("hybrid.files.movies.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match='PyAV.*pip install "av"'):
+    with pytest.raises(ImportError, match=r'PyAV.*pip install "av"'):
         check_movie(tmp_path / "a.mp4")
     check_movie(tmp_path / "a.webp")
