@@ -228,7 +228,8 @@ class Pictures:
             seen = np.zeros_like(bright)
             for n in others:
                 other = _excess(self.aligner.frames[n], self._made[n][0].color)
-                seen |= witnessed(own, bright, other, find_bright(other))
+                link = self.aligner.flows.between(frame.number, n)
+                seen |= witnessed(own, bright, other, find_bright(other), None if link is None else link[0])
             if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(bright):
                 seen = bright
             color = np.where(seen[..., None], frame.rendered, denoised.color)
