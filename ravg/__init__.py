@@ -30,7 +30,8 @@ def check_packages() -> None:
         expected = place / name / "__init__.py"
         if spec is None or not spec.origin or Path(spec.origin).resolve() != expected:
             found = spec.origin or "a folder without __init__.py" if spec else "nothing"
-            raise ImportError(f"ravg needs its own package {name}, expected {expected}, found {found}")
+            advice = "install ravg again, in an environment of its own"
+            raise ImportError(f"ravg needs its own package {name}, expected {expected}, found {found}: {advice}")
 
 
 def __getattr__(name: str) -> Any:

@@ -22,15 +22,15 @@ CONFIG.read(ROOT / "setup.cfg", encoding="utf-8")
 VERSION = CONFIG["metadata"]["version"]
 
 
-def run(folder: Path, *words: str | Path, path: Path | None = None) -> str:
+def run(folder: Path, *words: str | Path, path: Path | None = None, code: int = 0) -> str:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     if path:
         environment["PYTHONPATH"] = str(path)
     done = subprocess.run(
         [sys.executable, *map(str, words)], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stderr if code else done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,10 @@ def test_the_wheel_holds_the_packages_and_runs_from_a_file(tree, tmp_path):
     assert run(tmp_path, "-m", "ravg", "--version", path=place) == f"ravg {VERSION}\n"
     where = run(tmp_path, "-c", "import ravg; print(ravg.open_shot.__code__.co_filename)", path=place)
     assert Path(where.strip()).is_relative_to(place)
+    # As pip leaves it when it removes another distribution that has a package of this name.
+    (place / "flow" / "__init__.py").unlink()
+    said = run(tmp_path, "-m", "ravg", "--version", path=place, code=1)
+    assert said.startswith(f"error: ravg needs its own package flow, expected {place / 'flow' / '__init__.py'}, found ")
 
 
 @pytest.mark.slow

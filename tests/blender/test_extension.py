@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import tomllib
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ pytest.importorskip("bpy", reason="runs Blender: pip install bpy==5.0.1")
 
 ROOT = Path(__file__).parents[2]
 EXTENSION = ROOT / "blender"
+VERSION = tomllib.loads((EXTENSION / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
 NAME = "bl_ext.user_default.ravg"
 RAVG = os.environ.get("RAVG_COMMAND", "")
 needs_ravg = pytest.mark.skipif(not RAVG, reason="runs ravg: RAVG_COMMAND is to name it")
@@ -122,7 +124,7 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> Blender:
 def stub(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A command that says it is ravg, and makes nothing."""
     path = tmp_path_factory.mktemp("stub") / "ravg"
-    path.write_text(f"#!{sys.executable}\nprint('ravg 0.1.0')\n", encoding="utf-8")
+    path.write_text(f"#!{sys.executable}\nprint('ravg {VERSION}')\n", encoding="utf-8")
     path.chmod(0o755)
     return str(path)
 
@@ -868,9 +870,9 @@ def wheel(folder: Path, name: str, version: str, code: str, extra: str = "") -> 
 @pytest.fixture
 def wheels(tmp_path: Path) -> Path:
     """A wheel of ravg that does nothing but say its version, with one for its requirement beside it."""
-    code = "def main(): print('ravg 0.1.0')\n"
+    code = f"def main(): print('ravg {VERSION}')\n"
     wheel(tmp_path, "pyoidn", "2.5.1", code)
-    return wheel(tmp_path, "ravg", "0.1.0", code, "Provides-Extra: neural\n")
+    return wheel(tmp_path, "ravg", VERSION, code, "Provides-Extra: neural\n")
 
 
 INSTALLING = """
@@ -893,7 +895,7 @@ def test_ravg_is_installed_from_a_wheel_replaced_and_kept_where_that_fails(blend
     bad = tmp_path / "bad"
     bad.mkdir()
     shutil.copy(wheels.parent / "pyoidn-2.5.1-py3-none-any.whl", bad)
-    wheel(bad, "ravg", "0.1.0", "", "Provides-Extra: neural\nRequires-Dist: gone-for-good\n")
+    wheel(bad, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: gone-for-good\n")
     code = (
         INSTALLING
         + """
@@ -903,15 +905,15 @@ answer = [install(wheel=GOOD), there(), ran(), jobs.ravg_problem(wait=True), ins
 """
     )
     first, one, version, problem, second, two, failed, left, still = blender.run(
-        code, command="", GOOD=str(wheels), BAD=str(bad / "ravg-0.1.0-py3-none-any.whl")
+        code, command="", GOOD=str(wheels), BAD=str(bad / f"ravg-{VERSION}-py3-none-any.whl")
     )
     assert (first, one) == (["FINISHED"], ["current.txt", "environment-1"])
-    assert (version, problem) == ("ravg 0.1.0", "")
+    assert (version, problem) == (f"ravg {VERSION}", "")
     assert (second, two) == (["FINISHED"], ["current.txt", "environment-2"])
     assert "ravg is not installed: " in failed
     assert "gone-for-good" in failed
     assert "Online Access is off" in failed
-    assert (left, still) == (["current.txt", "environment-2"], "ravg 0.1.0")
+    assert (left, still) == (["current.txt", "environment-2"], f"ravg {VERSION}")
 
 
 def test_without_a_network_the_error_says_so(blender):
@@ -944,7 +946,7 @@ def test_a_file_that_is_no_wheel_of_ravg_is_refused(blender, tmp_path, name, rea
 @pytest.mark.parametrize(
     ("says", "reason"),
     [
-        ("ravg 0.2.5", "ravg 0.2.5 is not of this extension's version, 0.1"),
+        ("ravg 99.2.5", f"ravg 99.2.5 is not of this extension's version, {VERSION.rpartition('.')[0]}"),
         ("Python 3", "does not start as ravg (Python 3)"),
     ],
 )

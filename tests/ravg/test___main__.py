@@ -63,7 +63,8 @@ def test_a_package_that_hides_one_of_ours_is_named(name, tmp_path):
     assert done.returncode == 1
     expected = ROOT / name / "__init__.py"
     found = theirs / name / "__init__.py"
-    assert done.stderr == f"error: ravg needs its own package {name}, expected {expected}, found {found}\n"
+    said = f"error: ravg needs its own package {name}, expected {expected}, found {found}: install ravg again"
+    assert done.stderr == f"{said}, in an environment of its own\n"
     code = f"import {name}, ravg; ravg.open_shot"
     done = python(tmp_path, "-c", code, first=theirs)
     assert done.stderr.splitlines()[-1].startswith(f"ImportError: ravg needs its own package {name}, expected")
