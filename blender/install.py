@@ -76,9 +76,10 @@ def steps(environment: Path, source: Source) -> list[list[str]]:
     FileNotFoundError, ValueError
         As `Source.requirements`.
     """
-    pip = [_program(environment, "python"), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
+    # Isolated: a ravg in the folder or the path of Blender is not the one of the environment.
+    pip = [_program(environment, "python"), "-I", "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
     pip += ["--progress-bar=off", "--retries=1", "--timeout=15", *source.requirements()]
-    make = [sys.executable, "-m", "venv", os.fspath(environment)]
+    make = [sys.executable, "-I", "-m", "venv", os.fspath(environment)]
     return [make, pip, [_program(environment, "ravg"), "--version"]]
 
 
