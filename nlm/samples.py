@@ -48,6 +48,8 @@ _SOFT = 0.05
 _LAMP = 4.0
 # The least weight of a frame whose geometry is the centre's, and whose light is not.
 _OTHER_LIGHT = 0.02
+# Cells of a mean on a side of its deviation.
+_CELLS = 6
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
 _WARPED = np.float32(0.7)
 
@@ -245,22 +247,33 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     """
     for sigma, certain, few in _MEANS:
         level = np.maximum(_gray(picture), 0)
-        around = gaussian_mean(np.minimum(level, np.float32(_LAMP * exposure)), sigma)
+        around = _mean(np.minimum(level, np.float32(_LAMP * exposure)), sigma)
         light = level + np.float32(_SOFT) * around + np.float32(1e-3 * exposure)
         weight = 1 / np.maximum(light, around)
-        lit = gaussian_mean(weight * light, sigma)
+        lit = _mean(weight * light, sigma)
         reach = _FAR * light[..., None]
         difference = weight[..., None] * np.clip(noisy - picture, -reach, reach)
-        mean = np.dstack([gaussian_mean(difference[..., c], sigma) for c in range(3)])
+        mean = np.dstack([_mean(difference[..., c], sigma) for c in range(3)])
         square = np.square(difference).mean(axis=-1)
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
         pixels = np.float32(min(4 * np.pi * sigma**2, square.size))
-        noise, fourth = (gaussian_mean(power, sigma) for power in (square, np.square(square)))
+        noise, fourth = (_mean(power, sigma) for power in (square, np.square(square)))
         unsure = np.float32(certain) * (1 + _ratio(np.float32(few) * fourth, pixels * np.square(noise)))
         known = np.square(mean).mean(axis=-1)
         share = np.clip(_ratio(known - unsure * noise / pixels, known), 0, 1)
         picture = np.maximum(picture + mean * (share * light / lit)[..., None], np.minimum(picture, 0))
     return np.asarray(picture, np.float32)
+
+
+def _mean(image: Floats, sigma: float) -> Floats:
+    """Gaussian mean around each pixel, of cells of σ / 6 pixels: nothing in it is smaller than a cell."""
+    side, (height, width) = max(int(sigma / _CELLS), 1), image.shape
+    whole = cv2.copyMakeBorder(image, 0, -height % side, 0, -width % side, cv2.BORDER_REFLECT)
+    rows, columns = whole.shape[0] // side, whole.shape[1] // side
+    cells = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+    mean = gaussian_mean(cells, sigma / side)
+    spread = cv2.resize(mean, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(spread[:height, :width], np.float32)
 
 
 def _ratio(a: Floats, b: Floats) -> Floats:
