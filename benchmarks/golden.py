@@ -47,8 +47,8 @@ CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
     "sequence": ("plain", ["denoise", "--estimate", "sequence/reference.####.exr", *F32]),
     "oidn-best": ("plain", ["denoise", "--estimate", "oidn-best", *F32]),
     "estimate-none": ("plain", ["denoise", "--estimate", "none", *F32]),
-    "bands": ("tall", ["denoise", "--max-memory", "1100M", *F32]),
-    "bands-final": ("tall", ["pseudoref", "--preset", "final", "--max-memory", "500M"]),
+    "bands": ("tall", ["denoise", "--estimate", "nlm", "--max-memory", "690M", *F32]),
+    "bands-final": ("tall", ["pseudoref", "--preset", "final", "--max-memory", "370M"]),
     "views": ("views", ["denoise", *F32]),
     "aov-layers": ("aovs", ["denoise", "--aov", "all", *F32]),
     "aov-beauty": ("aovs", ["denoise", "--aov", "all", "--give-way", "beauty", *F32]),
@@ -74,22 +74,23 @@ RENAMED = {
 def write_shots(folder: Path) -> None:
     """Write all shots that configurations read."""
     frames = [_cropped(8 + index, slice(60, 124), slice(100, 196)) for index in range(5)]
-    tall = [_cropped(8 + index, slice(0, 180), slice(150, 182)) for index in range(3)]
-    tall = [{name: np.concatenate([layer] * 4) for name, layer in frame.items()} for frame in tall]
+    tall = [_cropped(8 + index, slice(0, 180), slice(60, 260)) for index in range(2)]
+    tall = [{name: np.concatenate([layer] * 8) for name, layer in frame.items()} for frame in tall]
     _write(folder / "plain", frames)
     _write(folder / "tall", tall)
     _write(folder / "missing", frames, skipped={2})
     _write(folder / "cut", [*frames[:3], *({name: layer[::-1, ::-1] for name, layer in f.items()} for f in frames[3:])])
     still = {name: np.zeros_like(layer) if "Vector" in name else layer for name, layer in frames[0].items()}
-    _write(folder / "still", [{**still, "ViewLayer.Combined": _noisy(still["ViewLayer.Combined"], n)} for n in range(3)])
-    _write(folder / "bare", [{"ViewLayer.Combined": frame["ViewLayer.Combined"]} for frame in frames])
+    color = "ViewLayer.Combined"
+    _write(folder / "still", [{**still, color: _noisy(still[color], seed)} for seed in range(3)])
+    _write(folder / "bare", [{color: frame[color]} for frame in frames])
     _write(folder / "aovs", [_with_light_passes(frame) for frame in frames[:4]])
     two = [{**f, **{n.replace("ViewLayer", "Second"): layer[::-1] for n, layer in f.items()}} for f in frames[:3]]
     _write(folder / "views", two)
     (folder / "sequence").mkdir()
     for index in range(5):
-        color = _cropped(8 + index, slice(60, 124), slice(100, 196), "reference")
-        name, layer = next(iter(color.items()))
+        reference = _cropped(8 + index, slice(60, 124), slice(100, 196), "reference")
+        name, layer = next(iter(reference.items()))
         _write_exr(folder / "sequence" / f"reference.{index + 1:04d}.exr", {name: layer})
 
 
@@ -130,7 +131,8 @@ def _write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
         else:
             for component, letter in enumerate("RGBA"[: pixels.shape[2]]):
                 channels[f"{name}.{letter}"] = np.ascontiguousarray(pixels[..., component])
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "BlenderMultiChannel": "Blender V2"}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header["BlenderMultiChannel"] = "Blender V2"
     OpenEXR.File(header, channels).write(str(path))
 
 
@@ -159,9 +161,9 @@ def _read_all(folder: Path) -> dict[str, tuple[dict[str, np.ndarray], dict[str, 
     frames = {}
     for path in sorted(folder.glob("*.exr")):
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            parts = [part.channels for part in file.parts]
+            parts = enumerate(part.channels for part in file.parts)
+            channels = {f"{number}:{n}": c.pixels.copy() for number, part in parts for n, c in part.items()}
             header = {k: str(v) for k, v in file.header().items() if k.startswith("ravg/") and k not in UNCOMPARED}
-        channels = {f"{number}:{n}": c.pixels.copy() for number, part in enumerate(parts) for n, c in part.items()}
         frames[path.name] = channels, header
     return frames
 
@@ -188,6 +190,8 @@ def differences(name: str, before: dict, after: dict) -> Iterator[str]:
         yield f"{name}: frames {sorted(before['frames'])} → {sorted(after['frames'])}"
     for frame in before["frames"].keys() & after["frames"].keys():
         (old, old_header), (new, new_header) = before["frames"][frame], after["frames"][frame]
+        if not old:
+            yield f"{name} {frame}: nothing was read"
         if old.keys() != new.keys():
             yield f"{name} {frame}: channels {sorted(old.keys() ^ new.keys())} are in one of them"
         for channel in sorted(old.keys() & new.keys()):
