@@ -31,8 +31,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.comparison.metrics import ssim
 from network.checkpoint import load_model, load_notes
-from network.clips import Clips, open_clips, split_by_shot, whole_frames
-from network.losses import tone_mapped_psnr
 from network.models import (
     TKPCN,
     KernelConfig,
@@ -43,8 +41,10 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
-from network.train import predict, train
-from network.train_config import SamplerConfig, TrainConfig
+from network.training.clips import Clips, open_clips, split_by_shot, whole_frames
+from network.training.config import SamplerConfig, TrainConfig
+from network.training.loop import predict, train
+from network.training.losses import tone_mapped_psnr
 
 
 def networks(frames: int, width: int, blocks: int, activation: str) -> dict[str, Callable[[], Model]]:

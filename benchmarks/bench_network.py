@@ -25,12 +25,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.cpu_time import measure
 from hybrid.heap import keep_freed_memory
-from network.blocks import RobustAverage, outermost_first, ravg
-from network.kernels import apply_kernels, predict_kernel, threshold_kernel
-from network.losses import relmse
 from network.models import PRESETS, channels_last, denoise_tile, for_inference
-from network.train import batch_loss
-from network.train_config import TrainConfig
+from network.paper.blocks import RobustAverage, outermost_first, ravg
+from network.paper.kernels import apply_kernels, predict_kernel, threshold_kernel
+from network.training.config import TrainConfig
+from network.training.loop import batch_loss
+from network.training.losses import relmse
 
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:

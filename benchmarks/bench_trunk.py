@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from hybrid.files.frames import open_shot
 from hybrid.heap import keep_freed_memory
 from hybrid.oidn import denoise_oidn
-from network.trunk import denoise_picture, load_oidn, round_trunk
+from network.unet import denoise_picture, load_oidn, round_trunk
 
 # Of OIDN's weights: its quality, and whether it is told that guides are clean.
 MODES = {

@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frames import open_shot
-from network.losses import ImageLoss, l1, relmse, smape
-from network.perceptual import Perceptual, load_vgg19
+from network.training.losses import ImageLoss, l1, relmse, smape
+from network.training.perceptual import Perceptual, load_vgg19
 
 BLOCK = 16
 

@@ -30,12 +30,12 @@ from torch import Tensor, nn
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.comparison.metrics import psnr
-from network.blocks import ResidualBlock
-from network.clips import Clips, open_clips, whole_frames
 from network.models import filter_window
+from network.paper.blocks import ResidualBlock
 from network.robust_unet import Picture, RobustUNet, RobustUNetConfig, start_from_oidn
-from network.train import train
-from network.train_config import SamplerConfig, TrainConfig
+from network.training.clips import Clips, open_clips, whole_frames
+from network.training.config import SamplerConfig, TrainConfig
+from network.training.loop import train
 
 
 class Joined(nn.Module):
@@ -54,7 +54,7 @@ class Joined(nn.Module):
         self.join.weight.data /= frames
 
     def forward(self, x: Tensor, frames: int, centre: bool) -> Tensor:
-        """As `network.blocks.ChannelAverage`, of the centre."""
+        """As `network.paper.blocks.ChannelAverage`, of the centre."""
         return self.block(self.join(torch.cat(x.chunk(frames), 1)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from network.train_config import DEVICES
+from network.training.config import DEVICES
 
 
 def find_device(name: str) -> tuple[str, torch.device]:
@@ -13,7 +13,7 @@ def find_device(name: str) -> tuple[str, torch.device]:
     Parameters
     ----------
     name : str
-        One of `network.train_config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, cpu. Metal, which
+        One of `network.training.config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, cpu. Metal, which
         nobody has run, is taken by its name alone.
 
     Returns

@@ -1,6 +1,6 @@
 """The networks by name, and those that predict kernels: in these only Robust Average blocks connect the frames.
 
-A model maps the features of an aligned window (`network.inputs`) to kernels (`network.kernels`). All of its
+A model maps the features of an aligned window (`network.paper.inputs`) to kernels (`network.paper.kernels`). All of its
 convolutions are shared over the frames. `RobustUNet`, in a file of its own, makes the
 picture itself.
 """
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
-from network.inputs import CHANNELS, network_inputs
-from network.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
+from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
+from network.paper.inputs import CHANNELS, network_inputs
+from network.paper.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
 from network.robust_unet import Borders, Picture, RobustUNet, RobustUNetConfig, denoise_window, round_robust
 
 
@@ -204,7 +204,7 @@ class RAUNet(UNet):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
         confidence : Tensor
             ``(N, T, 1, H, W)``.
         threshold : float, optional
@@ -228,7 +228,7 @@ class RAUNet(UNet):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
 
         Returns
         -------
@@ -282,7 +282,7 @@ class RAResNet(nn.Module):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
         confidence : Tensor
             ``(N, T, 1, H, W)``.
         threshold : float, optional
@@ -306,7 +306,7 @@ class RAResNet(nn.Module):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
 
         Returns
         -------
@@ -359,7 +359,7 @@ class TKPCN(nn.Module):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
         confidence : Tensor
             ``(N, T, 1, H, W)``.
         threshold : float, optional
@@ -422,7 +422,7 @@ class MultiScale(nn.Module):
         Parameters
         ----------
         features : Tensor
-            ``(N, T, channels, H, W)`` from `network.inputs.network_inputs`.
+            ``(N, T, channels, H, W)`` from `network.paper.inputs.network_inputs`.
         confidence : Tensor
             ``(N, T, 1, H, W)``.
         threshold : float, optional
@@ -718,7 +718,7 @@ def denoise_tile(
     window : mapping
         ``color``, ``(N, T, 3, H, W)`` aligned irradiance, float32, finite; ``albedo``, ``normal`` likewise, or None;
         ``confidence``, ``(N, T, 1, H, W)``; ``exposure``, ``(N,)`` of the *whole* window, as for
-        `network.inputs.network_inputs`. For a `RobustUNet`, in the place of color: ``estimate``, ``residual``,
+        `network.paper.inputs.network_inputs`. For a `RobustUNet`, in the place of color: ``estimate``, ``residual``,
         ``modulation`` and ``gain`` as for `network.robust_unet.realise`.
     threshold : float, optional
         t·K in [0, 1); more keeps more of the input. Default: what the model was trained with.

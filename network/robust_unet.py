@@ -1,6 +1,6 @@
 """The final stage: a U-Net that knows how to denoise, whose frames meet in Robust Average blocks before it does.
 
-The trunk is OIDN's (`network.trunk`). Each frame of an aligned window enters as a noisy realisation of the centre; RA
+The trunk is OIDN's (`network.unet`). Each frame of an aligned window enters as a noisy realisation of the centre; RA
 blocks, the first behind the first convolution at full resolution, let the samples of the frames meet; one decoder makes
 the picture of the centre.
 """
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.blocks import ChannelAverage
-from network.convolution import convolve
-from network.entering import RESIDUAL_LIMIT, can_lay_out, entering
-from network.trunk import (
+from network.cpu.convolution import convolve
+from network.cpu.input_packing import RESIDUAL_LIMIT, can_lay_out, entering
+from network.paper.blocks import ChannelAverage
+from network.unet import (
     DECODERS,
     ENCODERS,
     Convolutions,
@@ -50,7 +50,7 @@ class RobustUNetConfig:
     """Sizes of a `RobustUNet`."""
 
     frames: int = 5  # T, odd; the window
-    size: str = "base"  # of network.trunk.ENCODERS
+    size: str = "base"  # of network.unet.ENCODERS
     ra_scales: tuple[int, ...] = (0,)  # 0: behind the first convolution; s: behind the convolutions of scale s
     clean_guides: bool = False  # whether the trunk relies on its guides: where they have noise they are filtered first
 
@@ -114,7 +114,7 @@ def realise(
     exposure : Tensor
         ``(N,)``, positive, of the irradiance.
     gain : Tensor
-        ``(N,)``, positive: OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
+        ``(N,)``, positive: OIDN's exposure of the whole picture (`network.unet.autoexposure`).
 
     Returns
     -------
@@ -266,7 +266,7 @@ class RobustUNet(nn.Module):
         Parameters
         ----------
         own, alike : Tensor
-            From `lay_out`, or `network.entering.entering`, of any even height.
+            From `lay_out`, or `network.cpu.input_packing.entering`, of any even height.
 
         Returns
         -------
@@ -370,9 +370,9 @@ def denoise_window(
 
     Notes
     -----
-    Without gradients all that is done at full size is done some rows at a time (`network.trunk.in_strips`): no more of
+    Without gradients all that is done at full size is done some rows at a time (`network.unet.in_strips`): no more of
     all frames' features is ever there, and what is there fits the caches of a processor. On a processor what enters is
-    laid out in one pass (`network.entering`).
+    laid out in one pass (`network.cpu.input_packing`).
     """
     model.expect(window["confidence"].shape[1])
     height, width = window["modulation"].shape[-2:]
@@ -439,7 +439,7 @@ OIDN_TRUNKS = {"small": "rt_hdr_alb_nrm_small", "base": "rt_hdr_alb_nrm", "large
 
 
 def start_from_oidn(model: RobustUNet) -> RobustUNet:
-    """Give a model the weights of OIDN's network of its size (`network.trunk.load_oidn`, which says what it raises).
+    """Give a model the weights of OIDN's network of its size (`network.unet.load_oidn`, which says what it raises).
 
     Parameters
     ----------
@@ -456,7 +456,7 @@ def start_from_oidn(model: RobustUNet) -> RobustUNet:
 
 
 def round_robust(model: RobustUNet) -> RobustUNet:
-    """Lay a model out for processors that have bfloat16 (`network.trunk.round_trunk`); the model is changed."""
+    """Lay a model out for processors that have bfloat16 (`network.unet.round_trunk`); the model is changed."""
     model.trunk = round_trunk(model.trunk)
     model.known.weight.data = round_taps(model.known.weight)
     return model

@@ -39,7 +39,7 @@ def test_only_neural_imports_torch_and_the_network():
     command = ROOT / "hybrid" / "commands" / "train.py"
     assert {path.parent for path in learned - {command}} == {ROOT / "hybrid" / "neural"}
     assert imports(command) & {"torch", "network", "safetensors"} == {"network"}
-    assert not imports(ROOT / "network" / "train_config.py") - sys.stdlib_module_names
+    assert not imports(ROOT / "network" / "training" / "config.py") - sys.stdlib_module_names
 
 
 def modules_of_hybrid() -> dict[str, set[str]]:

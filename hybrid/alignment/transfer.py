@@ -184,7 +184,7 @@ def autoexposure(radiance: Array, *, dark: float = 1e-8) -> float:
     Notes
     -----
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
-    ``training/color.py``; `network.trunk.autoexposure` is the same in torch.
+    ``training/color.py``; `network.unet.autoexposure` is the same in torch.
     """
     # float64: no sum overflows
     means = _bin_means(np.maximum(radiance, 0) @ np.array([0.212671, 0.715160, 0.072169]))

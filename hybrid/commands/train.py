@@ -32,7 +32,7 @@ from hybrid.commands.options import (
     say_cuts,
     usage,
 )
-from network.train_config import SamplerConfig, TrainConfig
+from network.training.config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
     from hybrid.files.frames import Shot

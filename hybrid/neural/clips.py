@@ -18,7 +18,7 @@ from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average, gather_and_denoise
-from network.clips import Clip, importance, important_places, write_shards
+from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
 
 
@@ -54,7 +54,7 @@ def write_clips(
     tile : int
         Side of a clip, pixels; 0 for whole frames.
     tiles : int
-        Clips of each frame, placed by `network.clips.importance`.
+        Clips of each frame, placed by `network.training.clips.importance`.
     estimate : str
         Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
     reference : Shot, optional

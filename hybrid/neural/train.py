@@ -10,11 +10,11 @@ import torch
 
 from hybrid.threads import limit_threads
 from network.checkpoint import load_model, shipped_weights
-from network.clips import open_clips, split_by_shot
 from network.models import PRESETS, window_length
 from network.robust_unet import RobustUNet, start_from_oidn
-from network.train import train
-from network.train_config import TrainConfig
+from network.training.clips import open_clips, split_by_shot
+from network.training.config import TrainConfig
+from network.training.loop import train
 
 
 def train_network(
@@ -51,7 +51,7 @@ def train_network(
     threads : int, optional
         Of torch and numba.
     resume : bool
-        Whether to go on from what an interrupted training has left, as for `network.train.train`.
+        Whether to go on from what an interrupted training has left, as for `network.training.loop.train`.
     log : callable
         Is given a step and figures.
 

@@ -19,7 +19,7 @@ from hybrid.oidn import Quality
 from network.checkpoint import load_model, shipped_weights
 from network.devices import has_bfloat16
 from network.robust_unet import RobustUNet
-from network.trunk import Trunk, autoexposure, denoise_albedo, denoise_normal, denoise_picture, load_oidn, round_trunk
+from network.unet import Trunk, autoexposure, denoise_albedo, denoise_normal, denoise_picture, load_oidn, round_trunk
 
 Array = NDArray[np.float32]
 
@@ -40,7 +40,7 @@ def denoise_unet(
 ) -> Array:
     """Denoise one frame with OIDN's networks; in bfloat16 63 to 66 dB from OIDN's own picture.
 
-    Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
+    Where its weights are not found it raises as `network.unet.load_oidn`; see `has_unet`.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def denoise_unet(
 def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced") -> dict[str, Array]:
     """Take the noise out of guides, each by itself, with OIDN's networks.
 
-    Where its weights are not found it raises as `network.trunk.load_oidn`; see `has_unet`.
+    Where its weights are not found it raises as `network.unet.load_oidn`; see `has_unet`.
 
     Parameters
     ----------

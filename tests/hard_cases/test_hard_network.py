@@ -12,13 +12,13 @@ torch = pytest.importorskip("torch")
 from hybrid.alignment.transfer import measure_exposure  # noqa: E402
 from hybrid.comparison import metrics  # noqa: E402
 from hybrid.estimates import MODE_OF  # noqa: E402
-from network import losses  # noqa: E402
-from network.blocks import ravg  # noqa: E402
 from network.checkpoint import load_model, shipped_weights  # noqa: E402
-from network.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
 from network.models import denoise_tile, fast, filter_window, for_inference, unet, window_length  # noqa: E402
-from network.perceptual import VGG19, Perceptual  # noqa: E402
+from network.paper.blocks import ravg  # noqa: E402
+from network.paper.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
 from network.robust_unet import Picture  # noqa: E402
+from network.training import losses  # noqa: E402
+from network.training.perceptual import VGG19, Perceptual  # noqa: E402
 
 pytestmark = pytest.mark.neural
 EXAMPLES = 40

@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch")
 
 from network import devices
 from network.devices import find_device
-from network.train_config import DEVICES
+from network.training.config import DEVICES
 
 pytestmark = pytest.mark.neural
 

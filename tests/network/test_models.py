@@ -10,8 +10,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.inputs import network_inputs
-from network.kernels import apply_kernels, mean_of
 from network.models import (
     PRESETS,
     TKPCN,
@@ -30,6 +28,8 @@ from network.models import (
     unet,
     window_length,
 )
+from network.paper.inputs import network_inputs
+from network.paper.kernels import apply_kernels, mean_of
 
 pytestmark = pytest.mark.neural
 

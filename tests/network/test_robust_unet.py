@@ -11,10 +11,10 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network import trunk
+from network import unet as trunk
 from network.models import denoise_tile, filter_window, for_inference
 from network.robust_unet import KEEP, RobustUNet, RobustUNetConfig, realise, start_from_oidn
-from network.trunk import find_library, load_oidn, pu_forward, pu_inverse
+from network.unet import find_library, load_oidn, pu_forward, pu_inverse
 from nlm.gather import gather
 
 pytestmark = pytest.mark.neural

@@ -19,8 +19,8 @@ from hybrid.neural.clips import write_clips
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, gated_average, gather_and_denoise
 from network.checkpoint import save_model
-from network.clips import Clip, open_clips
 from network.models import centre_of, fast
+from network.training.clips import Clip, open_clips
 from tests.scenes import Scene
 
 pytestmark = pytest.mark.neural

@@ -18,7 +18,7 @@ from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
 from hybrid.files.frames import Frame, open_shot
 from hybrid.neural import denoiser, unet
 from hybrid.neural.unet import denoise_bundled, denoise_unet
-from network.trunk import OIDN_WEIGHTS, Trunk, TrunkConfig
+from network.unet import OIDN_WEIGHTS, Trunk, TrunkConfig
 from tests.scenes import Scene
 
 pytestmark = [

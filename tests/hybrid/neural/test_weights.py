@@ -16,9 +16,9 @@ from hybrid.files.frames import open_shot
 from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
-from network.blocks import ChannelAverage
 from network.checkpoint import load_model, shipped_weights
 from network.models import PRESETS, window_length
+from network.paper.blocks import ChannelAverage
 from nlm.average import robust_average
 
 pytestmark = pytest.mark.neural

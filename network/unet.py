@@ -28,9 +28,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.convolution import can_fuse, convolve
-from network.enlarged import Taps, add_taps, can_enlarge, convolve_enlarged
-from network.fused import can_end, convolve_to_picture
+from network.cpu.convolution import can_fuse, convolve
+from network.cpu.fused_ops import can_end, convolve_to_picture
+from network.cpu.upsample_conv import Taps, add_taps, can_enlarge, convolve_enlarged
 
 #: Channels of the convolutions at each scale of the encoder, finest first.
 ENCODERS: dict[str, tuple[tuple[int, ...], ...]] = {

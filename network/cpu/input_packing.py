@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from loops.cores import on_all_cores
-from network import trunk
+from network import unet as trunk
 
 #: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
 RESIDUAL_LIMIT = 6.0
@@ -26,7 +26,7 @@ RESIDUAL_LIMIT = 6.0
 #: average, samples gathered.
 OWN, ALIKE = 4, 10
 _LIMIT = np.float32(RESIDUAL_LIMIT)
-# The transfer curve (`network.trunk.pu_forward`), which a pixel of five frames asks for 21 times: 14 ns for a power or
+# The transfer curve (`network.unet.pu_forward`), which a pixel of five frames asks for 21 times: 14 ns for a power or
 # a logarithm, 3 ns for a line between two entries of a table. Of each power of two from 2^-20, below which it is one
 # line, to 2^16 there are 512: as exact as the functions in float32. The upper bits of a float32 say which it is.
 _LEAST, _GREATEST, _LOW_BITS = np.float32(2.0**-20), np.float32(2.0**16), np.uint32(14)

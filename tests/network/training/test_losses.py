@@ -10,8 +10,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.kernels import Filtered, apply_kernels, mean_of, predict_kernel
-from network.losses import (
+from network.paper.kernels import Filtered, apply_kernels, mean_of, predict_kernel
+from network.training.losses import (
     SUBSET_EPSILON,
     asymmetry,
     difference_loss,

@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.inputs import CHANNELS, network_inputs
+from network.paper.inputs import CHANNELS, network_inputs
 
 pytestmark = pytest.mark.neural
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from network.convolution import convolve
+from network.cpu.convolution import convolve
 
 
 class Taps(NamedTuple):

@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader
 
-from network.clips import (
+from network.training.clips import (
     Clip,
     Clips,
     Samples,
@@ -29,7 +29,7 @@ from network.clips import (
     whole_frames,
     write_shards,
 )
-from network.train_config import SamplerConfig
+from network.training.config import SamplerConfig
 
 pytestmark = pytest.mark.neural
 
@@ -121,7 +121,7 @@ def test_a_clip_needs_something_to_be_trained_towards() -> None:
 
 
 def test_clips_come_back_from_their_shards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("network.clips.SHARD_BYTES", 3 * 16 * 16 * 2 * 3 * 20)  # two or three clips a shard
+    monkeypatch.setattr("network.training.clips.SHARD_BYTES", 3 * 16 * 16 * 2 * 3 * 20)  # two or three clips a shard
     clips = folder_of(tmp_path, {"hall": 5})
     assert len(list(tmp_path.glob("hall.*.safetensors"))) > 1
     assert (len(clips), clips.shots, clips.frames, clips.size) == (5, ["hall"], 3, 16)
@@ -179,7 +179,7 @@ def test_of_longer_windows_the_middle_is_taken(tmp_path: Path) -> None:
 
 
 def test_clips_know_their_neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("network.clips.SHARD_BYTES", 1)  # a shard each: neighbours are found across them
+    monkeypatch.setattr("network.training.clips.SHARD_BYTES", 1)  # a shard each: neighbours are found across them
     clips = [replace(make_clip(i), linked=torch.full((3,), float(i < 2))) for i in range(4)]
     write_shards(tmp_path, "s", SPP, clips)
     found = open_clips(tmp_path)
@@ -188,7 +188,7 @@ def test_clips_know_their_neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_an_interrupted_shot_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("network.clips.SHARD_BYTES", 1)
+    monkeypatch.setattr("network.training.clips.SHARD_BYTES", 1)
 
     def clips():  # type: ignore[no-untyped-def]
         yield make_clip()

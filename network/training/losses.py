@@ -2,7 +2,7 @@
 
 An image loss takes prediction and target, ``(N, C, H, W)`` radiance, the scale of the radiance, ``(N,)``, and optional
 weights of the errors, and returns one value per sample, ``(N,)``. All are scale invariant:
-``loss(a·x, a·y, a·s) = loss(x, y, s)``. The perceptual one is in `network.perceptual`.
+``loss(a·x, a·y, a·s) = loss(x, y, s)``. The perceptual one is in `network.training.perceptual`.
 
 What they do to the mean when the targets are noisy (Lehtinen et al. 2018): a squared error is least at the mean
 of the targets, so `relmse`, whose weights depend on the prediction alone and carry no gradient, is unbiased.
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from network.kernels import Filtered
+from network.paper.kernels import Filtered
 
 #: Frames of a window, and the weight of the loss of the image they give together.
 Term = tuple[tuple[int, ...], float]

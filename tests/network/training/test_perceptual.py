@@ -13,8 +13,8 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file
 from torch.nn import functional
 
-from network.losses import smape
-from network.perceptual import Perceptual, load_vgg19
+from network.training.losses import smape
+from network.training.perceptual import Perceptual, load_vgg19
 
 pytestmark = pytest.mark.neural
 

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network import convolution, trunk
-from network.trunk import (
+from network import unet as trunk
+from network.cpu import convolution
+from network.unet import (
     OIDN_WEIGHTS,
     Trunk,
     TrunkConfig,
@@ -327,7 +328,7 @@ def test_strips_and_the_whole_are_one_picture(made_up: Trunk, monkeypatch: pytes
 
 
 def test_running_gives_what_training_sees(made_up: Trunk) -> None:
-    """Without gradients sums are taken in another order (`network.enlarged`)."""
+    """Without gradients sums are taken in another order (`network.cpu.upsample_conv`)."""
     picture = torch.rand(2, 9, 48, 32, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
         running = made_up(picture)

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from network.train_config import DEVICES, LOSSES, TERMS, SamplerConfig, TrainConfig
+from network.training.config import DEVICES, LOSSES, TERMS, SamplerConfig, TrainConfig
 
 CONFIG = TrainConfig(steps=6)
 
@@ -63,6 +63,6 @@ def test_a_limit_of_steps_or_of_time_is_all_that_is_needed() -> None:
 
 
 def test_it_is_known_without_torch() -> None:
-    code = "import sys, network.train_config; print('torch' in sys.modules)"
+    code = "import sys, network.training.config; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

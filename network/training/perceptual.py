@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from network.losses import smape
+from network.training.losses import smape
 
 #: Convolutions of VGG19 by block (configuration E of the paper below), each followed by a ReLU, each block but the
 #: last used by a maximum over 2×2. Up to the last convolution; what follows is for classification.
@@ -115,7 +115,7 @@ def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
 
 
 class Perceptual(nn.Module):
-    """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; an `network.losses.ImageLoss`.
+    """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; an `network.training.losses.ImageLoss`.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ def can_blend(x: Tensor, frames: int) -> bool:
 
 
 def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor, kept: Sequence[int]) -> Tensor:
-    """Do what `network.blocks.ChannelAverage` does, in one pass.
+    """Do what `network.paper.blocks.ChannelAverage` does, in one pass.
 
     Parameters
     ----------

@@ -18,11 +18,11 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from network import losses
 from network.checkpoint import new_partial, write_tensors
-from network.kernels import mean_of
-from network.losses import ImageLoss
-from network.train_config import SamplerConfig
+from network.paper.kernels import mean_of
+from network.training import losses
+from network.training.config import SamplerConfig
+from network.training.losses import ImageLoss
 
 FORMAT = "ravg-clips"
 VERSION = "4"
@@ -62,7 +62,7 @@ class Clip:
     exposure : Tensor
         ``(L,)``, of the windows of whole frames: what the network is told when it runs.
     gain : Tensor
-        ``(L,)``, OIDN's exposure of the whole picture (`network.trunk.autoexposure`).
+        ``(L,)``, OIDN's exposure of the whole picture (`network.unet.autoexposure`).
     to_next : Tensor
         ``(L, 2, H, W)``, pixels: from each pixel of the centre to where it is in the next frame; 0 where unknown.
     linked : Tensor

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.fused import blend_channels, can_blend
+from network.cpu.fused_ops import blend_channels, can_blend
 
 
 def ravg(frames: Sequence[Tensor]) -> Tensor:
@@ -230,7 +230,7 @@ class ChannelAverage(nn.Module):
     Notes
     -----
     As `RobustAverage`, with ``w = sigmoid(b)``, b learned. Where no gradient is asked for, on a processor, the block is
-    one pass over memory (`network.fused`), where torch needs one for each of forty operations.
+    one pass over memory (`network.cpu.fused_ops`), where torch needs one for each of forty operations.
 
     Behind the first convolution of a trunk that knows how to denoise, weights that two convolutions of 1×1 predicted in
     each pixel varied by less than 0.05 about 0.8 once they were trained, and the pictures were 0.01 dB worse.

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network.blocks import ChannelAverage, ResidualBlock, RobustAverage, TemporalModule, outermost_first, ravg
+from network.paper.blocks import ChannelAverage, ResidualBlock, RobustAverage, TemporalModule, outermost_first, ravg
 
 pytestmark = pytest.mark.neural
 

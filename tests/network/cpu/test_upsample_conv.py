@@ -10,9 +10,9 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network import trunk
-from network.enlarged import add_taps, can_enlarge, convolve_enlarged
-from network.trunk import Convolutions
+from network import unet as trunk
+from network.cpu.upsample_conv import add_taps, can_enlarge, convolve_enlarged
+from network.unet import Convolutions
 
 pytestmark = pytest.mark.neural
 

@@ -8,8 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network import blocks, fused
-from network.blocks import ChannelAverage, outermost_first
+from network.cpu import fused_ops as fused
+from network.paper import blocks
+from network.paper.blocks import ChannelAverage, outermost_first
 
 pytestmark = pytest.mark.neural
 

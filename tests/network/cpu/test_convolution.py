@@ -10,8 +10,8 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network import convolution
-from network.convolution import can_fuse, convolve
+from network.cpu import convolution
+from network.cpu.convolution import can_fuse, convolve
 
 pytestmark = pytest.mark.neural
 

@@ -16,14 +16,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 
-import network.train
-from network import losses
+import network.training.loop
 from network.checkpoint import load_model, load_notes
-from network.clips import Clip, Clips, Samples, open_clips, split_by_shot, whole_frames, write_shards
 from network.models import Model
 from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
-from network.train import batch_loss, image_loss, predict, train, validate
-from network.train_config import LOSSES, SamplerConfig, TrainConfig
+from network.training import losses
+from network.training.clips import Clip, Clips, Samples, open_clips, split_by_shot, whole_frames, write_shards
+from network.training.config import LOSSES, SamplerConfig, TrainConfig
+from network.training.loop import batch_loss, image_loss, predict, train, validate
 from tests.network.small import MODELS, make_model, make_robust
 
 pytestmark = pytest.mark.neural
@@ -191,7 +191,7 @@ def test_bfloat16_training_stays_near_float32(
     sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = sets[0].of([])
-    monkeypatch.setattr("network.train.has_bfloat16", lambda device: True)
+    monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: True)
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
     half = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
     assert half != full
@@ -203,7 +203,7 @@ def test_a_device_without_bfloat16_trains_in_float32(
 ) -> None:
     none = sets[0].of([])
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
-    monkeypatch.setattr("network.train.has_bfloat16", lambda device: False)
+    monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: False)
     same = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
     assert same == full
 
@@ -277,7 +277,7 @@ def test_two_processes_train_as_one_does_on_the_whole_batch(tmp_path: Path) -> N
 def test_a_batch_that_cannot_be_shared_is_an_error(
     sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(network.train, "_in_group", lambda: True)
+    monkeypatch.setattr(network.training.loop, "_in_group", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 0)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 4)
     with pytest.raises(ValueError, match="batch: expected a multiple of the 4 processes, got 2"):
@@ -363,7 +363,7 @@ def test_validation_measures_what_it_says(tmp_path: Path) -> None:
 
 def test_the_learning_rate_warms_up_and_falls() -> None:
     config = replace(CONFIG, steps=1000, warmup=100)
-    rates = [network.train._rate(config, step, step / 1000) for step in range(1000)]
+    rates = [network.training.loop._rate(config, step, step / 1000) for step in range(1000)]
     assert rates[0] == pytest.approx(0.01, rel=1e-3)
     assert max(rates) == pytest.approx(rates[99]) == pytest.approx(1, abs=0.03)
     assert all(b < a for a, b in pairwise(rates[99:]))

@@ -11,8 +11,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-import network.kernels
-from network.kernels import (
+import network.paper.kernels
+from network.paper.kernels import (
     Filtered,
     Pyramid,
     apply_kernels,
@@ -171,7 +171,7 @@ def test_what_other_devices_compute_is_what_processors_do(size, shape, monkeypat
     frames = uniform(2, 2, 3, *shape, seed=1).requires_grad_()
     found = []
     for device in ("cpu", "other"):
-        monkeypatch.setattr(network.kernels, "_PROCESSOR", device)
+        monkeypatch.setattr(network.paper.kernels, "_PROCESSOR", device)
         sums = apply_kernels(kernels, frames)
         found.append([*sums, *torch.autograd.grad([s.square().sum() for s in sums], (kernels, frames))])
     for here, there in zip(*found, strict=True):

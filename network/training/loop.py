@@ -25,15 +25,15 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
-from network import losses
 from network.checkpoint import describe, new_partial, save_model
-from network.clips import Clips, Samples, whole_frames
 from network.devices import find_device, has_bfloat16
-from network.kernels import Filtered, mean_of
 from network.models import Model, centre_of, channels_last, filter_window
-from network.perceptual import Perceptual, load_vgg19
+from network.paper.kernels import Filtered, mean_of
 from network.robust_unet import MIRRORED, Picture, RobustUNet
-from network.train_config import TrainConfig
+from network.training import losses
+from network.training.clips import Clips, Samples, whole_frames
+from network.training.config import TrainConfig
+from network.training.perceptual import Perceptual, load_vgg19
 
 
 def predict(
@@ -46,7 +46,7 @@ def predict(
     model : Model
         Any.
     batch : dict of Tensor
-        As from `network.clips.Samples`, with N in front.
+        As from `network.training.clips.Samples`, with N in front.
     bfloat16 : bool
         Whether the convolutions run in bfloat16.
     run : callable, optional
@@ -103,7 +103,7 @@ def batch_loss(
     model : Model
         Any.
     batch : dict of Tensor
-        As from `network.clips.Samples`, with N in front; of neighbours where their differences count.
+        As from `network.training.clips.Samples`, with N in front; of neighbours where their differences count.
     config : TrainConfig
         Terms, slope, differences and precision.
     loss : ImageLoss

@@ -11,8 +11,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network import robust_unet, trunk
-from network.entering import ALIKE, OWN, _curve, _on_curve, can_lay_out, entering
+from network import robust_unet
+from network import unet as trunk
+from network.cpu.input_packing import ALIKE, OWN, _curve, _on_curve, can_lay_out, entering
 from network.robust_unet import KNOWN, RobustUNet, RobustUNetConfig, denoise_window, realise
 
 pytestmark = pytest.mark.neural
