@@ -230,7 +230,7 @@ def summarize_runs(runs: Sequence[Run]) -> Seconds:
     -----
     The median alone. Dividing out the load of a round (as all methods felt it), or of a run (by a fixed piece of work
     between its frames), made ratios repeat no better on a machine under eight times its load: that changes
-    within seconds. More rounds do help; `benchmarks/bench_compare.py` shows how far the ratios can be trusted.
+    within seconds. More rounds do help.
     """
     wall = np.array([run.seconds / run.megapixels for run in runs])
     cpu = np.array([run.cpu_seconds / run.megapixels for run in runs])

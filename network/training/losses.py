@@ -9,7 +9,7 @@ of the targets, so `relmse`, whose weights depend on the prediction alone and ca
 `l1` is least at the median, and Monte Carlo noise is skewed, with its median below its mean: it darkens.
 `smape` is an L1 error with a weight that depends on the target too and darkens as well, where the noise is
 strong. `relmse` with a limit on outliers stays between the two: it only darkens by what is beyond the limit.
-``benchmarks/loss_bias.py`` measures this on renders.
+``docs/experiments.md`` has measurements on renders.
 """
 
 from __future__ import annotations
