@@ -24,7 +24,7 @@ from torch.nn import functional
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.cpu_time import measure
-from hybrid.heap import keep_freed_memory
+from hybrid.runtime.allocator import reuse_freed_memory
 from network.models import PRESETS, channels_last, denoise_tile, for_inference
 from network.paper.blocks import RobustAverage, outermost_first, ravg
 from network.paper.kernels import apply_kernels, predict_kernel, threshold_kernel
@@ -131,7 +131,7 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
 
 def main(argv: list[str]) -> int:
     options = parse_arguments(argv)
-    keep_freed_memory()  # as the commands do
+    reuse_freed_memory()  # as the commands do
     torch.set_num_threads(options.threads)
     numba.set_num_threads(min(options.threads, numba.get_num_threads()))
     results = {}

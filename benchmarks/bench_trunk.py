@@ -25,8 +25,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.files.frames import open_shot
-from hybrid.heap import keep_freed_memory
 from hybrid.oidn import denoise_oidn
+from hybrid.runtime.allocator import reuse_freed_memory
 from network.unet import denoise_picture, load_oidn, round_trunk
 
 # Of OIDN's weights: its quality, and whether it is told that guides are clean.
@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--size", default="960x540")
     options = parser.parse_args(argv)
-    keep_freed_memory()  # as the commands do
+    reuse_freed_memory()  # as the commands do
     torch.set_num_threads(options.threads)
     width, height = map(int, options.size.split("x"))
     shot = Path(__file__).resolve().parent.parent / "examples" / "shot"

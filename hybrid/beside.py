@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from concurrent.futures import Executor, Future
 
 from hybrid.files.frames import Frame, Frames
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 
 
 class ReadAhead:

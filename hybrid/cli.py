@@ -19,12 +19,12 @@ from hybrid.commands.simulate import simulate
 from hybrid.commands.status import status
 from hybrid.commands.train import prepare, train
 from hybrid.commands.view import view
-from hybrid.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
-from hybrid.system import expand_home
-from hybrid.threads import check_thread_counts, let_waiting_threads_sleep
+from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
+from hybrid.runtime.system import expand_home
+from hybrid.runtime.threads import check_thread_counts, let_waiting_threads_sleep
 
 # Where numba looks for a folder for compiled loops: its own list, and after that ours.
-FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.compiled.Fallback"
+FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.runtime.compiled.Fallback"
 
 
 class Command(TyperCommand):

@@ -23,8 +23,8 @@ from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.plausibility import find_nonfinite
+from hybrid.runtime.timing import Timings
 from hybrid.steady import Denoised, DenoiseWindow, Pictures
-from hybrid.timing import Timings
 
 Array = NDArray[np.float32]
 

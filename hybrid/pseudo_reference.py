@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import compress, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.oidn import denoise_oidn
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 from nlm.average import average, robust_average
 from nlm.gather import gather
 from nlm.guided import guided_filter

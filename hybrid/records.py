@@ -20,8 +20,8 @@ from typing import Any
 from hybrid.files.replace import remove_leftovers, write_file
 from hybrid.files.sequences import format_frames
 from hybrid.files.sources import PACKAGES, versions
-from hybrid.system import peak_memory, process_lives
-from hybrid.timing import Timings
+from hybrid.runtime.system import peak_memory, process_lives
+from hybrid.runtime.timing import Timings
 
 FOLDER = "ravg"
 # The sequence whose files are called by their numbers alone.

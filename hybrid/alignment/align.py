@@ -23,7 +23,7 @@ from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
 from hybrid.alignment.window import AlignedWindow, clean_guide, warp_layer, warp_residuals
 from hybrid.files.frames import Frame, Frames, Shot
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import color_gate, color_gates

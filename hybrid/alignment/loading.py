@@ -24,7 +24,7 @@ from hybrid.alignment.measure import (
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
 from hybrid.files.frames import Frame, Frames
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 from nlm.fireflies import (
     Lights,
     Mask,

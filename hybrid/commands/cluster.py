@@ -23,7 +23,7 @@ import typer
 
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import RESOURCES
-from hybrid.interrupt import INTERRUPTED, interruptible
+from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 SchedulerOption = Annotated[
     str | None,

@@ -134,8 +134,8 @@ def compare(
     from hybrid.comparison.samples import samples_of
     from hybrid.comparison.store import FrameStore
     from hybrid.comparison.tables import markdown_table, result_table
-    from hybrid.heap import keep_freed_memory
     from hybrid.plan import plan_shot
+    from hybrid.runtime.allocator import reuse_freed_memory
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]
@@ -188,7 +188,7 @@ def compare(
         else:
             bar.advance(done - bar.done, what)
 
-    keep_freed_memory()
+    reuse_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         comparison = compare_shot(
             noisy,

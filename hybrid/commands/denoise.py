@@ -46,7 +46,7 @@ from hybrid.commands.options import (
     say_cuts,
     usage,
 )
-from hybrid.interrupt import INTERRUPTED, interruptible
+from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
     from hybrid.estimates import EstimateSource
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from hybrid.plan import Rules
     from hybrid.plausibility import Judgement
     from hybrid.records import Record
+    from hybrid.runtime.timing import Timings
     from hybrid.steady import DenoiseWindow
-    from hybrid.timing import Timings
 
 
 def pseudoref(
@@ -103,8 +103,8 @@ def pseudoref(
     from hybrid.plan import NEURAL_STAGES
     from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL, gated_average, gather_and_denoise
     from hybrid.pseudo_reference import filter_window as estimate_centre
+    from hybrid.runtime.timing import Timings
     from hybrid.steady import Denoised
-    from hybrid.timing import Timings
 
     rules = rules_of(stages, no_stages)
     if neural := rules.on & NEURAL_STAGES:
@@ -270,7 +270,7 @@ def denoise(
     from hybrid.breakdown import Breakdown, write_breakdown
     from hybrid.estimates import MODE_OF, OIDN_MODES, EstimateSource, choose_estimate
     from hybrid.pipeline import reach_of
-    from hybrid.timing import Timings
+    from hybrid.runtime.timing import Timings
 
     if breakdown is not None and max_memory is not None:
         raise typer.BadParameter("--breakdown looks at whole frames, expected no --max-memory with it")
@@ -455,7 +455,7 @@ def _on_record(context: typer.Context, spec: str, shot: Shot, output: str) -> It
     """Leave a record of what has failed before the first frame."""
     from hybrid.files.frames import output_path
     from hybrid.records import Record, sequence_name
-    from hybrid.timing import Timings
+    from hybrid.runtime.timing import Timings
 
     try:
         yield
@@ -620,16 +620,16 @@ def _denoise(job: Job, record: Record) -> None:
     from rich.table import Table
 
     from hybrid.files.layers import summarize_layers
-    from hybrid.heap import keep_freed_memory
     from hybrid.memory import parse_size, plan_rows
     from hybrid.pipeline import Failed, denoise_frames, describe_run
     from hybrid.plan import NEURAL_STAGES, Plan, merge
+    from hybrid.runtime.allocator import reuse_freed_memory
 
     shot, source, timings = job.shot, job.source, job.timings
     with usage():
         limit = None if job.max_memory is None else parse_size(job.max_memory)
     if limit is None:
-        keep_freed_memory()
+        reuse_freed_memory()
     rules = job.rules
     rows = None
     if limit is not None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hybrid.streams import open_standard_streams
+from hybrid.runtime.streams import open_standard_streams
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -244,10 +244,10 @@ def open_input(
     motion: str | None = None,
     max_pixels: int | None = None,
 ) -> Shot:
-    from hybrid.compiled import watch_compiling
     from hybrid.files.exr import MAX_PIXELS
     from hybrid.files.frames import open_shot
     from hybrid.files.sequences import parse_frames
+    from hybrid.runtime.compiled import watch_compiling
 
     watch_compiling()
     chosen = parse_input(profile, motion)

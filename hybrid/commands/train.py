@@ -174,8 +174,8 @@ def prepare(
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
     from hybrid.files.frames import open_shot
-    from hybrid.heap import keep_freed_memory
     from hybrid.plan import plan_shot
+    from hybrid.runtime.allocator import reuse_freed_memory
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -206,7 +206,7 @@ def prepare(
         run_on_cluster(scheduler, "prepare", chunks)
         return
     output.mkdir(parents=True, exist_ok=True)
-    keep_freed_memory()
+    reuse_freed_memory()
     bar = Progress("prepare", sum(len(next(iter(shot.values()))) for _, shot, _ in found))
     for name, shot, counts in found:
         first = next(iter(shot.values()))

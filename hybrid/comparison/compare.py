@@ -19,7 +19,7 @@ from hybrid.comparison.running import ENOUGH, WARM_UP, Progress, Run, run_apart,
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Shot
-from hybrid.system import load_average
+from hybrid.runtime.system import load_average
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
 LARGE = 1 << 20  # pixels of a frame; above, the maps of all frames would take longer than the rest of a comparison

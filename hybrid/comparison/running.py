@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frames import Frame, MappedShot, Shot
-from hybrid.heap import keep_freed_memory
-from hybrid.system import peak_memory, start_context
-from hybrid.threads import let_waiting_threads_sleep, limit_threads
+from hybrid.runtime.allocator import reuse_freed_memory
+from hybrid.runtime.system import peak_memory, start_context
+from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
 
 Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
 P = ParamSpec("P")
@@ -75,7 +75,7 @@ def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         If the process dies.
     """
     let_waiting_threads_sleep()  # the libraries read it when the forked process first uses them
-    with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=keep_freed_memory) as pool:
+    with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=reuse_freed_memory) as pool:
         return pool.submit(function, *args, **kwargs).result()
 
 

@@ -27,7 +27,7 @@ import OpenEXR
 
 from hybrid.files.replace import refuse_other_kinds, replace_file
 from hybrid.files.strings import readable_copy, restore_strings, without_surrogates
-from hybrid.streams import open_standard_streams
+from hybrid.runtime.streams import open_standard_streams
 
 # 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
 # that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.

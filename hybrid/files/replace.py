@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hybrid.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
+from hybrid.runtime.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
 
 # What this process is writing to just now.
 _unfinished: set[Path] = set()

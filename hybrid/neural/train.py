@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from hybrid.threads import limit_threads
+from hybrid.runtime.threads import limit_threads
 from network.checkpoint import load_model, shipped_weights
 from network.models import PRESETS, window_length
 from network.robust_unet import RobustUNet, start_from_oidn

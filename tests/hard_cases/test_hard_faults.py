@@ -23,11 +23,11 @@ from hybrid.estimates import OfFrames, OfWindows
 from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
-from hybrid.interrupt import interruptible
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.plan import STAGES, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
+from hybrid.runtime.interrupt import interruptible
 from tests.hard_cases.test_hard_files import ROOT, run_alone
 from tests.scenes import Scene
 
@@ -209,7 +209,7 @@ def test_resume_of_the_network_gives_the_same_bytes(tmp_path):
 BUSY = """
 import hashlib, pathlib, sys
 from hybrid.files.replace import replace_file
-from hybrid.interrupt import interruptible
+from hybrid.runtime.interrupt import interruptible
 try:
     with interruptible(lambda: print("2 of 5", flush=True)), replace_file(pathlib.Path(sys.argv[1])) as temporary:
         print("begun", flush=True)
@@ -237,7 +237,7 @@ def test_a_stop_is_heard_in_the_midst_of_compiled_code(tmp_path, number):
 READING = """
 import hashlib, os, sys, threading, time
 from hybrid.files import exr
-from hybrid.interrupt import interruptible
+from hybrid.runtime.interrupt import interruptible
 
 def read():
     with exr._library_messages():
@@ -500,7 +500,7 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
 
 FAULTS = """
 import resource
-from hybrid.heap import keep_freed_memory
+from hybrid.runtime.allocator import reuse_freed_memory
 
 def page_faults() -> int:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -508,7 +508,7 @@ def page_faults() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 first, again = page_faults(), page_faults()
-keep_freed_memory()
+reuse_freed_memory()
 page_faults()
 print(first, again, page_faults())
 """

@@ -8,7 +8,7 @@ import pytest
 
 from hybrid.beside import ReadAhead
 from hybrid.files.frames import Frame
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 
 
 class Told:

@@ -9,8 +9,8 @@ from hybrid import pipeline
 from hybrid.files.frames import Shot, open_shot
 from hybrid.pipeline import Finished, denoise_frames
 from hybrid.plan import Rules
+from hybrid.runtime.timing import Timings
 from hybrid.steady import Denoised
-from hybrid.timing import Timings
 from tests.scenes import Scene
 
 SCENE = Scene(frames=4, noise=0.1)

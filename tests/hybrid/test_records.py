@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.records import FOLDER, Record, gather_status, read_records, sequence_name
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 
 
 def made(folder, record, *numbers, seconds=2.0):

@@ -11,7 +11,7 @@ import pytest
 
 from hybrid.files.pictures import encode_srgb
 from hybrid.records import Record
-from hybrid.timing import Stage, Timings
+from hybrid.runtime.timing import Stage, Timings
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 from tests.scenes import Scene

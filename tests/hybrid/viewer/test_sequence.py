@@ -13,7 +13,7 @@ import pytest
 from hybrid.files.exr import ExrError, read_exr, write_layers
 from hybrid.files.pictures import encode_srgb
 from hybrid.records import Record
-from hybrid.timing import Timings
+from hybrid.runtime.timing import Timings
 from hybrid.viewer import sequence as module
 from hybrid.viewer.sequence import Sequence, encode_picture
 from tests.scenes import Scene

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from hybrid.files.replace import remove_unfinished
-from hybrid.system import INTERRUPTS
+from hybrid.runtime.system import INTERRUPTS
 
 INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
 # How long Python is given to come back from compiled code and to unwind by itself, seconds.

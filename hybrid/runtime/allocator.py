@@ -12,7 +12,7 @@ M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_ARENA_MAX = -3, -1, -8
 KEPT = 3 * 2**26
 
 
-def keep_freed_memory() -> None:
+def reuse_freed_memory() -> None:
     """Let this process keep the memory it frees, where its C library is glibc; elsewhere do nothing.
 
     glibc gives blocks above 32 MiB back to the kernel at once, which hands out zeroed pages one by one when the next is

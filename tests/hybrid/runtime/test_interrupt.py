@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 BUSY = """
 import hashlib, pathlib, sys
 from hybrid.files.replace import replace_file
-from hybrid.interrupt import interruptible, stop_with_stdin
+from hybrid.runtime.interrupt import interruptible, stop_with_stdin
 stop_with_stdin()
 try:
     with interruptible(lambda: print("2 of 5", flush=True)), replace_file(pathlib.Path(sys.argv[1])):
@@ -70,7 +70,7 @@ def test_the_command_ends_with_its_standard_input(tmp_path):
 def test_what_the_process_starts_inherits_neither_variable_nor_standard_input():
     code = """
 import os, subprocess, sys
-from hybrid.interrupt import stop_with_stdin
+from hybrid.runtime.interrupt import stop_with_stdin
 stop_with_stdin()
 child = "import os, sys; print(os.environ.get('RAVG_STOP_WITH_STDIN'), len(sys.stdin.read()), flush=True)"
 subprocess.run([sys.executable, "-c", child], check=True)

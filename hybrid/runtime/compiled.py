@@ -51,7 +51,7 @@ class _FirstRun(event.Listener):
             if sys.platform == "win32":  # no console window of its own where this process has none
                 options["creationflags"] = subprocess.CREATE_NO_WINDOW
             with suppress(OSError):
-                self.beside = subprocess.Popen([sys.executable, "-m", "hybrid.compiled"], **options)
+                self.beside = subprocess.Popen([sys.executable, "-m", "hybrid.runtime.compiled"], **options)
 
     def on_end(self, event: Any) -> None:
         pass

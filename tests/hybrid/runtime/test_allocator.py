@@ -11,7 +11,7 @@ import pytest
 FREED = """
 import sys, threading
 import numpy as np
-from hybrid.heap import keep_freed_memory
+from hybrid.runtime.allocator import reuse_freed_memory
 
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
@@ -20,7 +20,7 @@ def take():
     block = np.ones(2**23)  # 64 MiB, which glibc would map anew, and unmap
 
 if sys.argv[1] == "keep":
-    keep_freed_memory()
+    reuse_freed_memory()
 before = resident()
 take()
 print(resident() - before)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from hybrid.cli import main
-from hybrid.threads import SPINS, check_thread_counts
+from hybrid.runtime.threads import SPINS, check_thread_counts
 
 VARIABLES = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"
 
@@ -37,7 +37,7 @@ def test_openmp_has_not_read_the_variable_before_the_command_sets_it():
 COUNTS = """
 import cv2, numba
 {first}
-from hybrid.threads import limit_threads
+from hybrid.runtime.threads import limit_threads
 limit_threads(1)
 import torch
 print(cv2.getNumThreads(), numba.get_num_threads(), torch.get_num_threads())
@@ -55,7 +55,7 @@ def test_all_libraries_are_limited_whether_torch_is_there_already_or_not(first):
 
 
 def test_numba_is_not_asked_for_more_than_it_started_with():
-    code = "import numba\nfrom hybrid.threads import limit_threads\nlimit_threads(8)\nprint(numba.get_num_threads())"
+    code = "import numba, hybrid.runtime.threads as t\nt.limit_threads(8)\nprint(numba.get_num_threads())"
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     assert done.stdout.split() == ["2"]

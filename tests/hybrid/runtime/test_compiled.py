@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 NOBODY = 65534
 LOOP = """
 from numba import njit
@@ -26,7 +26,7 @@ from hybrid.cli import FOLDERS
 from hybrid.commands.log import start_log
 start_log()
 os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = FOLDERS
-import numba, hybrid.compiled
+import numba, hybrid.runtime.compiled
 numba.njit(lambda x: 2 * x)(1)  # all that compiling needs is loaded
 if os.geteuid() == 0:  # who may write anywhere
     os.setegid(int(sys.argv[2]))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hybrid import system
-from hybrid.system import (
+from hybrid.runtime import system
+from hybrid.runtime.system import (
     expand_home,
     is_reserved,
     load_average,
@@ -141,10 +141,11 @@ def test_peak_memory_holds_what_the_process_takes():
 
 
 def test_processes_are_forked_from_a_server_on_linux_alone(monkeypatch):
-    assert start_context("hybrid.system").get_start_method() == ("forkserver" if sys.platform == "linux" else "spawn")
+    expected = "forkserver" if sys.platform == "linux" else "spawn"
+    assert start_context("hybrid.runtime.system").get_start_method() == expected
     for platform in ("darwin", "win32"):
         monkeypatch.setattr(system.sys, "platform", platform)
-        assert start_context("hybrid.system").get_start_method() == "spawn"
+        assert start_context("hybrid.runtime.system").get_start_method() == "spawn"
 
 
 def test_the_load_is_unknown_on_windows(monkeypatch):

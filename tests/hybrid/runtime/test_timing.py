@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybrid.files.replace import replace_file
-from hybrid.system import peak_memory
-from hybrid.timing import Timings
+from hybrid.runtime.system import peak_memory
+from hybrid.runtime.timing import Timings
 
 
 def test_stages_add_up():
@@ -64,7 +64,7 @@ def test_what_goes_on_beside_the_work_is_counted_there_and_not_with_the_work():
 
 
 PEAK = """
-from hybrid.system import peak_memory
+from hybrid.runtime.system import peak_memory
 before = peak_memory()
 bytearray(256 * 2**20)  # zeroed, so touched; and freed
 print(before, peak_memory())

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from hybrid.system import peak_memory
+from hybrid.runtime.system import peak_memory
 
 
 @dataclass

@@ -1,0 +1,1 @@
+"""The process itself: threads, memory, compiled loops, interrupts, timings, and what differs between systems."""
