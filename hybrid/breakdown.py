@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frames import Shot, output_path
-from hybrid.files.pictures import encode_srgb, write_png
+from hybrid.files.png import encode_srgb, write_png
 from nlm.average import average, replace_nonfinite
 
 Array = NDArray[np.float32]
@@ -134,7 +134,7 @@ def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:
     """The rows of one picture, in [0, 1]."""
     number = shot.numbers[len(shot.numbers) // 2]
     kinds = [[shot.own_name(f"{kind}.{name}") for name in names] for kind in ("contribution", "weight")]
-    denoised = shot.remade({number: output_path(output, shot, number)}, aovs=[*kinds[0], *kinds[1]]).read(number)
+    denoised = shot.reopened({number: output_path(output, shot, number)}, aovs=[*kinds[0], *kinds[1]]).read(number)
     noisy, _ = replace_nonfinite(shot.read(number).color)
     exposure = np.float32(measure_exposure(noisy) / 0.18)
     rows = [

@@ -11,9 +11,9 @@ from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
 from hybrid.files.frames import Shot
 from hybrid.pipeline import Failed, Finished, check_written, denoise_frames, describe_run
 from hybrid.plan import NEURAL_STAGES, Rules
-from hybrid.plausibility import judge_layers
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
 from hybrid.steady import Denoised, DenoiseWindow
+from hybrid.validation import validate_layers
 
 
 def denoise_shot(
@@ -77,7 +77,7 @@ def denoise_shot(
     >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr", preset="draft")]
     ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
     """
-    shot = judge_layers(shot).apply(shot)
+    shot = validate_layers(shot).apply(shot)
     off = set(no_stages)
     denoise: DenoiseWindow
     settings: dict[str, object] = {"aov": shot.aovs}

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.alignment.loading import REACH
-from hybrid.files.frames import Frame, Shot, open_beside, output_path
+from hybrid.files.frames import Frame, Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
-from hybrid.plausibility import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
+from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Lights, hold_lights
 
@@ -76,8 +76,8 @@ class OfFrames:
 
         def seen(frame: Frame) -> None:
             with aligner.timings.stage("estimate"):
-                lamps = aligner.frames[frame.number].lamps
-                aligner.estimates[frame.number] = _checked(self.function(frame), frame, lamps)
+                highlights = aligner.frames[frame.number].highlights
+                aligner.estimates[frame.number] = _checked(self.function(frame), frame, highlights)
 
         aligner.load(numbers, seen)
 
@@ -267,7 +267,7 @@ def _choose(
         if (lacking := why_no_oidn()) is not None:
             raise ImportError(f'estimate {spec}: {lacking}; expected: pip install "pyoidn"')
         return _oidn(spec, keep, "asked for", device)
-    sequence = open_beside(spec, shot)
+    sequence = open_matching_sequence(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
         raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
@@ -333,10 +333,10 @@ class Kept:
     def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool, device: str) -> None:
         # Of neighbours too that were not asked for.
         path = Path(spec)
-        if shot.picture:
-            name = _folder_name(shot.picture)
+        if shot.view:
+            name = _folder_name(shot.view)
             path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
-        self.places = {number: output_path(path, shot, number, beside=True) for number in shot.files}
+        self.places = {number: output_path(path, shot, number, include_context=True) for number in shot.files}
         self._shot = shot
         self._facts = {"estimate": mode, "quicker": quicker, "device": device, "forced": forced, **versions("pyoidn")}
         # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.
@@ -351,15 +351,15 @@ class Kept:
             If another file is there, which no run has left as an estimate.
         """
         path, shot = self.places[frame.number], self._shot
-        files = shot.states(shot.near(frame.number, self._reach))
-        made_from = describe_sources(files, frame=frame.number, layers=shot.taken(frame.number), **self._facts)
+        files = shot.sources(shot.neighbours(frame.number, self._reach))
+        made_from = describe_sources(files, frame=frame.number, layers=shot.layer_summary(frame.number), **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
                 raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")
             path.parent.mkdir(parents=True, exist_ok=True)
             shot.write(path, frame.number, {"color": run(frame, *known)}, attributes={MADE_FROM: made_from})
         # Read back also what was just written, half as it may be: every run then sees the same.
-        return shot.remade({frame.number: path}).read(frame.number).color
+        return shot.reopened({frame.number: path}).read(frame.number).color
 
 
 def _folder_name(picture: str) -> str:
@@ -375,8 +375,8 @@ def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Ca
     return estimate_oidn(frame, denoise, **settings)
 
 
-def _checked(found: Array | None, frame: Frame, lamps: Lights | None = None) -> Array | None:
-    """An estimate that fits its frame and is finite, without lamps that are not in the frame, and their halos."""
+def _checked(found: Array | None, frame: Frame, highlights: Lights | None = None) -> Array | None:
+    """An estimate that fits its frame and is finite, without highlights that are not in the frame, and their halos."""
     if found is None:
         return None
     what = f"the estimate of frame {frame.number}"
@@ -388,8 +388,8 @@ def _checked(found: Array | None, frame: Frame, lamps: Lights | None = None) -> 
     if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
         raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
     filled = np.maximum(filled, 0)
-    if lamps is not None:
-        filled = hold_lights(filled, lamps.pixels)
+    if highlights is not None:
+        filled = hold_lights(filled, highlights.pixels)
     if fault := find_lost_light(filled, noisy, ~bad):
         raise ValueError(f"{what}: {fault}")
     return filled

@@ -149,7 +149,7 @@ def _planes_prepared(layers: Layers) -> float:
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     one_way = layers.motion_convention is not None and not layers.motion_convention.pair
     single = (layers.depth is not None and one_way) + (layers.alpha is not None)
-    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.tints.values()))
+    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.pass_colors.values()))
     return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
 
 

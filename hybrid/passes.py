@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 _BAND, _ROWS = 27, 540
 
 
-def thin_passes(frame: Frame) -> Frame:
+def sample_rows(frame: Frame) -> Frame:
     """Color, albedo and further layers of a frame, of tall ones some bands of rows; finite."""
     height = frame.color.shape[0]
     rows = np.arange(height) // _BAND % -(-height // _ROWS) == 0
@@ -32,17 +32,17 @@ def thin_passes(frame: Frame) -> Frame:
         cut(frame.color),
         albedo=None if frame.albedo is None else np.maximum(cut(frame.albedo), 0),
         aovs={name: cut(layer) for name, layer in frame.aovs.items()},
-        tints={name: np.maximum(cut(tint), 0) for name, tint in frame.tints.items()},
+        pass_colors={name: np.maximum(cut(tint), 0) for name, tint in frame.pass_colors.items()},
     )
 
 
-def judge_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
+def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
     """Find out what the further layers of a shot are.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Some frames of it, from `thin_passes`; all have the same layers.
+        Some frames of it, from `sample_rows`; all have the same layers.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def judge_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
             continue
         albedos = [frame.albedo for frame in frames]
         known = [albedo for albedo in albedos if albedo is not None]
-        tinted = any(name in frame.tints for frame in frames)
+        tinted = any(name in frame.pass_colors for frame in frames)
         if len(known) == len(own) and not tinted and is_textured(np.concatenate(own), np.concatenate(known)):
             textured.append(name)
         if name in among:
@@ -101,7 +101,7 @@ def judge_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
 
 def _radiance_of(frame: Frame, name: str) -> Array:
     """A layer of a frame, multiplied by its color where it is written without (H, W, C)."""
-    tint = frame.tints.get(name)
+    tint = frame.pass_colors.get(name)
     return frame.aovs[name] if tint is None else frame.aovs[name] * tint
 
 

@@ -22,9 +22,9 @@ from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
-from hybrid.plausibility import find_nonfinite
 from hybrid.runtime.timing import Timings
 from hybrid.steady import Denoised, DenoiseWindow, Pictures
+from hybrid.validation import find_nonfinite
 
 Array = NDArray[np.float32]
 
@@ -53,7 +53,7 @@ class Finished:
     repaired: int = 0
     fireflies: int = 0
     mean: float = 0.0  # radiance of the noisy frame without its fireflies
-    burnt: float = 0.0  # mean radiance that went with them
+    removed_radiance: float = 0.0  # mean radiance that went with them
     outliers: int = 0
     clamped: int = 0
     plan: Plan | None = None  # which stages ran, and why
@@ -173,7 +173,7 @@ def denoise_frames(
     estimates : Estimates, optional
         Where the estimates of single frames come from (`hybrid.estimates`).
     others : sequence of (Shot, Estimates or None)
-        Further pictures of the same files (`Shot.pictures`), each with a window of its own. A file is written once.
+        Further pictures of the same files (`Shot.views`), each with a window of its own. A file is written once.
     attributes : mapping of str to str, optional
         Written to the header of each file.
     rows : int, optional
@@ -200,7 +200,7 @@ def denoise_frames(
     ------
     ValueError
         If a frame would be written over its own input, or its picture cannot be right: it is not finite, or its light
-        is not that of the noisy frame (`hybrid.plausibility.find_lost_light`).
+        is not that of the noisy frame (`hybrid.validation.find_lost_light`).
 
     Notes
     -----
@@ -227,7 +227,7 @@ def denoise_frames(
         def expect(number: int) -> None:
             """Have the frames read ahead that the picture of a frame needs."""
             # The outermost are read only where something shines in the one beside them, or by a later window.
-            near = shot.near(number, reach - REACH) if beside else ()
+            near = shot.neighbours(number, reach - REACH) if beside else ()
             for frames in readers:
                 frames.expect(near)
 
@@ -244,7 +244,7 @@ def denoise_frames(
             nonlocal making
             making = number
             started, path = time.perf_counter(), paths[number]
-            read_as = [picture.taken(number) for picture, _ in all_pictures]
+            read_as = [picture.layer_summary(number) for picture, _ in all_pictures]
             # With its number: in a shot that one window holds, all frames are made from the same files.
             made_from = describe_sources(sources(number), frame=number, layers=read_as, size=list(shot.shape))
             planned = {**(attributes or {}), BESIDE: _others(number, makers[0].beside(number)), MADE_FROM: made_from}
@@ -277,7 +277,7 @@ def denoise_frames(
                 repaired=sum(counts.repaired for counts in counted),
                 fireflies=sum(counts.fireflies for counts in counted),
                 mean=0.0 if centre is None else centre.mean,
-                burnt=0.0 if centre is None else centre.burnt,
+                removed_radiance=0.0 if centre is None else centre.removed_radiance,
                 outliers=sum(counts.outliers for counts in counted),
                 plan=plan,
                 again=again,
@@ -288,7 +288,7 @@ def denoise_frames(
                 with timings.beside("write"):
                     for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
                         if read is not None:
-                            read.check_unchanged(n for n in shot.near(number, reach) if read.has(n))
+                            read.check_unchanged(n for n in shot.neighbours(number, reach) if read.has(n))
                     headed = {**(attributes or {}), **own}
                     clamped = shot.write(path, number, layers[0], extra, headed, pictures)
                     return replace(finished, clamped=clamped + sum(counts.beyond for counts in counted))
@@ -382,13 +382,13 @@ def sources_of(
     shot, reach = pictures[0][0], reach_of(pictures[0][1], radius, rules)
 
     def sources(number: int) -> dict[str, Source]:
-        near = shot.near(number, reach)
+        near = shot.neighbours(number, reach)
         if before is not None:
             return {what: source for n in near for what, source in before(n).items()}
-        files = shot.states(near)
+        files = shot.sources(near)
         for _, estimates in pictures:
             if estimates is not None and (given := estimates.files) is not None:
-                files |= given.states((n for n in near if given.has(n)), "estimate")
+                files |= given.sources((n for n in near if given.has(n)), "estimate")
         return files
 
     return sources

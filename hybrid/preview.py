@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frames import Shot, output_path
 from hybrid.files.movies import check_movie, write_movie
-from hybrid.files.pictures import encode_bytes, write_png
+from hybrid.files.png import encode_bytes, write_png
 from nlm.average import replace_nonfinite
 
 Picture = NDArray[np.uint8]
@@ -161,7 +161,7 @@ class _Pairs:
 
     def __init__(self, shot: Shot, output: str | Path) -> None:
         self.noisy = shot
-        self.denoised = shot.remade({number: output_path(output, shot, number) for number in shot.numbers})
+        self.denoised = shot.reopened({number: output_path(output, shot, number) for number in shot.numbers})
         middle, _ = replace_nonfinite(shot.read_color(shot.numbers[len(shot.numbers) // 2]))
         self._exposure = np.float32(measure_exposure(middle) / 0.18)
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner
-from hybrid.alignment.kept import as_gray
 from hybrid.alignment.measure import FrameFacts, PairFacts
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import measure_exposure
+from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow
-from hybrid.plausibility import find_lost_light, find_nonfinite
+from hybrid.validation import find_lost_light, find_nonfinite
 from nlm.average import average
 from nlm.fireflies import Lights, add_lights
 from nlm.moving_lights import find_bright, witnessed
@@ -125,7 +125,7 @@ class Pictures:
         ------
         ValueError, OSError
             If the frame, or one beside it, cannot be made, or its light is not that of the noisy frame
-            (`hybrid.plausibility.find_lost_light`).
+            (`hybrid.validation.find_lost_light`).
         """
         beside = self.beside(number)
         self._made = {n: made for n, made in self._made.items() if n in beside}
@@ -145,9 +145,9 @@ class Pictures:
             denoised = self._correct(denoised, frame, sides, counts.stages)
             if "samples" in counts.stages:
                 denoised = self._with_moving_lights(denoised, frame)
-            if frame.lamps is not None:
-                denoised = _with_lamps(denoised, frame.lamps)
-            denoised, counts = _with_kept(denoised, frame), replace(counts, beyond=frame.kept.count)
+            if frame.highlights is not None:
+                denoised = _with_highlights(denoised, frame.highlights)
+            denoised, counts = _with_unfiltered(denoised, frame), replace(counts, beyond=frame.unfiltered.count)
         return denoised, replace(counts, beside=tuple(sorted(self._made)))
 
     def beside(self, number: int) -> list[int]:
@@ -208,7 +208,7 @@ class Pictures:
         if "mean" in stages:
             with self.aligner.timings.stage("mean"):
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
-                for noisy in (frame.radiance, *([frame.rendered] if frame.taken else [])):
+                for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
                     color = restore_mean(color, _where_rendered(frame, noisy, color), exposure)
         if sides is not None:
             with self.aligner.timings.stage("samples"):
@@ -276,9 +276,9 @@ def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
     return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
 
 
-def _with_lamps(denoised: Denoised, lamps: Lights) -> Denoised:
-    """The picture with the lamps of a pixel, which were taken out of what it was made of; its parts changed alike."""
-    color = add_lights(denoised.color, lamps)
+def _with_highlights(denoised: Denoised, highlights: Lights) -> Denoised:
+    """Add persistent highlights to the picture, and scale its parts alike."""
+    color = add_lights(denoised.color, highlights)
     ratio = np.divide(color, denoised.color, out=np.ones_like(color), where=denoised.color > 0)
     aovs, extra = (
         {name: layer * ratio if name in denoised.parts else layer for name, layer in layers.items()}
@@ -287,13 +287,13 @@ def _with_lamps(denoised: Denoised, lamps: Lights) -> Denoised:
     return replace(denoised, color=color, aovs=aovs, extra=extra)
 
 
-def _with_kept(denoised: Denoised, frame: PreparedFrame) -> Denoised:
-    """The picture and its parts with what no filter took (`hybrid.alignment.kept`)."""
-    kept, aovs = frame.kept, dict(denoised.aovs)
-    for name in aovs.keys() & kept.gray:
+def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
+    """The picture and its parts with what no filter took (`hybrid.alignment.unfiltered`)."""
+    unfiltered, aovs = frame.unfiltered, dict(denoised.aovs)
+    for name in aovs.keys() & unfiltered.gray:
         aovs[name] = as_gray(aovs[name])
-    for name in aovs.keys() & kept.negative.keys() & denoised.parts:
+    for name in aovs.keys() & unfiltered.negative.keys() & denoised.parts:
         # Shared out of the picture, which had no negative light, parts have none.
-        aovs[name] = np.maximum(aovs[name], 0) + kept.smooth_negative(name, denoised.color, frame.guide)
-    aovs = {name: kept.without_outside(layer) for name, layer in aovs.items()}
-    return replace(denoised, color=kept.restore(denoised.color, frame.guide), aovs=aovs)
+        aovs[name] = np.maximum(aovs[name], 0) + unfiltered.smooth_negative(name, denoised.color, frame.guide)
+    aovs = {name: unfiltered.without_outside(layer) for name, layer in aovs.items()}
+    return replace(denoised, color=unfiltered.restore(denoised.color, frame.guide), aovs=aovs)

@@ -279,8 +279,8 @@ class Aligner:
                 if "steady" in self.frames.allowed and self._shows_drift(number):
                     whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
                     whole[outer][inner] = weight[aligned.centre + 1][inner]
-        tints = {name: tint[outer] for name, tint in centre.tints.items()}
-        return replace(aligned, tints=tints, passes=centre.passes, sides=sides)
+        pass_colors = {name: tint[outer] for name, tint in centre.pass_colors.items()}
+        return replace(aligned, pass_colors=pass_colors, passes=centre.passes, sides=sides)
 
     def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
         """The rows of a frame that these depend on, and where these are among them; all without."""

@@ -9,7 +9,6 @@ from typing import Protocol
 
 import numpy as np
 
-from hybrid.alignment.kept import find_region, mirror_region
 from hybrid.alignment.measure import (
     MOVED_NOISE,
     FrameFacts,
@@ -23,6 +22,7 @@ from hybrid.alignment.measure import (
     shrink,
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
+from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.files.frames import Frame, Frames
 from hybrid.runtime.timing import Timings
 from nlm.fireflies import (
@@ -187,32 +187,33 @@ class LoadedFrames:
                 if region is not None:
                     inside = np.zeros_like(prepared.valid)
                     inside[region] = prepared.valid[region]
-                    prepared = replace(prepared, kept=replace(prepared.kept, region=region), valid=inside)
+                    prepared = replace(prepared, unfiltered=replace(prepared.unfiltered, region=region), valid=inside)
                 self._read[number] = frame, prepared
         return self._read[number]
 
     def _without_fireflies(self, frame: Frame | None, prepared: PreparedFrame) -> tuple[Frame | None, PreparedFrame]:
-        """Take out the single bright samples, before anything is made of the frame; those that are lamps are kept."""
+        """Remove single bright samples before the frame is used; persistent highlights are stored apart."""
         with self.timings.stage("prepare"):
             places, isolated = find_lights(prepared.irradiance)
         if not len(places):
             return frame, prepared
-        lamps, alone = self._tell_apart(prepared, places)
+        highlights, alone = self._tell_apart(prepared, places)
         with self.timings.stage("prepare"):
             whole, fireflies = prepared.irradiance, places[isolated & alone]
-            if len(lamps.pixels):
-                whole = take_lights(whole, lamps.pixels)
-                prepared = replace(prepared, irradiance=whole, lamps=lamps)
+            if len(highlights.pixels):
+                whole = take_lights(whole, highlights.pixels)
+                prepared = replace(prepared, irradiance=whole, highlights=highlights)
             if len(fireflies):
                 rendered = prepared.mean
                 clean, replaced, _ = replace_fireflies(whole, fireflies)
                 where = np.nonzero(replaced)
-                prepared = replace(prepared, irradiance=clean, fireflies=len(fireflies), taken=(where, whole[where]))
-                prepared = replace(prepared, burnt=max(rendered - prepared.mean, 0.0))
+                removed = where, whole[where]
+                prepared = replace(prepared, irradiance=clean, fireflies=len(fireflies), removed_samples=removed)
+                prepared = replace(prepared, removed_radiance=max(rendered - prepared.mean, 0.0))
         return None if frame is None else replace(frame, color=prepared.radiance), prepared
 
     def _tell_apart(self, prepared: PreparedFrame, places: Places) -> tuple[Lights, Mask]:
-        """Find which bright places are lamps, and which nothing beside the frame is like.
+        """Find which bright places are highlights, and which nothing beside the frame is like.
 
         Of a lamp the two nearest frames whose noise is their own have to show the same light at the same place along
         the motion, or the one that there is.

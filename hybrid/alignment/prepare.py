@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.motion import Motion, invert_flow
-from hybrid.alignment.kept import Kept, set_apart
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
+from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
 from hybrid.files.frames import Frame
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.average import reject_outliers, replace_nonfinite
@@ -54,7 +54,7 @@ class PreparedFrame:
         Guides, finite.
     valid : (H, W) bool array
         False where the renderer's color was not finite.
-    kept : Kept
+    unfiltered : Unfiltered
         What no filter takes, to be put back into the picture.
     repaired : int
         How many pixels of any layer were not finite and have been filled in.
@@ -68,7 +68,7 @@ class PreparedFrame:
         Coverage, finite.
     aovs : dict of str to (H, W, C) array
         Further layers to be warped along, demodulated like the color where they are textured.
-    tints : dict of str to (H, W, 3) array
+    pass_colors : dict of str to (H, W, 3) array
         Of those the color, finite and at least 0.
     passes : Passes
         What `aovs` are to the picture, in this frame.
@@ -76,11 +76,11 @@ class PreparedFrame:
         Whether the albedo has been divided out.
     fireflies : int
         Single bright samples that were taken out.
-    burnt : float
+    removed_radiance : float
         Mean radiance that went with them: what fireflies carry belongs to the picture in expectation.
-    taken : (tuple of index arrays, (K, 3) array) or None
+    removed_samples : (tuple of index arrays, (K, 3) array) or None
         Where `irradiance` is not as rendered as fireflies were taken out, and what was there.
-    lamps : Lights or None
+    highlights : Lights or None
         Lights of a pixel that other frames show as well, in the mean of these frames: they are not in `irradiance`, and
         are added to the picture once it is finished. None where there are none.
     """
@@ -97,13 +97,13 @@ class PreparedFrame:
     alpha: Array | None
     aovs: dict[str, Array]
     demodulated: bool
-    tints: dict[str, Array] = field(default_factory=dict)
+    pass_colors: dict[str, Array] = field(default_factory=dict)
     passes: Passes = NO_PASSES
-    kept: Kept = field(default_factory=Kept)
+    unfiltered: Unfiltered = field(default_factory=Unfiltered)
     fireflies: int = 0
-    burnt: float = 0.0
-    taken: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
-    lamps: Lights | None = None
+    removed_radiance: float = 0.0
+    removed_samples: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
+    highlights: Lights | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -141,20 +141,20 @@ class PreparedFrame:
 
     @property
     def radiance(self) -> Array:
-        """The noisy radiance (H, W, 3), without fireflies and lamps."""
+        """The noisy radiance (H, W, 3), without fireflies and highlights."""
         return self._as_radiance(self.irradiance)
 
     @property
-    def with_lamps(self) -> Array:
-        """The noisy radiance (H, W, 3), without fireflies, with lamps."""
-        return self.radiance if self.lamps is None else add_lights(self.radiance, self.lamps)
+    def with_highlights(self) -> Array:
+        """The noisy radiance (H, W, 3), without fireflies, with highlights."""
+        return self.radiance if self.highlights is None else add_lights(self.radiance, self.highlights)
 
     @property
     def rendered(self) -> Array:
-        """The noisy radiance (H, W, 3), with fireflies, without lamps: right in the mean but for these."""
-        if self.taken is None:
+        """The noisy radiance (H, W, 3), with fireflies, without highlights: right in the mean but for these."""
+        if self.removed_samples is None:
             return self.radiance
-        whole, (places, light) = self.irradiance.copy(), self.taken
+        whole, (places, light) = self.irradiance.copy(), self.removed_samples
         whole[places] = light
         return self._as_radiance(whole)
 
@@ -170,13 +170,13 @@ class PreparedFrame:
 
     @cached_property
     def mean(self) -> float:
-        """Mean radiance of all pixels and channels, lamps included."""
-        return float(self.with_lamps.mean(dtype=np.float64))
+        """Mean radiance of all pixels and channels, highlights included."""
+        return float(self.with_highlights.mean(dtype=np.float64))
 
     @property
     def removed(self) -> float:
         """Share of the light that went with the fireflies, in [0, 1]."""
-        return self.burnt / (self.mean + self.burnt) if self.burnt else 0.0
+        return self.removed_radiance / (self.mean + self.removed_radiance) if self.removed_radiance else 0.0
 
 
 def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
@@ -189,9 +189,9 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     demodulated : bool
         Whether to divide by the albedo, where there is one.
     """
-    color, kept = set_apart(frame)
+    color, unfiltered = split_unfiltered(frame)
     color, bad = replace_nonfinite(color)
-    repaired = bad if kept.lights is None else bad & ~kept.lights
+    repaired = bad if unfiltered.lights is None else bad & ~unfiltered.lights
     layers: dict[str, Array | None] = {}
     for name in ("albedo", "normal", "variance"):
         layer = getattr(frame, name)
@@ -205,10 +205,10 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     for name, layer in frame.aovs.items():
         aovs[name], bad_here = replace_nonfinite(layer)
         repaired = repaired | bad_here
-    tints = {name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.tints.items()}
+    pass_colors = {name: np.maximum(replace_nonfinite(tint)[0], 0) for name, tint in frame.pass_colors.items()}
     passes = frame.passes
     if passes.sums:
-        lights = {name: layer * tints[name] if name in tints else layer for name, layer in aovs.items()}
+        lights = {name: layer * pass_colors[name] if name in pass_colors else layer for name, layer in aovs.items()}
         passes = passes.in_frame(color, lights, measure_exposure(color))
     demodulated = albedo is not None and demodulated
     if albedo is not None and demodulated:
@@ -230,8 +230,8 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
         aovs=aovs,
         demodulated=demodulated,
-        kept=kept,
-        tints=tints,
+        unfiltered=unfiltered,
+        pass_colors=pass_colors,
         passes=passes,
     )
 

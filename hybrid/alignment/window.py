@@ -76,7 +76,7 @@ class AlignedWindow:
         The stages that made it.
     shares : dict of str to float
         On what share of the picture a stage ran that runs only where it is called for, in [0, 1].
-    tints : dict of str to (H, W, 3) array
+    pass_colors : dict of str to (H, W, 3) array
         The centre's color of those of `aovs` that are light without it.
     sides : SampleMean or None
         The samples of the frames beside the centre, averaged at its pixels, radiance; with the stage "samples".
@@ -107,7 +107,7 @@ class AlignedWindow:
     inner: slice
     stages: frozenset[str]
     shares: dict[str, float] = field(default_factory=dict)
-    tints: dict[str, Array] = field(default_factory=dict)
+    pass_colors: dict[str, Array] = field(default_factory=dict)
     sides: SampleMean | None = None
     passes: Passes = NO_PASSES
 

@@ -248,9 +248,9 @@ def _show(markdown: bool, text: str, table: RichTable) -> None:
 
 def _open_beside(spec: str, shot: Shot, frames: str | None) -> Shot:
     """Open a reference or a finished sequence, and pass on its warnings."""
-    from hybrid.files.frames import open_beside
+    from hybrid.files.frames import open_matching_sequence
 
-    opened = open_beside(spec, shot, frames=frames)
+    opened = open_matching_sequence(spec, shot, frames=frames)
     for warning in opened.warnings:
         LOG.warning(warning)
     return opened

@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     from hybrid.files.frames import Shot
     from hybrid.pipeline import SourcesOf
     from hybrid.plan import Rules
-    from hybrid.plausibility import Judgement
     from hybrid.records import Record
     from hybrid.runtime.timing import Timings
     from hybrid.steady import DenoiseWindow
+    from hybrid.validation import ValidationReport
 
 
 def pseudoref(
@@ -119,7 +119,7 @@ def pseudoref(
     if scheduler is not None:
         _spare_inputs(opened, output, (), {"profile": profile}, preview=preview, contact=contact)
         _hand_out(context, given, opened, scheduler, chunk)
-        _look(opened.pictures[0], output, preview, fps, contact)
+        _look(opened.views[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
         _expect_memory(opened, max_memory)
@@ -282,7 +282,7 @@ def denoise(
         inputs = {"weights": weights, "profile": profile}
         _spare_inputs(opened, output, (), inputs, preview=preview, contact=contact)
         _hand_out(context, given, opened, scheduler, chunk)
-        _look(opened.pictures[0], output, preview, fps, contact)
+        _look(opened.views[0], output, preview, fps, contact)
         return
     with _on_record(context, shot, opened, output):
         _expect_memory(opened, max_memory)
@@ -323,7 +323,8 @@ def denoise(
             forced=rules.forced,
             device=device,
         )
-        source, beside = choose(opened.around(ahead)), [(other, choose(other.around(ahead))) for other in others]
+        source = choose(opened.with_neighbours(ahead))
+        beside = [(other, choose(other.with_neighbours(ahead))) for other in others]
     elif estimate in ("auto", "none"):
         source = EstimateSource("none", None, "this network takes none")
         beside = [(other, source) for other in others]
@@ -426,7 +427,7 @@ def _hand_out(context: typer.Context, given: Mapping[str, object], shot: Shot, s
         raise typer.Exit(1)
 
 
-def _judge(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:
+def _judge(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], ValidationReport]:
     """The pictures of the shot as `judge_input` has them; if `strict`, cuts are looked for too before any is made."""
     from hybrid.plan import plan_shot
 
@@ -525,7 +526,7 @@ class Job:
     resume: bool
     keep_going: bool
     max_memory: str | None
-    judgement: Judgement
+    judgement: ValidationReport
     others: Sequence[tuple[Shot, EstimateSource]] = ()
     radius: int = 2
     network: int | None = None  # bytes that the network takes while it runs, if one does
@@ -546,13 +547,14 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
     with ExitStack() as stack:
         for number in range(1, passes):
             folder = stack.enter_context(temporary_folder(home / f"pass{number}"))
-            made = job.shot.around(reach_of(None, job.radius, job.rules) * (passes - number))  # what later passes reach
+            reach = reach_of(None, job.radius, job.rules) * (passes - number)  # what later passes reach
+            made = job.shot.with_neighbours(reach)
             early = replace(job, shot=made, output=str(folder), keep_going=False)
             _run(replace(early, command=f"{command}, pass {number} of {passes}"))
             files = {n: output_path(folder, made, n) for n in made.numbers}
             pictures = [(job.shot, job.source), *job.others]
             (again, source), *others = (
-                (picture.remade(files), replace(theirs, estimates=given, reason="the pass before"))
+                (picture.reopened(files), replace(theirs, estimates=given, reason="the pass before"))
                 for picture, theirs in pictures
             )
             job = replace(
@@ -645,7 +647,7 @@ def _denoise(job: Job, record: Record) -> None:
     taken = shot.layers(shot.numbers[0])
     layers = summarize_layers(taken)
     said = [finding.message for finding in job.judgement.findings if not finding.warning]
-    for words in (f"layers: {layers}", *taken.notes, *said, *shot.kept_lossless(other for other, _ in job.others)):
+    for words in (f"layers: {layers}", *taken.notes, *said, *shot.recompressed_parts(other for other, _ in job.others)):
         LOG.info(printable(words))
     LOG.info(f"estimates: {source.name} ({source.reason})")
     # Not where things lie: what was read from there is told by the files and layers that each picture was made from.
@@ -690,8 +692,8 @@ def _denoise(job: Job, record: Record) -> None:
             judged += say_cuts(finished.plan, judged, strict=False)
         if finished.again:
             LOG.info(f"frame {finished.number} is made again: {printable(finished.again)}")
-        light = finished.mean + finished.burnt
-        share = finished.burnt / light if light > 0 else 0.0
+        light = finished.mean + finished.removed_radiance
+        share = finished.removed_radiance / light if light > 0 else 0.0
         if finished.fireflies:
             LOG.info(f"frame {finished.number}: {finished.fireflies} fireflies taken out, {share:.2%} of its light")
         if finished.repaired:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not 
     from hybrid.files.frames import Shot
     from hybrid.files.profile import Profile
     from hybrid.plan import Plan, Rules
-    from hybrid.plausibility import Finding, Judgement
+    from hybrid.validation import Finding, ValidationReport
 
 Thing = TypeVar("Thing")
 
@@ -318,8 +318,8 @@ def each_view(command: Callable[..., None], given: Mapping[str, object]) -> bool
 def _expect_apart(given: Mapping[str, object], views: Sequence[str]) -> None:
     """Refuse what both views would be written to, or be made from, as if they were one."""
     from hybrid.estimates import SPECS
-    from hybrid.files.apart import names_sequence
     from hybrid.files.sequences import name_view
+    from hybrid.files.sidecars import names_sequence
 
     def shared(value: str) -> bool:
         return len({name_view(value, view) for view in views}) < len(views)
@@ -337,16 +337,16 @@ def _expect_apart(given: Mapping[str, object], views: Sequence[str]) -> None:
             raise typer.BadParameter(f"{option} is {value!r}, expected %V or %v in it, as the shot has")
 
 
-def judge_input(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], Judgement]:
+def judge_input(shot: Shot, *, strict: bool) -> tuple[tuple[Shot, ...], ValidationReport]:
     """The pictures of the shot, without the layers that make no sense.
 
     Each of those is said in a line; it is an error if `strict`. The judgement is that of the first picture, with what
     was found in the others.
     """
-    from hybrid.plausibility import judge_layers
+    from hybrid.validation import validate_layers
 
-    pictures = shot.pictures
-    judged = [judge_layers(picture) for picture in pictures]
+    pictures = shot.views
+    judged = [validate_layers(picture) for picture in pictures]
     findings = [finding for judgement in judged for finding in judgement.findings]
     judgement = replace(judged[0], findings=tuple(dict.fromkeys(findings)))
     _say(judgement, shot, strict=strict)
@@ -361,9 +361,9 @@ def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, S
 
     Of files with several pictures one has to be chosen. Also returned is what was said.
     """
-    from hybrid.plausibility import judge_layers
+    from hybrid.validation import validate_layers
 
-    judged = {name: judge_layers(shot) for name, shot in shots.items()}
+    judged = {name: validate_layers(shot) for name, shot in shots.items()}
     for name, judgement in judged.items():
         _say(judgement, shots[name], strict=strict, name=name if len(shots) > 1 else "")
     findings = tuple(dict.fromkeys(finding for judgement in judged.values() for finding in judgement.findings))
@@ -371,7 +371,7 @@ def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, S
     return apply, [finding.message for finding in findings]
 
 
-def _say(judgement: Judgement, shot: Shot, *, strict: bool, name: str = "") -> None:
+def _say(judgement: ValidationReport, shot: Shot, *, strict: bool, name: str = "") -> None:
     if strict and (warnings := [*shot.warnings, *judgement.warnings]):
         raise ValueError(f"{name}: {'; '.join(warnings)}" if name else "; ".join(warnings))
     for warning in judgement.warnings:
@@ -380,7 +380,7 @@ def _say(judgement: Judgement, shot: Shot, *, strict: bool, name: str = "") -> N
 
 def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
     """Log a plan's cuts, an error if `strict`, and its repeated frames, a line each, beyond what is known."""
-    from hybrid.plausibility import find_cut, find_repeat
+    from hybrid.validation import find_cut, find_repeat
 
     found = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
     words = [f"{name}: {finding.message}" if name else finding.message for finding in found]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.comparison.embedding import ReportImages
 from hybrid.files.movies import write_movie
-from hybrid.files.pictures import encode_bytes
+from hybrid.files.png import encode_bytes
 
 Array = NDArray[np.float32]
 Picture = NDArray[np.uint8]

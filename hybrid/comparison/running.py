@@ -125,7 +125,7 @@ def _middle_of(shot: Shot) -> Shot:
         cuts: dict[str, Any] = {
             name: part(value) for name, value in vars(frame).items() if isinstance(value, np.ndarray)
         }
-        cuts |= {name: {key: part(a) for key, a in getattr(frame, name).items()} for name in ("aovs", "tints")}
+        cuts |= {name: {key: part(a) for key, a in getattr(frame, name).items()} for name in ("aovs", "pass_colors")}
         return replace(frame, **cuts, resolution=frame.resolution or whole)
 
     return cast("Shot", MappedShot(shot, cut, shape=(height, width)))  # of a shot methods ask for frames alone

@@ -16,13 +16,13 @@ from typing import Protocol
 import numpy as np
 
 from flow.motion import Motion, MotionConvention, normalize_motion
-from hybrid.files.apart import Apart, find_companions, gather_folder, names_sequence, open_apart
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
 from hybrid.files.layers import Layers, find_colors, find_layers, samples_of, summarize_layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES, Profile, find_profile
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern, pattern_of
+from hybrid.files.sidecars import SidecarSequence, find_companions, gather_folder, names_sequence, open_sidecar
 from hybrid.files.sources import Source, identify
 from nlm.variance import variance_from_halves
 
@@ -52,7 +52,7 @@ class Frame:
         those of `color`.
     aovs : mapping of str to (H, W, C) array of float32
         By name, those that were asked for.
-    tints : mapping of str to (H, W, 3) array of float32
+    pass_colors : mapping of str to (H, W, 3) array of float32
         What those of them are multiplied by that are light without its color.
     passes : Passes
         What is known of `aovs`.
@@ -74,7 +74,7 @@ class Frame:
     alpha: np.ndarray | None = None
     estimate: np.ndarray | None = None
     aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
-    tints: Mapping[str, np.ndarray] = field(default_factory=dict)
+    pass_colors: Mapping[str, np.ndarray] = field(default_factory=dict)
     passes: Passes = NO_PASSES
     source: Path | None = None
     beyond: np.ndarray | None = None
@@ -171,7 +171,7 @@ class Shot:
         The frames that were asked for and are not there.
     warnings : list of str
         One line each.
-    picture : str
+    view : str
         Which of several `pictures` of the files it is: the name of its color; "" for the only one.
 
     Notes
@@ -193,7 +193,7 @@ class Shot:
         *,
         frames: str | None = None,
         layers: Mapping[str, str | Layer] | None = None,
-        apart: Iterable[Apart] = (),
+        apart: Iterable[SidecarSequence] = (),
         profile: Profile | None = None,
         motion: str | None = None,
         aovs: Sequence[str] = (),
@@ -203,7 +203,7 @@ class Shot:
         wanted = sorted(files) if frames is None else parse_frames(frames)
         self.numbers = tuple(number for number in wanted if number in files)
         self.warnings: list[str] = []
-        self.picture = ""
+        self.view = ""
         if not self.numbers:
             folder = next(iter(files.values())).parent
             raise FileNotFoundError(f"none of the frames {frames} is there; {folder} has {format_frames(files)}")
@@ -272,18 +272,18 @@ class Shot:
         """Whether this is one of the shot's files, asked for or not, by whatever name."""
         return not self._identities.isdisjoint(identities(path))
 
-    def near(self, number: int, reach: int) -> list[int]:
+    def neighbours(self, number: int, reach: int) -> list[int]:
         """The frames that are there up to `reach` steps before and after one, itself among them."""
         numbers = range(number - reach * self.step, number + reach * self.step + 1, self.step)
         return [n for n in numbers if n in self._files]
 
-    def around(self, reach: int) -> Shot:
+    def with_neighbours(self, reach: int) -> Shot:
         """The same shot, asked also for the frames up to `reach` steps before and after, where they are there."""
         wider = copy(self)
-        wider.numbers = tuple(sorted({near for number in self.numbers for near in self.near(number, reach)}))
+        wider.numbers = tuple(sorted({near for number in self.numbers for near in self.neighbours(number, reach)}))
         return wider
 
-    def remade(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Shot:
+    def reopened(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Shot:
         """The same frames from files that `write` has made of these: the denoised picture is now the color.
 
         Parameters
@@ -302,13 +302,13 @@ class Shot:
             keep=self._keep,
             max_pixels=self._max_pixels,
         )
-        made.missing, made.picture = self.missing, self.picture
+        made.missing, made.view = self.missing, self.view
         made.numbers, made.step = tuple(n for n in self.numbers if n in files) or made.numbers, self.step
         made._canvas = self._canvas  # frames that are cropped differently lie on the same one again
         taken = self._left_out, self._convention, self._variance_scale
-        return made.judged(*taken, self.passes, self._estimate_factors)
+        return made.reinterpreted(*taken, self.passes, self._estimate_factors)
 
-    def judged(
+    def reinterpreted(
         self,
         left_out: Collection[str],
         convention: MotionConvention | None,
@@ -316,7 +316,7 @@ class Shot:
         passes: Passes | None = None,
         estimate_factors: tuple[float, float, float] | None = None,
     ) -> Shot:
-        """The same shot, read otherwise than its files and their profile say (`hybrid.plausibility`).
+        """The same shot, read otherwise than its files and their profile say (`hybrid.validation`).
 
         Parameters
         ----------
@@ -352,7 +352,7 @@ class Shot:
             raise FileNotFoundError(f"frame {number} is not there; the shot has {format_frames(self._files)}")
         return self._files[number]
 
-    def states(self, numbers: Iterable[int], what: str = "frame") -> dict[str, Source]:
+    def sources(self, numbers: Iterable[int], what: str = "frame") -> dict[str, Source]:
         """The files of some frames as they were when they were read, or if they have not been yet, as they are now.
 
         Parameters
@@ -404,7 +404,7 @@ class Shot:
         kind = self._kinds.get(path)
         return self._find(self.header(number)) if kind not in self._known else self._like_first(path, self._known[kind])
 
-    def taken(self, number: int) -> str:
+    def layer_summary(self, number: int) -> str:
         """What is taken for what of a frame, and how it is read, in words: where these differ, so does the picture."""
         layers = self.layers(number)
         said = f"{summarize_layers(layers)}; motion {layers.motion_convention}; variance {layers.variance_scale}"
@@ -459,7 +459,7 @@ class Shot:
         }
 
     @cached_property
-    def pictures(self) -> tuple[Shot, ...]:
+    def views(self) -> tuple[Shot, ...]:
         """This shot, once for each view layer and stereo view in its files; as it is where the color was chosen.
 
         Raises
@@ -480,11 +480,11 @@ class Shot:
 
     def _picture(self, color: Layer) -> Shot:
         other = copy(self)
-        for name in ("_first_layers", "_size", "_canvas", "pictures"):
+        for name in ("_first_layers", "_size", "_canvas", "views"):
             other.__dict__.pop(name, None)
         other._held, other._known = OrderedDict(), {}
         other._overrides = {**self._overrides, "color": color}
-        other.picture = color.name or str(color)
+        other.view = color.name or str(color)
         return other
 
     def paths(self, number: int) -> tuple[Path, ...]:
@@ -574,7 +574,7 @@ class Shot:
             added |= {picture.own_name(name): picture._cut(image, home) for name, image in new.items()}
         return write_exr(path, source, replaced, added, attributes)
 
-    def kept_lossless(self, others: Iterable[Shot] = ()) -> list[str]:
+    def recompressed_parts(self, others: Iterable[Shot] = ()) -> list[str]:
         """Say of each part of the first file that `write` compresses otherwise, as its layers are kept to the bit.
 
         Parameters
@@ -592,7 +592,7 @@ class Shot:
 
     def own_name(self, layer: str) -> str:
         """What a layer is called that is added to the files for this picture."""
-        return f"{self.picture}.{layer}" if self.picture else layer
+        return f"{self.view}.{layer}" if self.view else layer
 
     def _replace(self, source: ExrImage, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels of a file that pictures by role or AOV take the place of."""
@@ -625,7 +625,7 @@ class Shot:
 
     def _open(self, number: int) -> tuple[ExrImage, Layers]:
         """The file of a frame, and what is taken for what; refuses one of another size than the first frame's."""
-        self.states([number])
+        self.sources([number])
         image = self.source(number)
         layers = self._find(image)
         size = _size(image.parts[layers.color.part])
@@ -729,7 +729,7 @@ def open_shot(
         raise ValueError(f"color is {said['color']!r}, expected that sequence as the shot, over whose files is written")
     files, named, beside = _gather(str(spec))
     known, companions = beside or find_companions(files, {*(layers or {})})
-    own = [open_apart(role, value) for role, value in said.items()]
+    own = [open_sidecar(role, value) for role, value in said.items()]
     apart = [other for other in companions if other.role not in {*(layers or {})}]
     shot = Shot(
         files,
@@ -750,7 +750,7 @@ def open_shot(
     return shot
 
 
-def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list[Apart]] | None]:
+def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list[SidecarSequence]] | None]:
     """The files of the color, the range named with them, and the sequences that a folder has for other layers."""
     try:
         return *find_files(spec), None
@@ -762,7 +762,7 @@ def _gather(spec: str) -> tuple[dict[int, Path], str | None, tuple[Profile, list
         return files, None, (profile, apart)
 
 
-def open_beside(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
+def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
     """Open another sequence of the frames of a shot: a reference, or what another denoiser has made.
 
     Errors are those of `open_shot`.
@@ -791,7 +791,7 @@ def open_beside(spec: str | Path, shot: Shot, *, frames: str | None = None) -> S
     return opened
 
 
-def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = False) -> Path:
+def output_path(pattern: str | Path, shot: Shot, number: int, *, include_context: bool = False) -> Path:
     """Where the result for a frame goes.
 
     Parameters
@@ -803,7 +803,7 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
         The shot.
     number : int
         Frame number.
-    beside : bool
+    include_context : bool
         Frames that were not asked for get files too.
 
     Raises
@@ -819,7 +819,7 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, beside: bool = 
     if Path(pattern).is_dir() or names.path(number).suffix.lower() != ".exr":
         path = Path(pattern) / shot.path(number).name
     else:
-        count = shot.count if beside else len(shot)
+        count = shot.count if include_context else len(shot)
         if not names.digits and count > 1:
             raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
         path = names.path(number)
@@ -905,7 +905,7 @@ def _frame(
         motion_convention=convention,
         resolution=_size(image.parts[layers.color.part])[::-1],
         aovs={name: _pixels(image, layer, canvas) for name, layer in layers.aovs.items()},
-        tints={name: _pixels(image, layer, canvas) for name, layer in layers.tints.items()},
+        pass_colors={name: _pixels(image, layer, canvas) for name, layer in layers.pass_colors.items()},
         source=image.path,
         beyond=None if beyond is None or not beyond.any() else beyond,
     )

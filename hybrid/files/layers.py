@@ -65,8 +65,8 @@ class Layers:
 
     `aovs` are the further layers that were asked for, by the names they were asked for by, or all
     that have a name for light.
-    `tints` are the colors by which those of them are multiplied that a renderer writes without. `notes` say what was
-    left alone that a user might think is denoised; one line each.
+    `pass_colors` are the colors by which those of them are multiplied that a renderer writes without. `notes` say what
+    was left alone that a user might think is denoised; one line each.
     """
 
     color: Layer
@@ -93,7 +93,7 @@ class Layers:
     view: str | None = None
     views: tuple[str, ...] = ()
     aovs: Mapping[str, Layer] = field(default_factory=dict)
-    tints: Mapping[str, Layer] = field(default_factory=dict)
+    pass_colors: Mapping[str, Layer] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def without(self, roles: Collection[str]) -> Layers:
@@ -106,10 +106,9 @@ class Layers:
 
     def without_aovs(self, names: Collection[str]) -> Layers:
         """The same with some further layers left out."""
-        aovs, tints = (
-            {name: layer for name, layer in found.items() if name not in names} for found in (self.aovs, self.tints)
-        )
-        return replace(self, aovs=aovs, tints=tints)
+        aovs = {name: layer for name, layer in self.aovs.items() if name not in names}
+        pass_colors = {name: layer for name, layer in self.pass_colors.items() if name not in names}
+        return replace(self, aovs=aovs, pass_colors=pass_colors)
 
 
 def find_layers(
@@ -212,7 +211,7 @@ def find_layers(
         view=view,
         views=image.views,
         aovs=further,
-        tints=_find_tints(image, further, color),
+        pass_colors=_find_tints(image, further, color),
         notes=tuple(notes),
     )
 
@@ -378,13 +377,13 @@ def _lobes(image: ExrImage, layer: Layer) -> set[str]:
 
 def _find_tints(image: ExrImage, aovs: Mapping[str, Layer], color: Layer) -> dict[str, Layer]:
     """The color of each layer of light that is written without: (direct + indirect) · color, as Cycles has them."""
-    tints = {}
+    pass_colors = {}
     for name, light in aovs.items():
         named = {lobe + word for lobe in _lobes(image, light) for word in ("col", "color")}
         for layer in _same_group(image, color):
             if named & {*_tails(image, layer)} and _group(layer) == _group(light):
-                tints[name] = replace(layer, channels=layer.channels[:3])
-    return tints
+                pass_colors[name] = replace(layer, channels=layer.channels[:3])
+    return pass_colors
 
 
 def _find_aovs(

@@ -286,7 +286,7 @@ def _share_out(
             split = parts
         elif found.complete:
             bounds = [
-                average(aligned.aovs[name], aligned.confidence) if name in aligned.tints else None
+                average(aligned.aovs[name], aligned.confidence) if name in aligned.pass_colors else None
                 for name in found.parts
             ]
             split = split_light(parts, pictures[whole], exposure=exposure, factors=by, bounds=bounds)
@@ -302,15 +302,15 @@ def _share_out(
         if name == ALPHA:
             own = aligned.aovs[name][aligned.centre]
             aovs[name] = np.where(_solid(own), own, aovs[name])
-        elif name not in aligned.tints and (factor := factors[name]) is not None:
+        elif name not in aligned.pass_colors and (factor := factors[name]) is not None:
             aovs[name] = aovs[name] * factor
     return aovs, pictures[BEAUTY], among
 
 
 def _factor(name: str, aligned: AlignedWindow) -> Array | None:
     """What a filtered AOV is multiplied by to be radiance; None: 1."""
-    if name in aligned.tints:
-        return aligned.tints[name]
+    if name in aligned.pass_colors:
+        return aligned.pass_colors[name]
     if name not in aligned.passes.textured:
         return None
     modulation = aligned.modulation

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
-from hybrid.files.pictures import encode_srgb
+from hybrid.files.png import encode_srgb
 from hybrid.files.profile import find_profile
 from hybrid.files.sequences import find_files, parse_frames
 from hybrid.files.sources import MADE_FROM

@@ -12,9 +12,9 @@ from hybrid.cli import main
 from hybrid.estimates import OfWindows
 from hybrid.files.exr import write_layers
 from hybrid.files.frames import open_shot
-from hybrid.passes import judge_passes, thin_passes
-from hybrid.plausibility import judge_layers
+from hybrid.passes import classify_passes, sample_rows
 from hybrid.pseudo_reference import DRAFT
+from hybrid.validation import validate_layers
 
 Layers = dict[str, np.ndarray]
 
@@ -111,7 +111,7 @@ RENDERERS = {
 
 def judged(folder, names):
     shot = open_shot(folder, aovs=names)
-    return judge_layers(shot).apply(shot)
+    return validate_layers(shot).apply(shot)
 
 
 def write(folder, layers, frames=3):
@@ -148,7 +148,7 @@ def test_each_pass_of_a_renderer_keeps_its_light(name, tmp_path):
         mean = np.mean([one.aovs[part] for one in rendered])
         assert layer.mean() == pytest.approx(mean, rel=0.03), part  # of three frames' noise
     for names in renderer.partitions:
-        total = sum(made.aovs[part] * frame.tints.get(part, np.float32(1)) for part in names)
+        total = sum(made.aovs[part] * frame.pass_colors.get(part, np.float32(1)) for part in names)
         assert np.abs(total - made.color).max() < 1e-3 * made.color.mean()
 
 
@@ -160,7 +160,7 @@ def sums_of(beauty, parts, frames=2):
         Frame(k, np.float32(beauty(k)), aovs={name: np.float32(part(k)) for name, part in parts.items()})
         for k in range(frames)
     ]
-    passes, words = judge_passes([thin_passes(frame) for frame in made])
+    passes, words = classify_passes([sample_rows(frame) for frame in made])
     assert {*words} == {*parts}
     return {(found.whole, frozenset(found.parts), found.complete) for found in passes.sums}, {*passes.kept}
 
@@ -259,7 +259,7 @@ def test_only_what_was_multiplied_by_the_albedo_is_divided_by_it():
         Frame(k, a(k) * albedo + b(k), albedo=albedo, aovs={"diffuse": a(k) * albedo, "emission": b(k), "ao": c(k)})
         for k in range(2)
     ]
-    passes, _ = judge_passes([thin_passes(frame) for frame in frames])
+    passes, _ = classify_passes([sample_rows(frame) for frame in frames])
     assert passes.textured == ("diffuse",)
 
 

@@ -150,7 +150,7 @@ def test_two_passes_and_the_breakdown_of_both_eyes_are_those_of_mono_files(tmp_p
             expected = mono.channel(name)
             np.testing.assert_array_equal(both.channel(f"ViewLayer.Combined.{eye}.{name}"), expected)
     np.testing.assert_array_equal(cv2.imread(str(sheet)), np.vstack([sheets["left"], sheets["right"]]))
-    names = [picture.picture for picture in open_shot(out).pictures]
+    names = [picture.view for picture in open_shot(out).views]
     assert names == ["ViewLayer.Combined.left", "ViewLayer.Combined.right"]
 
 
@@ -177,7 +177,7 @@ def test_layers_apart_need_to_know_of_which_picture_they_are(tmp_path: Path) -> 
         save(tmp_path / "alb" / f"a.{truth.number:04d}.exr", layer("", "RGB", truth.albedo))
     shot = open_shot(tmp_path / "in", layers={"albedo": str(tmp_path / "alb" / "a.####.exr")})
     with pytest.raises(ValueError, match=r"and layers in other files: expected one \(--layer color=NAME\)"):
-        _ = shot.pictures
+        _ = shot.views
 
 
 @pytest.mark.parametrize(("pattern", "letter"), [("%V/shot.####.exr", False), ("shot_%v.####.exr", True)])

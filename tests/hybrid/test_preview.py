@@ -10,7 +10,7 @@ from PIL import Image
 
 from hybrid.cli import main
 from hybrid.files.frames import open_shot
-from hybrid.files.pictures import encode_srgb
+from hybrid.files.png import encode_srgb
 from hybrid.preview import SHEET_WIDTH, SHORTEST, check_preview, divide, write_contact_sheet, write_preview
 from tests.scenes import Scene
 

@@ -139,8 +139,8 @@ def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
     aligner = Aligner(shot, Rules())
     assert aligner.align(1006).fireflies == 0
     frame = aligner.frames[1006]
-    assert frame.with_lamps[20, 30].mean() == pytest.approx(500, rel=2e-3)
-    assert frame.with_lamps.sum() == pytest.approx(shot.read(1006).color.sum(), rel=2e-3)
+    assert frame.with_highlights[20, 30].mean() == pytest.approx(500, rel=2e-3)
+    assert frame.with_highlights.sum() == pytest.approx(shot.read(1006).color.sum(), rel=2e-3)
 
 
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])

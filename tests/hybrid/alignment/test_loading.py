@@ -52,10 +52,10 @@ def test_what_one_neighbour_shows_too_is_kept_and_what_both_show_is_a_lamp(tmp_p
     """Noise with long tails is bright in two frames by chance; it was put back into pictures as it was rendered."""
     frame = load(open_shot(CALM.write(tmp_path, edit=shining(*seen))), range(1004, 1009))[1006]
     assert frame.fireflies == 0
-    assert (frame.lamps is not None) == lamp
+    assert (frame.highlights is not None) == lamp
     # A lamp is added to the finished picture: what that is made of does not show it.
     assert (frame.radiance[PLACE].mean() > 400) == (not lamp)
-    assert frame.with_lamps[PLACE].mean() == pytest.approx(500, rel=0.01)
+    assert frame.with_highlights[PLACE].mean() == pytest.approx(500, rel=0.01)
 
 
 def test_a_lamp_is_the_mean_of_the_frames_that_show_it(tmp_path):
@@ -65,8 +65,8 @@ def test_a_lamp_is_the_mean_of_the_frames_that_show_it(tmp_path):
         layers["ViewLayer.Combined"][PLACE] = 500 + 60 * (index % 3)
 
     frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
-    assert frame.lamps is not None
-    np.testing.assert_allclose(frame.lamps.light, 560, rtol=0.01)
+    assert frame.highlights is not None
+    np.testing.assert_allclose(frame.highlights.light, 560, rtol=0.01)
 
 
 @pytest.mark.parametrize("off", [(0, 2), (3, 0)])
@@ -77,7 +77,7 @@ def test_bright_samples_near_each_other_are_no_lamp(tmp_path, off):
         layers["ViewLayer.Combined"][20 + off[0] * (index % 2), 30 + off[1] * (index % 2)] = 500
 
     frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
-    assert frame.lamps is None
+    assert frame.highlights is None
 
 
 def test_a_lamp_moves_along_with_the_vectors(tmp_path):
@@ -87,20 +87,20 @@ def test_a_lamp_moves_along_with_the_vectors(tmp_path):
         layers["ViewLayer.Combined"][10 + index, 20 + 2 * index] = 500
 
     frame = load(open_shot(scene.write(tmp_path, edit=shine)), range(1003, 1008))[1005]
-    assert frame.lamps is not None
-    assert frame.lamps.pixels.tolist() == [[14, 28]]
+    assert frame.highlights is not None
+    assert frame.highlights.pixels.tolist() == [[14, 28]]
 
 
 @pytest.mark.parametrize("number", [1001, 1012])
 def test_at_the_ends_of_a_shot_the_two_nearest_frames_know_a_lamp(tmp_path, number):
     shot = open_shot(CALM.write(tmp_path, edit=shining(*range(12))))
-    assert load(shot, [number])[number].lamps is not None
+    assert load(shot, [number])[number].highlights is not None
 
 
 def test_a_frame_alone_knows_no_lamp(tmp_path):
     shot = open_shot(replace(CALM, frames=1).write(tmp_path, edit=shining(0)))
     frame = load(shot, [1001])[1001]
-    assert (frame.fireflies, frame.lamps) == (1, None)
+    assert (frame.fireflies, frame.highlights) == (1, None)
 
 
 @pytest.mark.parametrize("held", [{4: 5}, {6: 5}, {4: 5, 6: 5}, {index: 5 for index in range(12)}])
@@ -113,7 +113,7 @@ def test_the_same_noise_once_more_is_no_witness(tmp_path, held):
             layers["ViewLayer.Combined"][PLACE] = 500
 
     frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
-    assert (frame.fireflies, frame.lamps) == (1, None)
+    assert (frame.fireflies, frame.highlights) == (1, None)
     assert frame.radiance[PLACE].max() < 10
 
 
@@ -149,7 +149,7 @@ def test_dense_fireflies_are_taken_out(tmp_path, vectors):
 
     shot = open_shot(scene.write(tmp_path, edit=shine, without=set() if vectors else {"Vector"}))
     frame = load(shot, range(1001, 1004))[1002]
-    assert frame.lamps is None
+    assert frame.highlights is None
     assert frame.fireflies >= 8
     assert np.count_nonzero(frame.radiance.mean(axis=-1) > 100) <= 3
 

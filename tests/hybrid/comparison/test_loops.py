@@ -11,7 +11,7 @@ import pytest
 
 from hybrid.comparison.embedding import ReportImages
 from hybrid.comparison.loops import QUALITY, TALLEST, embed_loops, mid_exposure, write_loops
-from hybrid.files.pictures import encode_srgb
+from hybrid.files.png import encode_srgb
 from tests.hybrid.comparison.test_report import scene
 
 FRAMES = [8, 9, 10]

@@ -48,11 +48,11 @@ def test_a_lossy_compression_of_what_is_kept_is_named(tmp_path):
         str(tmp_path / "a.0001.exr")
     )
     said = ["files: DWAA would change layers that are kept, written with ZIP"]
-    assert open_shot(tmp_path).kept_lossless() == said
-    assert open_shot(tmp_path, layers={"color": "RGB"}, aovs=["Vector"]).kept_lossless() == []
+    assert open_shot(tmp_path).recompressed_parts() == said
+    assert open_shot(tmp_path, layers={"color": "RGB"}, aovs=["Vector"]).recompressed_parts() == []
     (tmp_path / "zip").mkdir()
     save(tmp_path / "zip", [1])
-    assert open_shot(tmp_path / "zip").kept_lossless() == []
+    assert open_shot(tmp_path / "zip").recompressed_parts() == []
 
 
 # --- names
@@ -140,11 +140,11 @@ def test_range_without_any_frame_is_not_found(tmp_path):
 
 def test_frames_around_those_asked_for_are_those_there_are(tmp_path):
     shot = open_shot(save(tmp_path, (1, 2, 3, 5, 6, 9)), frames="3-5")
-    assert shot.around(0).numbers == (3, 5)
-    assert shot.around(2).numbers == (1, 2, 3, 5, 6)
+    assert shot.with_neighbours(0).numbers == (3, 5)
+    assert shot.with_neighbours(2).numbers == (1, 2, 3, 5, 6)
     assert shot.numbers == (3, 5)
     # Of these files alone the step would be 2.
-    made = shot.remade({number: shot.path(number) for number in (1, 3, 5)})
+    made = shot.reopened({number: shot.path(number) for number in (1, 3, 5)})
     assert (made.numbers, made.step, shot.step) == ((3, 5), 1, 1)
     assert made.has(1)
     assert not made.has(2)
@@ -273,7 +273,7 @@ def test_a_frame_of_another_size_outside_the_range_changes_nothing(tmp_path, sta
     shot = open_shot(save(tmp_path, numbers), frames="5-7")
     assert shot.step == 2
     assert list(shot.available) == numbers
-    assert [shot.read(number).color[0, 0, 0] for number in shot.near(5, 2)] == numbers
+    assert [shot.read(number).color[0, 0, 0] for number in shot.neighbours(5, 2)] == numbers
     assert f"frames {stale} differ in size from those asked for: left out" in shot.warnings
 
 
@@ -442,4 +442,4 @@ def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):
         save_file(tmp_path / f"a.{number}.exr", channels, {"samplesPerPixel": samples, "renderTimeSeconds": 1.0})
     shot = open_shot(tmp_path)
     assert [shot.read(number).variance.max() for number in (1, 2)] == [1 / 64, 1 / 256]
-    assert "variance 0.00390625" in shot.taken(2)
+    assert "variance 0.00390625" in shot.layer_summary(2)

@@ -10,7 +10,7 @@ import pytest
 from flow import motion
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, read_exr, write_layers
-from hybrid.files.frames import open_beside, open_shot, output_path
+from hybrid.files.frames import open_matching_sequence, open_shot, output_path
 from hybrid.files.layers import describe_layers, find_layers, summarize_layers
 from tests.hybrid.files.test_exr import CYCLES, cycles_names, planes, save, save_parts
 
@@ -366,7 +366,7 @@ def test_all_is_every_layer_with_a_name_for_a_part_of_the_light(tmp_path):
     layers = find_layers(headers(tmp_path, names), aovs=["all", "AO"])
     assert list(layers.aovs) == [*sorted(f"ViewLayer.{name}" for name in lights), "AO"]
     tinted = {"ViewLayer.DiffDir": "DiffCol", "ViewLayer.DiffInd": "DiffCol", "ViewLayer.GlossDir": "GlossCol"}
-    assert {name: tint.name for name, tint in layers.tints.items()} == {
+    assert {name: tint.name for name, tint in layers.pass_colors.items()} == {
         name: f"ViewLayer.{tint}" for name, tint in tinted.items()
     }
 
@@ -453,7 +453,7 @@ def test_what_was_written_is_read_back_from_where_it_was_written(tmp_path):
     shot = open_shot(tmp_path / "in", layers={"color": "Front.Combined"})
     path = output_path(tmp_path / "a.####.exr", shot, 2)
     shot.write(path, 2, {"color": layer(9)})
-    assert (shot.remade({2: path}).read(2).color == 9).all()
+    assert (shot.reopened({2: path}).read(2).color == 9).all()
 
 
 def test_another_sequence_follows_the_choice_made_for_the_shot(tmp_path):
@@ -462,8 +462,8 @@ def test_another_sequence_follows_the_choice_made_for_the_shot(tmp_path):
     write_layers(tmp_path / "b.0001.exr", layers)
     write_layers(tmp_path / "c.0001.exr", {"": layer(7)})
     shot = open_shot(tmp_path / "a.0001.exr", layers={"color": "Front.Combined"})
-    assert (open_beside(tmp_path / "b.0001.exr", shot).read(1).color == 2).all()
-    assert (open_beside(tmp_path / "c.0001.exr", shot).read(1).color == 7).all()
+    assert (open_matching_sequence(tmp_path / "b.0001.exr", shot).read(1).color == 2).all()
+    assert (open_matching_sequence(tmp_path / "c.0001.exr", shot).read(1).color == 7).all()
 
 
 def test_one_line_says_what_was_taken(tmp_path):

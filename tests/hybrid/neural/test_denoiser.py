@@ -14,8 +14,8 @@ from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.estimates import OfWindows  # noqa: E402
 from hybrid.files.frames import open_shot  # noqa: E402
 from hybrid.neural.denoiser import Denoiser  # noqa: E402
-from hybrid.plausibility import judge_layers  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.validation import validate_layers  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
 from network.models import unet  # noqa: E402
 from nlm.gather import gather  # noqa: E402
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
 
 def align(folder, **options):
     shot = open_shot(folder, **options)
-    return Aligner(judge_layers(shot).apply(shot), STAGES, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
+    return Aligner(validate_layers(shot).apply(shot), STAGES, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
 
 
 def test_tiles_give_what_the_whole_image_gives(tmp_path, weights):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid.files.pictures import encode_srgb
+from hybrid.files.png import encode_srgb
 from hybrid.records import Record
 from hybrid.runtime.timing import Stage, Timings
 from hybrid.viewer.sequence import Sequence

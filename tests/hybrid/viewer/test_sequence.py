@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from hybrid.files.exr import ExrError, read_exr, write_layers
-from hybrid.files.pictures import encode_srgb
+from hybrid.files.png import encode_srgb
 from hybrid.records import Record
 from hybrid.runtime.timing import Timings
 from hybrid.viewer import sequence as module

@@ -11,8 +11,8 @@ import OpenEXR
 import pytest
 
 from hybrid.alignment.align import Aligner
-from hybrid.alignment.kept import find_region, mirror_region, set_apart
 from hybrid.alignment.prepare import prepare
+from hybrid.alignment.unfiltered import find_region, mirror_region, split_unfiltered
 from hybrid.cli import main
 from hybrid.estimates import OfFrames
 from hybrid.files.exr import HALF_MAX, read_exr, write_layers
@@ -78,11 +78,11 @@ def test_inf_of_floats_and_other_infinities_are_lost(tmp_path):
     beyond[10:20, 10:20] = True
     color[beyond] = np.nan
     prepared = prepare(Frame(1, color, beyond=beyond))
-    assert (prepared.repaired, prepared.kept.count, int((~prepared.valid).sum())) == (0, 300, 100)
+    assert (prepared.repaired, prepared.unfiltered.count, int((~prepared.valid).sum())) == (0, 300, 100)
     lost = beyond.copy()
     lost[..., 0] = False  # red is NaN in the file itself
     prepared = prepare(Frame(1, color, beyond=lost))
-    assert (prepared.repaired, prepared.kept.count) == (100, 0)
+    assert (prepared.repaired, prepared.unfiltered.count) == (100, 0)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -105,12 +105,12 @@ def test_what_a_filter_leaves_beside_a_lamp_is_no_color():
     color = colors()[0]
     color[20, 20] = -30, -40, -20
     color[30, 30] = -30, 0.25, -0.125
-    apart, kept = set_apart(Frame(1, color))
-    negative = kept.negative["color"]
+    left, unfiltered = split_unfiltered(Frame(1, color))
+    negative = unfiltered.negative["color"]
     assert np.count_nonzero(negative) == 2
     np.testing.assert_array_equal(negative[30, 30], [-0.25, 0, -0.125])
-    np.testing.assert_array_equal(apart + negative, color)
-    assert set_apart(Frame(1, np.abs(color)))[1].negative == {}
+    np.testing.assert_array_equal(left + negative, color)
+    assert split_unfiltered(Frame(1, np.abs(color)))[1].negative == {}
 
 
 def test_parts_keep_their_negative_light(tmp_path):
@@ -153,8 +153,8 @@ def test_of_layers_only_those_that_are_gray_everywhere_count():
     tinted = color.copy()
     tinted[20, 20, 1] *= 1.01
     frame = Frame(1, color, aovs={"tinted": tinted, "gray": color * 2, "one": color[..., :1]})
-    assert set_apart(frame)[1].gray == {"color", "gray"}
-    assert set_apart(replace(frame, color=tinted))[1].gray == {"gray"}
+    assert split_unfiltered(frame)[1].gray == {"color", "gray"}
+    assert split_unfiltered(replace(frame, color=tinted))[1].gray == {"gray"}
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -34,7 +34,7 @@ _LIGHT = 5
 
 
 @dataclass(frozen=True)
-class Kept:
+class Unfiltered:
     """What is put back into the picture of a frame.
 
     Attributes
@@ -70,7 +70,7 @@ class Kept:
         Parameters
         ----------
         picture : (H, W, 3) array
-            Denoised radiance, of what `set_apart` has left.
+            Denoised radiance, of what `split_unfiltered` has left.
         guide : (H, W, G) array or None
             Albedo and normal, finite.
 
@@ -171,8 +171,8 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
             mirrored[name][outer] = layer[region][y][:, x]
     return replace(frame, **mirrored)
 
-def set_apart(frame: Frame) -> tuple[Array, Kept]:
-    """Divide a frame's color into what is denoised and what is kept.
+def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
+    """Divide a frame's color into what is denoised and what is unfiltered.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def set_apart(frame: Frame) -> tuple[Array, Kept]:
     -------
     color : (H, W, 3) array
         Radiance; as before not finite where it is lost.
-    kept : Kept
+    unfiltered : Unfiltered
         The rest.
 
     Notes
@@ -196,7 +196,7 @@ def set_apart(frame: Frame) -> tuple[Array, Kept]:
     negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}
     color = frame.color - negative["color"] if "color" in negative else frame.color
     gray = frozenset(name for name, layer in layers.items() if _is_gray(layer))
-    return color, Kept(_lights(frame), negative, gray)
+    return color, Unfiltered(_lights(frame), negative, gray)
 
 
 def as_gray(picture: Array) -> Array:

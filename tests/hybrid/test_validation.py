@@ -17,7 +17,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.frames import Frame, Shot, open_shot
 from hybrid.plan import plan_shot
-from hybrid.plausibility import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, judge_layers
+from hybrid.validation import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 
@@ -126,7 +126,7 @@ def test_right_vectors_are_kept_in_moving_shadows_and_wrong_ones_are_not(tmp_pat
             for change in (in_shadows, *edits):
                 change(index, channels)
 
-        return " ".join(judge_layers(open_shot(write(tmp_path / name, edit))).warnings)
+        return " ".join(validate_layers(open_shot(write(tmp_path / name, edit))).warnings)
 
     assert judged("right") == ""
     left_out = "no reading of the vectors explains the pictures"
@@ -222,7 +222,7 @@ def test_a_denoised_picture_that_is_the_noisy_one_is_no_estimate(tmp_path) -> No
         channels.update({f"ViewLayer.Noisy Image.{c}": channels[f"{LIGHT}.{c}"] for c in "RGBA"})
 
     shot = open_shot(write(tmp_path, edit))
-    judgement = judge_layers(shot)
+    judgement = validate_layers(shot)
     assert judgement.warnings == ("estimate (ViewLayer.Combined.RGB) is the noisy picture: left out",)
     layers = judgement.apply(shot).layers(10)
     assert layers.estimate is None
@@ -252,7 +252,7 @@ def test_an_estimate_of_another_level_is_brought_to_that_of_the_samples(factor, 
         channels.update(layer(LIGHT, "RGB", clean))
 
     shot = open_shot(write(tmp_path, edit))
-    judgement = judge_layers(shot)
+    judgement = validate_layers(shot)
     before, after = (opened.read(10).estimate for opened in (shot, judgement.apply(shot)))
     if factor == 1:
         assert judgement.estimate_factors is None
@@ -263,7 +263,7 @@ def test_an_estimate_of_another_level_is_brought_to_that_of_the_samples(factor, 
 
 
 def test_what_makes_sense_gives_no_finding() -> None:
-    judgement = judge_layers(open_shot(SHOT / "noisy.####.exr"))
+    judgement = validate_layers(open_shot(SHOT / "noisy.####.exr"))
     assert judgement.findings == ()
     assert judgement.motion is not None
     assert judgement.variance_scale is None
@@ -275,7 +275,7 @@ def test_no_frame_is_read_twice_and_a_second_pair_only_where_one_leaves_a_questi
     for spec, motion, count in ((bundled, None, 2), (bundled, "auto", 2), (wrong, None, 4)):
         numbers: list[int] = []
         monkeypatch.setattr(Shot, "read", lambda shot, number, seen=numbers: seen.append(number) or read(shot, number))
-        judge_layers(open_shot(spec, keep=0, motion=motion))
+        validate_layers(open_shot(spec, keep=0, motion=motion))
         assert len(numbers) == len(set(numbers)) == count, (spec, motion)
 
 
@@ -285,13 +285,13 @@ def test_the_judgement_is_of_the_shot_and_not_of_the_frames_asked_for(tmp_path) 
             channels.update(layer("ViewLayer.Vector", "XYZW", 0 * cycles_vector(FRAMES[index])))
 
     spec = write(tmp_path, edit)
-    judged = [judge_layers(open_shot(spec, frames=frames)) for frames in (None, "9", "11-12")]
+    judged = [validate_layers(open_shot(spec, frames=frames)) for frames in (None, "9", "11-12")]
     assert judged[0] == judged[1] == judged[2]
 
 
 def test_variance_of_samples_is_divided_by_their_number_or_by_what_the_picture_shows(tmp_path) -> None:
     spec = write(tmp_path / "told", fill("variance", "RGB", lambda t, i: SAMPLES * t.variance))
-    judgement = judge_layers(open_shot(spec))
+    judgement = validate_layers(open_shot(spec))
     assert judgement.variance_scale == 1 / SAMPLES  # Cycles' header says how many
     assert len(judgement.warnings) == 1  # but not that the variance is theirs
     frame = judgement.apply(open_shot(spec)).read(10)
@@ -301,14 +301,14 @@ def test_variance_of_samples_is_divided_by_their_number_or_by_what_the_picture_s
     moonray = replace(RENDERERS["moonray"], files=lambda t: {
         "shot.####.exr": RENDERERS["moonray"].files(t)["shot.####.exr"] | layer("variance", "Y", 9 * t.variance[..., 1])
     })  # fmt: skip
-    judgement = judge_layers(open_shot(moonray.write(tmp_path / "measured", FRAMES)))
+    judgement = validate_layers(open_shot(moonray.write(tmp_path / "measured", FRAMES)))
     assert judgement.warnings == ()
     assert judgement.variance_scale == pytest.approx(1 / 9, rel=0.5)
 
 
 def test_a_shot_of_one_frame_is_judged_too(tmp_path) -> None:
     save(tmp_path / "still.exr", cycles(FRAMES[0]) | layer("ViewLayer.Denoising Albedo", "RGB", 0 * FRAMES[0].albedo))
-    judgement = judge_layers(open_shot(tmp_path / "still.exr"))
+    judgement = validate_layers(open_shot(tmp_path / "still.exr"))
     assert [finding.role for finding in judgement.findings] == ["albedo"]
     assert judgement.motion is None
 
@@ -320,7 +320,7 @@ def test_vectors_are_not_judged_over_a_cut(tmp_path) -> None:
             channels.update({name: -plane for name, plane in channels.items() if ".Vector." in name})
 
     spec = write(tmp_path, edit)
-    judgement = judge_layers(open_shot(spec))
+    judgement = validate_layers(open_shot(spec))
     assert judgement.findings == ()
     assert judgement.motion is not None
     assert judgement.motion.convention is not None
@@ -336,7 +336,7 @@ def test_a_cut_anywhere_is_noticed_said_once_and_nothing_is_averaged_over_it(tmp
             channels.update({name: -plane for name, plane in channels.items() if ".Vector." in name})
 
     spec = write(tmp_path / "cut", edit)
-    assert judge_layers(open_shot(spec)).warnings == ()
+    assert validate_layers(open_shot(spec)).warnings == ()
     made, said = denoised(spec, tmp_path / "out", "--preset", "draft")
     assert warnings(said) == [f"warning: {find_cut(10, 11).message}"]
     (record,) = (tmp_path / "out" / "ravg").glob("*.json")
@@ -384,7 +384,7 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
 
 
 def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales() -> None:
-    rows = judge_layers(open_shot(SHOT / "noisy.####.exr")).readings()
+    rows = validate_layers(open_shot(SHOT / "noisy.####.exr")).readings()
     assert [said for taken, said, _ in rows if taken] == ["cycles,pixels,y-up"]
     assert rows[-1][1] in ("no motion", "found in the pictures")
     assert len([said for _, said, _ in rows if said.startswith("cycles,pixels,y-up,scale=0.9")]) <= 1

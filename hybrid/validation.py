@@ -22,7 +22,7 @@ from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES
 from hybrid.grade import Grade, find_grade
-from hybrid.passes import judge_passes, thin_passes
+from hybrid.passes import classify_passes, sample_rows
 
 Array = NDArray[np.float32]
 
@@ -80,7 +80,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class ValidationReport:
     """What was found about a shot's layers.
 
     Attributes
@@ -134,10 +134,10 @@ class Judgement:
         """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""
         left_out = {finding.role for finding in self.findings if finding.left_out}
         convention = None if self.motion is None else self.motion.convention
-        return shot.judged(left_out, convention, self.variance_scale, self.passes, self.estimate_factors)
+        return shot.reinterpreted(left_out, convention, self.variance_scale, self.passes, self.estimate_factors)
 
 
-def judge_layers(shot: Shot) -> Judgement:
+def validate_layers(shot: Shot) -> ValidationReport:
     """Judge every layer of a shot on pairs of neighbouring frames.
 
     Parameters
@@ -148,7 +148,7 @@ def judge_layers(shot: Shot) -> Judgement:
 
     Returns
     -------
-    Judgement
+    ValidationReport
         Depends on the files and on the options that the shot was opened with, not on the frames asked for.
 
     Notes
@@ -162,7 +162,7 @@ def judge_layers(shot: Shot) -> Judgement:
         readable = [pair for pair in pairs if all(_can_read(shot, number) for number in pair)]
         if readable == pairs:
             raise
-        return _judge_pairs(shot, readable) if readable else Judgement()
+        return _judge_pairs(shot, readable) if readable else ValidationReport()
 
 
 def find_cut(a: int, b: int) -> Finding:
@@ -197,7 +197,7 @@ def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str
     Parameters
     ----------
     shot : Shot
-        The noisy frames, of which as many pairs are read as for `judge_layers`.
+        The noisy frames, of which as many pairs are read as for `validate_layers`.
     finished : callable
         From a frame's number to its denoised picture (H, W, 3); None where it has none.
 
@@ -222,7 +222,7 @@ def find_sequence_grade(shot: Shot, finished: Callable[[int], Array | None]) -> 
     Parameters
     ----------
     shot : Shot
-        The noisy frames, of which those are read that `judge_layers` may read.
+        The noisy frames, of which those are read that `validate_layers` may read.
     finished : callable
         From a frame's number to its denoised picture (H, W, 3); None where it has none.
     """
@@ -244,12 +244,12 @@ def _can_read(shot: Shot, number: int) -> bool:
     return True
 
 
-def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
+def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationReport:
     layers = shot.layers(shot.available[0])
     evidence = _Evidence(layers)
     if not pairs:
         evidence.add(shot.read(shot.available[0]))
-        return evidence.judge_passes(_judge(evidence, layers, [], lambda roles: []))
+        return evidence.classify_passes(_judge(evidence, layers, [], lambda roles: []))
     light: list[Patches] = []
     surfaces: list[Patches] = []
 
@@ -265,7 +265,7 @@ def _judge_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> Judgement:
         judgement = _judge(evidence, layers, light, partial(look_at_surfaces, earlier, later))
         if not judgement.warnings and (judgement.motion is None or judgement.motion.certain):
             break  # nothing is left to ask
-    return evidence.judge_passes(judgement)
+    return evidence.classify_passes(judgement)
 
 
 def _pair_of(earlier: Frame, later: Frame, here: Array, there: Array, step: int) -> FramePair | None:
@@ -291,7 +291,7 @@ def _judge(
     layers: Layers,
     light: Sequence[Patches],
     surfaces: Callable[[Collection[str]], Sequence[Patches]],
-) -> Judgement:
+) -> ValidationReport:
     variance_scale, judged = evidence.judge_variance()
     grade, graded = evidence.judge_grade()
     findings = [*evidence.findings(), *judged, *graded]
@@ -303,7 +303,7 @@ def _judge(
         )
         findings += _judge_motion(layers, choice)
     findings.sort(key=lambda finding: ROLES.index(finding.role))
-    return Judgement(tuple(findings), choice, variance_scale, estimate_factors=grade)
+    return ValidationReport(tuple(findings), choice, variance_scale, estimate_factors=grade)
 
 
 def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
@@ -330,7 +330,7 @@ class _Evidence:
         for frame in frames:
             thin = _thin(frame)
             if frame.aovs:
-                self.passes.append(thin_passes(frame))
+                self.passes.append(sample_rows(frame))
             for role, judge in _JUDGES.items():
                 if getattr(frame, role) is not None:
                     self.wrong.setdefault(role, []).append(judge(thin))
@@ -371,11 +371,11 @@ class _Evidence:
             return 1 / samples, [Finding("variance", words, left_out=False)]
         return None, [self._leave("variance", said)]
 
-    def judge_passes(self, judgement: Judgement) -> Judgement:
+    def classify_passes(self, judgement: ValidationReport) -> ValidationReport:
         """The same with what the further layers are to the picture, and a line for each."""
         if not self.passes:
             return judgement
-        passes, words = judge_passes(self.passes)
+        passes, words = classify_passes(self.passes)
         lines = (Finding("aov", f"aov {name}: {said}", warning=False, left_out=False) for name, said in words.items())
         return replace(judgement, findings=(*judgement.findings, *lines), passes=passes)
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hybrid.files.pictures import encode_bytes, encode_srgb, write_png
+from hybrid.files.png import encode_bytes, encode_srgb, write_png
 
 
 def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):

@@ -19,7 +19,7 @@ GUIDES = ("albedo", "normal", "depth", "motion", "motion_next", "variance")
 
 
 @dataclass(frozen=True)
-class Apart:
+class SidecarSequence:
     """A sequence that holds one layer of the shot.
 
     Attributes
@@ -63,7 +63,7 @@ def names_sequence(value: str) -> bool:
     )
 
 
-def open_apart(role: str, value: str) -> Apart:
+def open_sidecar(role: str, value: str) -> SidecarSequence:
     """Find the sequence that the user names for a layer.
 
     Parameters
@@ -75,7 +75,7 @@ def open_apart(role: str, value: str) -> Apart:
 
     Returns
     -------
-    Apart
+    SidecarSequence
 
     Raises
     ------
@@ -84,10 +84,12 @@ def open_apart(role: str, value: str) -> Apart:
     """
     match = re.fullmatch(r"(.*\.exr):(.+)", value, re.IGNORECASE)
     spec, layer = (match[1], match[2]) if match else (value, None)
-    return Apart(role, value, find_files(spec)[0], layer)
+    return SidecarSequence(role, value, find_files(spec)[0], layer)
 
 
-def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> tuple[Profile | None, list[Apart]]:
+def find_companions(
+    files: Mapping[int, Path], named: Collection[str] = ()
+) -> tuple[Profile | None, list[SidecarSequence]]:
     """Sequences that a renderer writes beside the color's, under names made from its name.
 
     Parameters
@@ -101,7 +103,7 @@ def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> t
     -------
     Profile or None
         The renderer, which its other file tells where the color's may not.
-    list of Apart
+    list of SidecarSequence
         A layer each; those that the other files do not have, or that the color's files have themselves, are left out.
 
     Raises
@@ -112,7 +114,7 @@ def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> t
     own = pattern_of(files[min(files)])
     stem = own.before.rstrip("._-")
     for profile in read_profiles().values() if own.digits and stem else ():
-        found: list[Apart] = []
+        found: list[SidecarSequence] = []
         for name in dict.fromkeys(profile.files.values()):
             beside = replace(own, before=name.replace("{name}", stem) + own.before[len(stem) :])
             numbered = beside.files()
@@ -123,7 +125,7 @@ def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> t
                 continue
             for role in [role for role, own_name in profile.files.items() if own_name == name]:
                 with suppress(ExrError):  # not every file has every layer
-                    apart = Apart(role, str(beside), numbered)
+                    apart = SidecarSequence(role, str(beside), numbered)
                     apart.find(image, profile)
                     found.append(apart)
         if found:
@@ -133,7 +135,7 @@ def find_companions(files: Mapping[int, Path], named: Collection[str] = ()) -> t
 
 def _find_elements(
     own: Pattern, files: Mapping[int, Path], named: Collection[str]
-) -> tuple[Profile | None, list[Apart]]:
+) -> tuple[Profile | None, list[SidecarSequence]]:
     """Guides that lie beside the color, a sequence each, under its name and their own (``view.normals.####.exr``)."""
     beside = [(plain_name(rest), p) for p in list_patterns(own.folder) if (rest := _rest(p, own))]
     if not own.digits or not beside:
@@ -154,7 +156,7 @@ def _find_elements(
     return (_told_by(image, profile, why) if apart else None), apart
 
 
-def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] | None:
+def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[SidecarSequence]] | None:
     """Gather a shot that lies in a folder as a sequence, or a folder, for each AOV, known by their names.
 
     Parameters
@@ -164,7 +166,7 @@ def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[Apart]] 
 
     Returns
     -------
-    tuple of dict, Profile and list of Apart, optional
+    tuple of dict, Profile and list of SidecarSequence, optional
         Its files, whose names they are, and the others. None where no sequence is known as the color by its name.
 
     Raises
@@ -204,12 +206,12 @@ def _assign(sequences: Sequence[tuple[str, Pattern]]) -> tuple[Profile, dict[str
     return best if score[1] > 1 else None
 
 
-def _only_each(folder: Path, roles: Mapping[str, Sequence[Pattern]]) -> list[Apart]:
+def _only_each(folder: Path, roles: Mapping[str, Sequence[Pattern]]) -> list[SidecarSequence]:
     """The one sequence of each role; raise ValueError where there are several."""
     for role, several in roles.items():
         if len(several) > 1:
             raise ValueError(f"{folder}: {role} can be {', '.join(map(str, several))}, expected one sequence")
-    return [Apart(role, str(pattern), pattern.files()) for role, (pattern,) in roles.items()]
+    return [SidecarSequence(role, str(pattern), pattern.files()) for role, (pattern,) in roles.items()]
 
 
 def _told_by(image: ExrImage, profile: Profile, why: str) -> Profile:
