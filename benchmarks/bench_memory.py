@@ -20,9 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid.files.exr import read_exr, write_layers
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from hybrid.files.exr import read_exr
 from hybrid.memory import parse_size
 from hybrid.records import read_records
+from tests.exr_files import write_layers
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 FRAMES = 5

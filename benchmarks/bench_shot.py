@@ -35,9 +35,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid.files.exr import read_exr, write_layers
-from hybrid.files.frames import open_shot, output_path
+from hybrid.files.exr import read_exr
+from hybrid.files.shots import open_shot, output_path
 from hybrid.records import read_records
+from tests.exr_files import write_layers
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
 REPEAT = 6

@@ -24,7 +24,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.oidn import denoise_oidn
 from hybrid.runtime.allocator import reuse_freed_memory
 from network.unet import denoise_picture, load_oidn, round_trunk

@@ -33,9 +33,11 @@ os.environ.update(NUMBA_THREADING_LAYER="workqueue", NUMBA_NUM_THREADS="1", OMP_
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
 from hybrid.cli import main as ravg
-from hybrid.files.exr import write_layers
 from hybrid.records import FOLDER
+from tests.exr_files import write_layers
 
 FRAMES = 6
 NOBODY = 65534

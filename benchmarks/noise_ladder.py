@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid import denoise_shot, open_shot
-from hybrid.files.exr import write_layers
+from tests.exr_files import write_layers
 
 HEIGHT, WIDTH, FRAMES = 96, 160, 7
 JUDGED = range(2, 5)

@@ -28,7 +28,7 @@ from flow.motion import CYCLES
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import OfFrames
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybrid.denoising import denoise_shot
-    from hybrid.files.frames import open_shot
+    from hybrid.files.shots import open_shot
 
 __all__ = ["denoise_shot", "open_shot"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "open_shot":
-        from hybrid.files.frames import open_shot
+        from hybrid.files.shots import open_shot
 
         return open_shot
     if name == "denoise_shot":

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from concurrent.futures import Executor, Future
 
-from hybrid.files.frames import Frame, Frames
+from hybrid.files.frame import Frame, Frames
 from hybrid.runtime.timing import Timings
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.frames import Shot, output_path
 from hybrid.files.png import encode_srgb, write_png
+from hybrid.files.shots import Shot, output_path
 from nlm.average import average, replace_nonfinite
 
 Array = NDArray[np.float32]

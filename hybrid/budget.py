@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
-from hybrid.files.frames import Frame, Frames, MappedShot, Shot
+from hybrid.files.frame import Frame, Frames, MappedShot
+from hybrid.files.shots import Shot
 from hybrid.plan import Rules
 from hybrid.steady import DenoiseWindow, Pictures
 

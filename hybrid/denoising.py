@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from hybrid.estimates import MODE_OF, EstimateSource, choose_estimate
-from hybrid.files.frames import Shot
+from hybrid.files.shots import Shot
 from hybrid.pipeline import Failed, Finished, check_written, denoise_frames, describe_run
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average

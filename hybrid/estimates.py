@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.align import Aligner, Estimates
 from hybrid.alignment.loading import REACH
-from hybrid.files.frames import Frame, Shot, open_matching_sequence, output_path
+from hybrid.files.frame import Frame
+from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window

@@ -11,8 +11,8 @@ import re
 from collections.abc import Collection
 
 from hybrid.alignment.align import MARGIN, Estimates
-from hybrid.files.frames import Shot
 from hybrid.files.layers import Layers
+from hybrid.files.shots import Shot
 from hybrid.oidn import HOLDS, HOLDS_FAST
 
 # Rows are taken in whole strips of the guided filter.

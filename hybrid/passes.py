@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.files.passes import BEAUTY, Passes, Sum
 from nlm.average import replace_nonfinite
 from nlm.parts import above, find_sums, in_noise, is_noisy, is_textured, may_differ

@@ -18,8 +18,8 @@ from hybrid.alignment.loading import REACH
 from hybrid.alignment.window import AlignedWindow
 from hybrid.beside import ReadAhead
 from hybrid.estimates import OIDN_MODES, EstimateSource
-from hybrid.files.frames import Shot, output_path
 from hybrid.files.replace import check_outputs, remove_leftovers
+from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
 from hybrid.plan import Plan, Rules, as_run
 from hybrid.runtime.timing import Timings

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybrid.alignment.loading import LoadedFrames
 from hybrid.alignment.measure import FIXED_NOISE_ABOVE, FrameFacts, PairFacts
-from hybrid.files.frames import Frames
+from hybrid.files.frame import Frames
 from hybrid.files.sequences import format_frames
 
 STAGES = {

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.frames import Shot, output_path
 from hybrid.files.movies import check_movie, write_movie
 from hybrid.files.png import encode_bytes, write_png
+from hybrid.files.shots import Shot, output_path
 from nlm.average import replace_nonfinite
 
 Picture = NDArray[np.uint8]

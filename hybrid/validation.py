@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from flow.convention import SCALES, Choice, FramePair, Patches, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES
+from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
 from hybrid.passes import classify_passes, sample_rows
 

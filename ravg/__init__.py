@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybrid.denoising import denoise_shot
-    from hybrid.files.frames import open_shot
+    from hybrid.files.shots import open_shot
 
 __all__ = ["check_packages", "denoise_shot", "open_shot"]
 

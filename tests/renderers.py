@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 
 from flow.motion import MotionConvention
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 
 # Rendered with Cycles at 24 samples: the camera moves, and three objects cross its picture.
 SHOT = Path(__file__).parent / "data" / "objects"

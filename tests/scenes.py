@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid.files.exr import write_layers
+from tests.exr_files import write_layers
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, tr
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
 from hybrid.alignment.window import AlignedWindow, clean_guide, warp_layer, warp_residuals
-from hybrid.files.frames import Frame, Frames, Shot
+from hybrid.files.frame import Frame, Frames
+from hybrid.files.shots import Shot
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre

@@ -23,7 +23,7 @@ from hybrid.alignment.measure import (
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, rendered_flow
 from hybrid.alignment.unfiltered import find_region, mirror_region
-from hybrid.files.frames import Frame, Frames
+from hybrid.files.frame import Frame, Frames
 from hybrid.runtime.timing import Timings
 from nlm.fireflies import (
     Lights,

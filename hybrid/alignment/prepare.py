@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Lights, add_lights

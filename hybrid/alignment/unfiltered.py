@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import compress, measure_exposure
 from hybrid.files.exr import HALF_MAX
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from nlm.guided import guided_filter
 
 Array = NDArray[np.float32]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
     from hybrid.comparison.methods import Method
-    from hybrid.files.frames import Shot
+    from hybrid.files.shots import Shot
 
 
 def compare(
@@ -248,7 +248,7 @@ def _show(markdown: bool, text: str, table: RichTable) -> None:
 
 def _open_beside(spec: str, shot: Shot, frames: str | None) -> Shot:
     """Open a reference or a finished sequence, and pass on its warnings."""
-    from hybrid.files.frames import open_matching_sequence
+    from hybrid.files.shots import open_matching_sequence
 
     opened = open_matching_sequence(spec, shot, frames=frames)
     for warning in opened.warnings:

@@ -50,7 +50,7 @@ from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
     from hybrid.estimates import EstimateSource
-    from hybrid.files.frames import Shot
+    from hybrid.files.shots import Shot
     from hybrid.pipeline import SourcesOf
     from hybrid.plan import Rules
     from hybrid.records import Record
@@ -454,7 +454,7 @@ def _expect_sum(pictures: Sequence[Shot]) -> None:
 @contextmanager
 def _on_record(context: typer.Context, spec: str, shot: Shot, output: str) -> Iterator[None]:
     """Leave a record of what has failed before the first frame."""
-    from hybrid.files.frames import output_path
+    from hybrid.files.shots import output_path
     from hybrid.records import Record, sequence_name
     from hybrid.runtime.timing import Timings
 
@@ -538,8 +538,8 @@ class Job:
 def _last_pass(job: Job, passes: int) -> Iterator[Job]:
     """Make all passes but the last, in folders that go when the block ends; it is given what is left to run."""
     from hybrid.estimates import OfFrames
-    from hybrid.files.frames import output_path
     from hybrid.files.replace import temporary_folder
+    from hybrid.files.shots import output_path
     from hybrid.pipeline import reach_of, sources_of
 
     command, given = job.command, OfFrames(lambda frame: frame.color)
@@ -572,8 +572,8 @@ def _last_pass(job: Job, passes: int) -> Iterator[Job]:
 
 def _run(job: Job) -> None:
     """Denoise the shot; leave a record beside the frames however it ends; stopped by Ctrl-C, say what is finished."""
-    from hybrid.files.frames import output_path
     from hybrid.files.sequences import format_frames
+    from hybrid.files.shots import output_path
     from hybrid.records import Record, sequence_name
 
     first = output_path(job.output, job.shot, job.shot.numbers[0])

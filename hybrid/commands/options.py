@@ -16,8 +16,8 @@ import typer
 from hybrid.commands.log import LOG, printable
 
 if TYPE_CHECKING:  # the commands import what they need: `ravg --help` must not wait for OpenCV and numba
-    from hybrid.files.frames import Shot
     from hybrid.files.profile import Profile
+    from hybrid.files.shots import Shot
     from hybrid.plan import Plan, Rules
     from hybrid.validation import Finding, ValidationReport
 
@@ -245,8 +245,8 @@ def open_input(
     max_pixels: int | None = None,
 ) -> Shot:
     from hybrid.files.exr import MAX_PIXELS
-    from hybrid.files.frames import open_shot
     from hybrid.files.sequences import parse_frames
+    from hybrid.files.shots import open_shot
     from hybrid.runtime.compiled import watch_compiling
 
     watch_compiling()

@@ -35,8 +35,8 @@ from hybrid.commands.options import (
 from network.training.config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
-    from hybrid.files.frames import Shot
     from hybrid.files.profile import Profile
+    from hybrid.files.shots import Shot
 
 TRAINING = "Training"
 DEFAULTS = TrainConfig(steps=1)  # one limit there must be
@@ -61,7 +61,7 @@ def open_levels(
     samples : dict of str to float, optional
         Levels to take, and their samples per pixel. Without: all there are, and what Cycles wrote in their headers.
     frames : str, optional
-        As for `hybrid.files.frames.open_shot`.
+        As for `hybrid.files.shots.open_shot`.
     layers, profile, motion : optional
         The same.
 
@@ -82,7 +82,7 @@ def open_levels(
         If there are several levels and no samples of one of them.
     """
     from hybrid.comparison.samples import samples_of
-    from hybrid.files.frames import open_shot
+    from hybrid.files.shots import open_shot
 
     path = Path(spec)
     if path.is_dir():
@@ -173,7 +173,7 @@ def prepare(
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
-    from hybrid.files.frames import open_shot
+    from hybrid.files.shots import open_shot
     from hybrid.plan import plan_shot
     from hybrid.runtime.allocator import reuse_freed_memory
 

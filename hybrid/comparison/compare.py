@@ -18,7 +18,7 @@ from hybrid.comparison.results import Comparison, MethodResult, Statistic
 from hybrid.comparison.running import ENOUGH, WARM_UP, Progress, Run, run_apart, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frames import Shot
+from hybrid.files.shots import Shot
 from hybrid.runtime.system import load_average
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")

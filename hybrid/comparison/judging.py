@@ -30,7 +30,8 @@ from hybrid.comparison.metrics import (
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
-from hybrid.files.frames import Frame, Shot
+from hybrid.files.frame import Frame
+from hybrid.files.shots import Shot
 from hybrid.plan import STILL
 
 Array = NDArray[np.float32]

@@ -22,7 +22,8 @@ from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn, read_denoised
-from hybrid.files.frames import Frame, MappedShot, Shot
+from hybrid.files.frame import Frame, MappedShot
+from hybrid.files.shots import Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise

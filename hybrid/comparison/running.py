@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frames import Frame, MappedShot, Shot
+from hybrid.files.frame import Frame, MappedShot
+from hybrid.files.shots import Shot
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import peak_memory, start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import Shot
+from hybrid.files.shots import Shot
 
 
 def decibels(error: float | np.floating) -> str:

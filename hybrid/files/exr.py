@@ -593,56 +593,6 @@ def write_exr(
     return clamped
 
 
-def write_layers(
-    path: str | Path,
-    layers: Mapping[str, np.ndarray],
-    *,
-    half: bool = True,
-    attributes: Mapping[str, str] | None = None,
-) -> int:
-    """Write a new single-part file from named layers (ZIP, scan lines).
-
-    Parameters
-    ----------
-    path : str or Path
-        The file to write.
-    layers : mapping of str to array
-        Name → (H, W) or (H, W, C ≤ 4), C components named R G B A; X Y Z W where the name ends in normal,
-        vector, motion or position; Z for depth; Y for other single channels. "" writes bare R, G, B, A.
-    half : bool
-        Store R, G, B, A and Y as half. X, Y, Z, W and depth stay float32, as in Blender: half has three
-        digits, too few for a motion of 100 pixels.
-    attributes : mapping of str to str, optional
-        Strings for the header.
-
-    Returns
-    -------
-    int
-        How many finite values were too large for half, and were written as ±65504.
-
-    Raises
-    ------
-    ValueError
-        If the layers differ in size, or there are none.
-    OSError
-        If the file cannot be written; no partial file is left.
-    """
-    sizes = {name: values.shape[:2] for name, values in layers.items()}
-    if len(set(sizes.values())) != 1:
-        raise ValueError(f"layers must be of one size, got {sizes}")
-    channels, clamped = {}, 0
-    for name, values in layers.items():
-        for channel, plane in _named(name, values).items():
-            data = _is_vector(name) or channel.endswith(".Z")
-            kind = np.dtype(np.float16 if half and not data else np.float32)
-            pixels, count = _convert(plane, plane.dtype if plane.dtype == np.uint32 else kind)
-            clamped += count
-            channels[channel] = OpenEXR.Channel(channel, pixels)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
-    _write(Path(path), [OpenEXR.Part(header, channels, "")])
-    return clamped
-
-
 # What a part that is added to a multi-part file takes from the one it lies over.
 _SHARED = (
     "compression",

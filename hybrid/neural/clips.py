@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import OIDN_MODES, choose_estimate
-from hybrid.files.frames import Shot
+from hybrid.files.shots import Shot
 from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules

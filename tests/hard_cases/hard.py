@@ -11,7 +11,7 @@ import numpy as np
 from flow.motion import CYCLES
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.scenes import Scene
 

@@ -10,7 +10,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.scenes import Scene
 

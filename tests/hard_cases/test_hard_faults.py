@@ -21,8 +21,8 @@ from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.estimates import OfFrames, OfWindows
 from hybrid.files.exr import read_exr, write_exr
-from hybrid.files.frames import open_shot
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
+from hybrid.files.shots import open_shot
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.plan import STAGES, Rules
@@ -486,7 +486,7 @@ def test_too_little_memory_is_refused_before_any_pixel_is_read(tmp_path, monkeyp
         assert not pixels
         return read_exr(path, pixels=False, **options)
 
-    monkeypatch.setattr("hybrid.files.frames.read_exr", headers_only)
+    monkeypatch.setattr("hybrid.files.shots.read_exr", headers_only)
     assert draft(tmp_path, tmp_path / "out", "--max-memory", "1G") == 1
     assert "expected at least" in capsys.readouterr().err
 

@@ -15,8 +15,9 @@ import pytest
 
 import hybrid
 from hybrid.cli import main
-from hybrid.files.exr import read_exr, write_exr, write_layers
-from hybrid.files.frames import open_shot, output_path
+from hybrid.files.exr import read_exr, write_exr
+from hybrid.files.shots import open_shot, output_path
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid.beside import ReadAhead
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.runtime.timing import Timings
 
 

@@ -10,7 +10,7 @@ from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import stage_layers
 from hybrid.estimates import OfFrames
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from nlm.average import average
 from tests.scenes import Scene
 

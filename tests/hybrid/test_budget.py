@@ -10,7 +10,7 @@ from hybrid import budget, cli
 from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
 from hybrid.commands.denoise import _fitting
 from hybrid.estimates import MODE_OF
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.plan import Rules
 from hybrid.steady import Denoised
 from tests.scenes import Scene

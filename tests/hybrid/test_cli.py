@@ -18,8 +18,9 @@ from hybrid.cli import app, main
 from hybrid.commands.options import check_estimate
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import SPECS
-from hybrid.files.exr import read_exr, write_layers
+from hybrid.files.exr import read_exr
 from hybrid.records import read_records
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 

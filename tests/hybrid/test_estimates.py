@@ -15,11 +15,11 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
 from hybrid.files import sources
-from hybrid.files.exr import write_layers
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
 from hybrid.records import read_records
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 STAGES = {"demodulate", "outliers", "warp", "gate"}

@@ -14,7 +14,7 @@ from hybrid.alignment.transfer import demodulate, measure_gain
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, choose_estimate
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.oidn import _device
 from hybrid.pseudo_reference import SECOND_LOOK, gated_average, gather_and_denoise
 from hybrid.steady import Denoised, Pictures

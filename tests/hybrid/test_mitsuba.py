@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 
 mitsuba = pytest.importorskip("mitsuba", reason="mitsuba is not installed")
 pytestmark = pytest.mark.mitsuba

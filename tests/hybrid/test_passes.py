@@ -10,11 +10,11 @@ import pytest
 from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.estimates import OfWindows
-from hybrid.files.exr import write_layers
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.passes import classify_passes, sample_rows
 from hybrid.pseudo_reference import DRAFT
 from hybrid.validation import validate_layers
+from tests.exr_files import write_layers
 
 Layers = dict[str, np.ndarray]
 
@@ -154,7 +154,7 @@ def test_each_pass_of_a_renderer_keeps_its_light(name, tmp_path):
 
 def sums_of(beauty, parts, frames=2):
     """The sums found among layers, given as functions of the frame's index."""
-    from hybrid.files.frames import Frame
+    from hybrid.files.frame import Frame
 
     made = [
         Frame(k, np.float32(beauty(k)), aovs={name: np.float32(part(k)) for name, part in parts.items()})
@@ -252,7 +252,7 @@ def test_a_layer_without_noise_is_kept():
 
 
 def test_only_what_was_multiplied_by_the_albedo_is_divided_by_it():
-    from hybrid.files.frames import Frame
+    from hybrid.files.frame import Frame
 
     albedo = textured()
     frames = [

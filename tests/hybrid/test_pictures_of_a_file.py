@@ -13,7 +13,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.files.exr import ExrImage, read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
 FRAMES = truths()

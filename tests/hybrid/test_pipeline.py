@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from hybrid import pipeline
-from hybrid.files.frames import Shot, open_shot
+from hybrid.files.shots import Shot, open_shot
 from hybrid.pipeline import Finished, denoise_frames
 from hybrid.plan import Rules
 from hybrid.runtime.timing import Timings

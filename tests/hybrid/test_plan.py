@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hybrid.alignment.align import Aligner
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.plan import STAGES, Rules, as_run, plan_shot
 from tests.scenes import Scene
 

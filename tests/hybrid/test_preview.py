@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from hybrid.cli import main
-from hybrid.files.frames import open_shot
 from hybrid.files.png import encode_srgb
+from hybrid.files.shots import open_shot
 from hybrid.preview import SHEET_WIDTH, SHORTEST, check_preview, divide, write_contact_sheet, write_preview
 from tests.scenes import Scene
 

@@ -12,7 +12,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from tests.renderers import RENDERERS, Renderer, truths
 
 FRAMES = truths()

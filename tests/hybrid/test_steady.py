@@ -10,7 +10,7 @@ import pytest
 from hybrid.alignment.align import Aligner
 from hybrid.estimates import OfFrames
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.pipeline import BESIDE, denoise_frames
 from hybrid.plan import Rules, decide, plan_shot

@@ -15,7 +15,8 @@ import pytest
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import Frame, Shot, open_shot
+from hybrid.files.frame import Frame
+from hybrid.files.shots import Shot, open_shot
 from hybrid.plan import plan_shot
 from hybrid.validation import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
 from tests.hybrid.test_renderers import denoised

@@ -10,9 +10,9 @@ from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
 from hybrid.estimates import OfFrames
-from hybrid.files import frames as frames_module
+from hybrid.files import shots as shots_module
 from hybrid.files.exr import read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.pipeline import denoise_frames
 from hybrid.plan import STAGES, Rules, plan_shot
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
@@ -117,14 +117,14 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
 
 def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_over(tmp_path, monkeypatch):
     shot, read = open_shot(replace(CALM, frames=8).write(tmp_path / "in", edit=burnt)), []
-    whole = frames_module.read_exr
+    whole = shots_module.read_exr
 
     def counted(path, *, pixels=True, **options):
         if pixels:
             read.append(path.name)
         return whole(path, pixels=pixels, **options)
 
-    monkeypatch.setattr(frames_module, "read_exr", counted)
+    monkeypatch.setattr(shots_module, "read_exr", counted)
     for _ in denoise_frames(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
         pass
     assert len(read) == 16
@@ -227,7 +227,7 @@ def test_noise_that_stands_still_is_told_from_detail(samples, step, fixed, vecto
 
 def hard_frame(layers, color, index):
     from flow.motion import CYCLES
-    from hybrid.files.frames import Frame
+    from hybrid.files.frame import Frame
 
     return Frame(
         number=index,

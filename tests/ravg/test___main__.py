@@ -74,4 +74,4 @@ def test_packages_behind_ours_on_the_path_change_nothing(tmp_path):
     for name in PACKAGES:
         other(tmp_path, name)
     code = f"import sys; sys.path.append({str(tmp_path)!r}); import ravg; print(ravg.open_shot.__module__)"
-    assert python(ROOT, "-c", code).stdout == "hybrid.files.frames\n"
+    assert python(ROOT, "-c", code).stdout == "hybrid.files.shots\n"

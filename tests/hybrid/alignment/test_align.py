@@ -7,7 +7,7 @@ import numpy as np
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.estimates import OfFrames
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from tests.scenes import Scene
 
 STAGES = {"demodulate", "outliers", "warp"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid.alignment.align import Aligner
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from tests.scenes import Scene
 
 STAGES = {"demodulate", "outliers", "warp"}

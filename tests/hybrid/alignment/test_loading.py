@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.alignment.align import Aligner
 from hybrid.alignment.loading import LoadedFrames
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.plan import Rules, plan_shot
 from tests.scenes import Scene
 

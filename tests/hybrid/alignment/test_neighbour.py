@@ -9,7 +9,7 @@ import pytest
 
 from hybrid.alignment.neighbour import AGREEING, layers_of, novelty_of, trust_light, warp_layers
 from hybrid.alignment.prepare import prepare
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from nlm.gate import color_gate
 from tests.scenes import Scene
 

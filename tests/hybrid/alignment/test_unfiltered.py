@@ -15,11 +15,13 @@ from hybrid.alignment.prepare import prepare
 from hybrid.alignment.unfiltered import find_region, mirror_region, split_unfiltered
 from hybrid.cli import main
 from hybrid.estimates import OfFrames
-from hybrid.files.exr import HALF_MAX, read_exr, write_layers
-from hybrid.files.frames import Frame, open_shot
+from hybrid.files.exr import HALF_MAX, read_exr
+from hybrid.files.frame import Frame
+from hybrid.files.shots import open_shot
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average
 from hybrid.steady import Denoised, Pictures
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 SIZE = (40, 56)

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid.alignment.align import Aligner
 from hybrid.estimates import OfFrames
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from nlm.average import replace_nonfinite
 from tests.scenes import Scene
 

@@ -18,14 +18,15 @@ torch = pytest.importorskip("torch")
 
 from hybrid.cli import main  # noqa: E402
 from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
-from hybrid.files.exr import read_exr, write_layers  # noqa: E402
-from hybrid.files.frames import open_shot  # noqa: E402
+from hybrid.files.exr import read_exr  # noqa: E402
+from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.files.sources import MADE_FROM  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
 from network.models import unet  # noqa: E402
 from network.robust_unet import RobustUNet, RobustUNetConfig  # noqa: E402
 from network.training.clips import open_clips  # noqa: E402
 from network.training.config import SamplerConfig, TrainConfig  # noqa: E402
+from tests.exr_files import write_layers  # noqa: E402
 
 pytestmark = pytest.mark.neural
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flow.motion import CYCLES
 from hybrid.comparison.methods import METHODS, Method, Run
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 
 Array = NDArray[np.float32]
 SIZE = (24, 32)

@@ -13,7 +13,7 @@ from hybrid.comparison.compare import compare_shot
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, REFERENCE, FrameStore
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 from tests.hybrid.comparison.test_running import killed, not_installed
 

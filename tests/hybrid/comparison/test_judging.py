@@ -16,7 +16,7 @@ from hybrid.comparison.flip import flip_map
 from hybrid.comparison.judging import motion_between
 from hybrid.comparison.methods import external
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FrameStore
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 
 

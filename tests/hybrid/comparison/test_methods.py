@@ -13,12 +13,12 @@ from hybrid.alignment.align import Aligner
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
-from hybrid.files.exr import write_layers
-from hybrid.files.frames import Shot, open_shot
+from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import filter_window
 from nlm.average import average
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 SCENE = Scene(frames=3, height=32, width=40)

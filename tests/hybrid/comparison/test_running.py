@@ -16,7 +16,7 @@ from hybrid.comparison import running
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.running import Run, Seconds, run_method, summarize_runs, time_methods
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frames import Frame
+from hybrid.files.frame import Frame
 from hybrid.oidn import denoise_oidn
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor, samples_of
-from hybrid.files.exr import write_layers
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 A, B = 0.24, 1e-4  # errors a/n + b

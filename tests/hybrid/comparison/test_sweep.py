@@ -10,7 +10,7 @@ import pytest
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS
 from hybrid.comparison.sweep import CLASSICAL, KERNELS, NETWORK, sweep_methods
-from hybrid.files.frames import Shot, open_shot
+from hybrid.files.shots import Shot, open_shot
 from hybrid.plan import STAGES, plan_shot
 from tests.scenes import Scene
 

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flow import motion
-from hybrid.files.exr import ExrError, read_exr, write_exr, write_layers
+from hybrid.files.exr import ExrError, read_exr, write_exr
 from hybrid.files.layers import find_layers
 from hybrid.files.sources import identify
+from tests.exr_files import write_layers
 
 CYCLES = {
     "Combined": "RGBA",

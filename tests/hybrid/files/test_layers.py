@@ -9,9 +9,10 @@ import pytest
 
 from flow import motion
 from flow.motion import MotionConvention
-from hybrid.files.exr import ExrError, ExrImage, read_exr, write_layers
-from hybrid.files.frames import open_matching_sequence, open_shot, output_path
+from hybrid.files.exr import ExrError, ExrImage, read_exr
 from hybrid.files.layers import describe_layers, find_layers, summarize_layers
+from hybrid.files.shots import open_matching_sequence, open_shot, output_path
+from tests.exr_files import write_layers
 from tests.hybrid.files.test_exr import CYCLES, cycles_names, planes, save, save_parts
 
 SIZE = 4, 6

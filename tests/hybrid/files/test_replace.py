@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from hybrid.files import replace
-from hybrid.files.exr import read_exr, write_layers
+from hybrid.files.exr import read_exr
 from hybrid.files.movies import write_movie
 from hybrid.files.png import write_png
 from hybrid.files.replace import check_outputs, remove_leftovers, replace_file, temporary_folder, write_file
+from tests.exr_files import write_layers
 
 
 @pytest.mark.posix

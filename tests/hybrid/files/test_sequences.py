@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.files.frames import Shot
 from hybrid.files.sequences import find_files, name_holes, parse_frames, parse_pattern
+from hybrid.files.shots import Shot
 
 NOT_ON_WINDOWS = [pytest.param(name, marks=pytest.mark.posix) for name in ("back\\slash", "new\nline")]
 

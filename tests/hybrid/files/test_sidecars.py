@@ -10,7 +10,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.files.exr import ExrError, read_exr
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.files.sidecars import names_sequence
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 

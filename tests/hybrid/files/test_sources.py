@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hybrid.files import sources
-from hybrid.files.exr import write_layers
 from hybrid.files.sources import HASHED, MADE_FROM, Source, describe_sources, identify, sources_in, why_stale
+from tests.exr_files import write_layers
 
 SOURCE = Source("a.exr", 3, 100.0, "00")
 

@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 from hybrid import estimates, pseudo_reference
 from hybrid.alignment.align import Aligner
 from hybrid.estimates import OfWindows, choose_estimate
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.neural import clips as module
 from hybrid.neural import denoiser
 from hybrid.neural.clips import write_clips

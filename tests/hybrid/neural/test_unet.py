@@ -15,7 +15,8 @@ from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
-from hybrid.files.frames import Frame, open_shot
+from hybrid.files.frame import Frame
+from hybrid.files.shots import open_shot
 from hybrid.neural import denoiser, unet
 from hybrid.neural.unet import denoise_bundled, denoise_unet
 from network.unet import OIDN_WEIGHTS, Trunk, TrunkConfig

@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 from hybrid.alignment.align import Aligner
 from hybrid.comparison.metrics import mean_bias, psnr
 from hybrid.estimates import MODE_OF, OfWindows
-from hybrid.files.frames import open_shot
+from hybrid.files.shots import open_shot
 from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average

@@ -10,12 +10,13 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from hybrid.files.exr import ExrError, read_exr, write_layers
+from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.png import encode_srgb
 from hybrid.records import Record
 from hybrid.runtime.timing import Timings
 from hybrid.viewer import sequence as module
 from hybrid.viewer.sequence import Sequence, encode_picture
+from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 DEFAULTS = Path(__file__).parents[2] / "data" / "defaults"

@@ -11,9 +11,10 @@ import pytest
 
 from flow.motion import CYCLES, MotionConvention
 from hybrid.alignment.loading import LoadedFrames
-from hybrid.files import frames as frames_module
-from hybrid.files.exr import ExrError, read_exr, write_layers
-from hybrid.files.frames import Frame, Shot, open_shot, output_path
+from hybrid.files import shots as shots_module
+from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.shots import Shot, open_shot, output_path
+from tests.exr_files import write_layers
 from tests.renderers import layer
 from tests.renderers import save as save_file
 
@@ -237,7 +238,7 @@ def test_frames_that_are_kept_are_read_once_and_no_more_are_held(tmp_path, monke
             opened.append(path)
         return read_exr(path, pixels=pixels, **kwargs)
 
-    monkeypatch.setattr(frames_module, "read_exr", counted)
+    monkeypatch.setattr(shots_module, "read_exr", counted)
     for number in shot.numbers:
         there = [near for near in neighbours(shot, number, 2) if near is not None]
         assert len(there) >= 3
@@ -300,17 +301,6 @@ def test_missing_frame_cannot_be_read(tmp_path):
     assert [shot.has(number) for number in (1, 2)] == [True, False]
     with pytest.raises(FileNotFoundError, match="frame 2 is not there; the shot has 1,3-4"):
         shot.read(2)
-
-
-def test_frame_says_which_array_is_wrong():
-    with pytest.raises(ValueError, match=r"albedo is float32 \(4, 5, 3\), expected float32 \(4, 6, 3\)"):
-        Frame(1, image(1), albedo=image(1, size=(4, 5)))
-    with pytest.raises(ValueError, match="color is float64"):
-        Frame(1, image(1).astype(np.float64))
-    with pytest.raises(ValueError, match="motion_convention"):
-        Frame(1, image(1), motion=image(1, 2))
-    with pytest.raises(ValueError, match="'glow'"):
-        Frame(1, image(1), aovs={"glow": image(1)[..., 0]})
 
 
 # --- cropped frames

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from flow.motion import Motion, MotionConvention, normalize_motion
+from flow.motion import MotionConvention
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, read_exr, write_exr
+from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers, find_colors, find_layers, samples_of, summarize_layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES, Profile, find_profile
@@ -30,131 +30,6 @@ from nlm.variance import variance_from_halves
 # pixel of 1e30 made NaN of all frames around it.
 LARGEST = 1e14
 LIMITED = frozenset({"color", "albedo", "normal", "variance", "half_a", "half_b", "estimate"})
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One frame of a shot; all arrays of all frames of a shot are of one size.
-
-    Attributes
-    ----------
-    number : int
-        Frame number.
-    color : (H, W, 3) array of float32
-        Linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
-    albedo, normal, variance, estimate : (H, W, 3) array of float32, optional
-        Variance is that of the color's mean, in squared radiance.
-    depth, alpha : (H, W) array of float32, optional
-    motion : (H, W, C) array of float32, optional
-        As the renderer wrote it, C at least 2; `motion_convention` says what it means.
-    resolution : (int, int), optional
-        Height and width, pixels, of the whole picture, which NDC units of the motion are fractions of; without,
-        those of `color`.
-    aovs : mapping of str to (H, W, C) array of float32
-        By name, those that were asked for.
-    pass_colors : mapping of str to (H, W, 3) array of float32
-        What those of them are multiplied by that are light without its color.
-    passes : Passes
-        What is known of `aovs`.
-    source : Path, optional
-        The file, if there is one.
-    beyond : (H, W, 3) array of bool, optional
-        Where the color is +Inf as its light is beyond the range of half; the color is NaN there.
-    """
-
-    number: int
-    color: np.ndarray
-    albedo: np.ndarray | None = None
-    normal: np.ndarray | None = None
-    depth: np.ndarray | None = None
-    motion: np.ndarray | None = None
-    motion_convention: MotionConvention | None = None
-    resolution: tuple[int, int] | None = None
-    variance: np.ndarray | None = None
-    alpha: np.ndarray | None = None
-    estimate: np.ndarray | None = None
-    aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
-    pass_colors: Mapping[str, np.ndarray] = field(default_factory=dict)
-    passes: Passes = NO_PASSES
-    source: Path | None = None
-    beyond: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        if self.color.ndim != 3 or self.color.shape[2] != 3:
-            raise ValueError(f"color has shape {self.color.shape}, expected (H, W, 3)")
-        size = self.color.shape[:2]
-        expected: dict[str, tuple[tuple[int, ...], ...]] = {
-            "color": ((*size, 3),),
-            **{name: ((*size, 3),) for name in ("albedo", "normal", "variance", "estimate")},
-            **{name: (size,) for name in ("depth", "alpha")},
-            "motion": tuple((*size, count) for count in range(2, 9)),
-        }
-        for name, shapes in expected.items():
-            array = getattr(self, name)
-            if array is not None and (array.shape not in shapes or array.dtype != np.float32):
-                allowed = " or ".join(map(str, shapes))
-                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {allowed}")
-        for name, array in self.aovs.items():
-            if array.ndim != 3 or array.shape[:2] != size:
-                raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
-        if (self.motion is None) != (self.motion_convention is None):
-            raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
-
-    def flows(self) -> Motion | None:
-        """The motion in our own convention; None where there is none."""
-        if self.motion is None or self.motion_convention is None:
-            return None
-        return normalize_motion(self.motion, self.motion_convention, resolution=self.resolution)
-
-
-class Frames(Protocol):
-    """Numbered frames, read one by one: a `Shot`, a `MappedShot`, or frames in memory.
-
-    Attributes
-    ----------
-    numbers : tuple of int
-        The frames that were asked for, ascending.
-    step : int
-        Distance between neighbouring frames.
-    shape : (int, int)
-        Height and width of every frame.
-    """
-
-    numbers: tuple[int, ...]
-    step: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of every frame."""
-
-    def has(self, number: int) -> bool:
-        """Whether there is such a frame, asked for or not."""
-
-    def read(self, number: int) -> Frame:
-        """A frame."""
-
-
-class MappedShot:
-    """The frames of a shot, each changed as it is read.
-
-    Parameters
-    ----------
-    shot : Frames
-        Where they come from.
-    change : callable
-        From a frame to what it is to be; all of one size.
-    shape : (int, int), optional
-        Height and width of what it gives; those of the shot without.
-    """
-
-    def __init__(self, shot: Frames, change: Callable[[Frame], Frame], *, shape: tuple[int, int] | None = None) -> None:
-        self.numbers, self.step, self.shape = shot.numbers, shot.step, shape or shot.shape
-        self.has = shot.has
-        self._shot, self._change = shot, change
-
-    def read(self, number: int) -> Frame:
-        """A frame, changed."""
-        return self._change(self._shot.read(number))
 
 
 class Shot:
