@@ -1090,7 +1090,7 @@ def no_library(estimate: str, folder: Path) -> str | None:
     if estimate != "auto":
         return done.refused
     return done.failed or (
-        None if re.search(r"estimates: (nlm|bundled)\b", done.said) else "it does not say what it took"
+        None if re.search(r"first pass: (nlm|bundled)\b", done.said) else "it does not say what it took"
     )
 
 

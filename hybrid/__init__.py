@@ -1,27 +1,31 @@
 """What the user touches: EXR files, shots, the plan, the pipeline, comparison, the command.
 
-For other programs: `open_shot` finds the frames of a shot, `denoise_shot` does what the command does. Both are imported
-when they are asked for, so that ``import hybrid`` is quick.
+For other programs: `open_shot` finds the frames of a shot, `denoise_shot` denoises and writes them as the command does,
+and `DenoiseOptions` describes how; `denoise_arrays` denoises arrays without files. They are imported when they are
+first used, so that ``import hybrid`` is quick.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybrid.denoising import denoise_shot
+    from hybrid.arrays import denoise_arrays
     from hybrid.files.shots import open_shot
+    from hybrid.job import DenoiseOptions, denoise_shot
 
-__all__ = ["denoise_shot", "open_shot"]
+__all__ = ["DenoiseOptions", "denoise_arrays", "denoise_shot", "open_shot"]
+
+_MODULES = {
+    "DenoiseOptions": "hybrid.job",
+    "denoise_arrays": "hybrid.arrays",
+    "denoise_shot": "hybrid.job",
+    "open_shot": "hybrid.files.shots",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "open_shot":
-        from hybrid.files.shots import open_shot
-
-        return open_shot
-    if name == "denoise_shot":
-        from hybrid.denoising import denoise_shot
-
-        return denoise_shot
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from hybrid.alignment.align import Aligner, Estimates
-from hybrid.estimates import MODE_OF, OfFrames, choose_estimate
+from hybrid.denoisers import WindowDenoiser
+from hybrid.estimates import EstimateSource, OfFrames
 from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
 from hybrid.plan import Rules
-from hybrid.steady import DenoiseWindow, Pictures
+from hybrid.steady import Pictures
 
 # Pixels on a side of the part that is measured: large enough that threads have work, small enough for seconds.
 SIDE = 512
@@ -20,28 +21,14 @@ SIDE = 512
 
 @dataclass(frozen=True)
 class Measured:
-    """A preset and its time.
-
-    Attributes
-    ----------
-    preset : str
-        Of `hybrid.estimates.MODE_OF`.
-    seconds : float
-        Of wall clock for one frame of the shot, without writing it.
-    """
+    """A preset, and the seconds of wall clock that one frame takes, without writing it."""
 
     preset: str
     seconds: float
 
 
 def parse_budget(text: str) -> float:
-    """Seconds of "10s", "500ms", "2m" or "10".
-
-    Raises
-    ------
-    ValueError
-        If it is no positive duration.
-    """
+    """Seconds of "10s", "500ms", "2m" or "10"; ValueError if `text` is no positive duration."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?|\.\d+)\s*(ms|s|m|min)?", text.strip())
     seconds = float(found[1]) * {"ms": 1e-3, "m": 60.0, "min": 60.0}.get(found[2], 1.0) if found else 0.0
     if seconds <= 0:
@@ -50,36 +37,29 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot,
-    rules: Rules,
-    estimate: str,
-    load: Callable[[str], tuple[DenoiseWindow, int]],
-    device: str = "cpu",
+    shot: Shot, rules: Rules, presets: Iterable[str], load: Callable[[str], tuple[WindowDenoiser, EstimateSource]]
 ) -> Iterator[Measured]:
-    """Measure the presets on the middle of the shot, the most accurate first.
+    """Measure presets on the middle of a shot, one after the other.
 
     Parameters
     ----------
     shot : Shot
         Its middle frames are read.
     rules : Rules
-        What decides which stages run.
-    estimate : str
-        As for `hybrid.estimates.choose_estimate`.
+        The forced stages.
+    presets : iterable of str
+        The most accurate first: nothing slower than needed is measured after a preset that fits.
     load : callable
-        From a preset to its estimator and the frames on each side that it looks at.
-    device : str
-        Of OIDN, as for `hybrid.estimates.choose_estimate`.
+        From a preset to its denoiser and first pass.
 
     Yields
     ------
     Measured
-        One after the other, so that nothing slower than needed is measured after what fits.
 
     Notes
     -----
-    Of two neighbouring frames the second is timed: while a window slides, each frame is read, estimated, aligned and
-    denoised once. The pictures of a finished sequence are counted as if they cost nothing.
+    The second of two neighbouring frames is timed: while a window slides, each frame is read, aligned and denoised
+    once. A finished sequence as first pass counts as if reading it cost nothing.
     """
     middle = len(shot.numbers) // 2
     numbers = shot.numbers[max(0, middle - 1) : middle + 1]
@@ -89,18 +69,16 @@ def measure_presets(
     start = time.perf_counter()
     shot.read(numbers[-1])
     reading = time.perf_counter() - start
-    for preset in reversed(MODE_OF):
-        denoise, radius = load(preset)
-        source = choose_estimate(estimate, shot, mode=MODE_OF[preset], device=device)
-        # A sequence's pictures are whole; what is measured is a part.
+    for preset in presets:
+        denoiser, source = load(preset)
+        # A sequence holds whole frames, and only a part is measured.
         given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
-        aligner = Aligner(part, rules, radius=radius, estimates=given)
-        pictures, spent = Pictures(aligner, denoise), []
+        frames, spent = Pictures(Aligner(part, rules, radius=denoiser.radius, estimates=given), denoiser), []
         for number in numbers:
             start = time.perf_counter()
-            pictures.make(number)
+            frames.make(number)
             spent.append(time.perf_counter() - start)
-        # The last frame's picture is made with the one before it: then what both take together counts.
+        # The last frame of a shot is denoised together with the one before: then the mean of both counts.
         seconds = spent[-1] if part.has(numbers[-1] + part.step) else sum(spent) / len(spent)
         yield Measured(preset, reading + max(seconds - reading, 0) / share)
 
@@ -113,11 +91,7 @@ def cut_out(shot: Frames, side: int) -> MappedShot:
     shot : Frames
         Frames of H × W pixels.
     side : int
-        Pixels, at most, that are left each way.
-
-    Returns
-    -------
-    MappedShot
+        Pixels that are left each way, at most.
     """
     height, width = shot.shape
     top, left = max(0, height - side) // 2, max(0, width - side) // 2

@@ -2,37 +2,78 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
-from hybrid.commands.compare import compare
-from hybrid.commands.denoise import denoise, pseudoref
-from hybrid.commands.inspect import inspect
-from hybrid.commands.log import LOG, end_log, lasting_streams, logged, one_line, start_log
-from hybrid.commands.simulate import simulate
-from hybrid.commands.status import status
-from hybrid.commands.train import prepare, train
-from hybrid.commands.view import view
+from hybrid.commands.log import LOG, RENAMED, end_log, lasting_streams, logged, one_line, start_log
 from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
 from hybrid.runtime.system import expand_home
-from hybrid.runtime.threads import check_thread_counts, let_waiting_threads_sleep
+from hybrid.runtime.threads import check_thread_counts, prepare_libraries
 
-# Where numba looks for a folder for compiled loops: its own list, and after that ours.
-FOLDERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.runtime.compiled.Fallback"
+
+class Entry(NamedTuple):
+    """A command: its function ``module:name``, its group in the help, and the first line of its help."""
+
+    function: str
+    panel: str
+    summary: str
+
+
+COMMANDS = {
+    "inspect": Entry(
+        "inspect:inspect",
+        "Frames",
+        "Show which channels are used as what, and which stages the shot calls for, with figures and reasons.",
+    ),
+    "denoise": Entry(
+        "denoise:denoise",
+        "Frames",
+        "Denoise the frames of a shot, and write each as an EXR file with all its other layers.",
+    ),
+    "view": Entry("view:view", "Frames", "Play frames in a browser: wipe, exposure, layers, weights, stages."),
+    "status": Entry("status:status", "Frames", "Show which frames are finished, running, missing and failed."),
+    "compare": Entry(
+        "compare:compare",
+        "Frames",
+        "Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference.",
+    ),
+    "make-clips": Entry("train:make_clips", "Networks", "Make training clips of shots at several noise levels."),
+    "train": Entry("train:train", "Networks", "Train a network on clips."),
+    "simulate": Entry(
+        "simulate:simulate",
+        "Networks",
+        "Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for.",
+    ),
+}
+# Old name → new name, and options that stand for the old defaults; accepted for one release.
+OLD_COMMANDS = {"pseudoref": ("denoise", ["--preset=standard"]), "prepare": ("make-clips", [])}
+OLD_OPTIONS = {
+    "--contact": "--contact-sheet",
+    "--estimate": "--first-pass",
+    "--give-way": "--aov-sum",
+    "--keep-estimates": "--keep-first-pass",
+}
 
 
 class Command(TyperCommand):
-    """A command that says what to do where a shell has replaced a pattern by the names of files."""
+    """A command that accepts old names of options, and recognises a pattern that a shell has expanded."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; of several files where one was expected, say that the pattern is to be quoted."""
+        """Parse the arguments; several files where one was expected ask for quotes."""
         files = [argument for argument in args if argument.lower().endswith(".exr")]
+        known = {name for parameter in self.params for name in parameter.opts}
+        for index, argument in enumerate(args):
+            old, equals, value = argument.partition("=")
+            new = OLD_OPTIONS.get(old)
+            if new in known and old not in known:
+                args[index] = f"{new}{equals}{value}"
+                _say_renamed(ctx, old, str(new))
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter:
@@ -44,23 +85,57 @@ class Command(TyperCommand):
             raise
 
 
+def _say_renamed(ctx: Any, old: str, new: str) -> None:
+    """Have a line logged that an old name was used."""
+    ctx.meta.setdefault(RENAMED, []).append(f"{old} is now {new}; the old name goes in the next release")
+
+
+class LazyCommand(TyperCommand):
+    """A command whose module is imported when it is run, or asked for its help; its line in the help needs neither."""
+
+    def __init__(self, name: str, entry: Entry) -> None:
+        super().__init__(name, help=entry.summary, rich_help_panel=entry.panel)
+        self._entry = entry
+
+    def load(self) -> Any:
+        """Import the command."""
+        module, _, function = self._entry.function.partition(":")
+        command = getattr(import_module(f"hybrid.commands.{module}"), function)
+        single = typer.Typer(add_completion=False)
+        single.command(self.name, cls=Command)(logged(command))
+        return typer.main.get_command(single)
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Import the command and parse its arguments."""
+        return self.load().make_context(info_name, args, parent, **extra)
+
+
+class Commands(TyperGroup):
+    """The commands of `COMMANDS`, also under their old names."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of the help."""
+        return [*COMMANDS]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command; not yet imported."""
+        return LazyCommand(cmd_name, COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that the arguments begin with."""
+        if args and args[0] in OLD_COMMANDS:
+            old, (new, options) = args[0], OLD_COMMANDS[args[0]]
+            _say_renamed(ctx, f"ravg {old}", f"ravg {new}{''.join(f' {option}' for option in options)}")
+            args = [new, *options, *args[1:]]
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command, panel in (
-    (inspect, "Frames"),
-    (denoise, "Frames"),
-    (pseudoref, "Frames"),
-    (view, "Frames"),
-    (status, "Frames"),
-    (compare, "Frames"),
-    (prepare, "Networks"),
-    (train, "Networks"),
-    (simulate, "Networks"),
-):
-    app.command(cls=Command, rich_help_panel=panel)(logged(command))
 
 
 def _show_version(asked: bool) -> None:
@@ -86,10 +161,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments; the process's own without.
     """
-    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", FOLDERS)
-    let_waiting_threads_sleep()
+    prepare_libraries()
     with lasting_streams():
-        start_log()  # until a command has read how it is to tell things
+        start_log()  # until a command has read its options of the log
         try:
             return _run(argv)
         finally:

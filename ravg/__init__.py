@@ -1,6 +1,8 @@
-"""Denoise rendered animation from other programs: `open_shot` finds the frames, `denoise_shot` denoises them.
+"""Denoise rendered animation from other programs.
 
-Both are those of `hybrid`, and are imported when they are first used, so that ``import ravg`` is quick.
+`open_shot` finds the frames of a shot, `denoise_shot` denoises and writes them, as `DenoiseOptions` say;
+`denoise_arrays` denoises arrays without files. All are those of `hybrid`, and are imported when they are first used, so
+that ``import ravg`` is quick.
 """
 
 from __future__ import annotations
@@ -10,10 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybrid.denoising import denoise_shot
+    from hybrid.arrays import denoise_arrays
     from hybrid.files.shots import open_shot
+    from hybrid.job import DenoiseOptions, denoise_shot
 
-__all__ = ["check_packages", "denoise_shot", "open_shot"]
+__all__ = ["DenoiseOptions", "check_packages", "denoise_arrays", "denoise_shot", "open_shot"]
 
 
 def check_packages() -> None:
@@ -35,9 +38,11 @@ def check_packages() -> None:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in ("denoise_shot", "open_shot"):
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     check_packages()
     import hybrid
+    from hybrid.runtime.threads import prepare_libraries
 
+    prepare_libraries()
     return getattr(hybrid, name)

@@ -99,7 +99,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/alignment/measure.py",
     "hybrid/alignment/prepare.py",
     "hybrid/breakdown.py",
-    "hybrid/commands/denoise.py",
     "hybrid/commands/inspect.py",
     "hybrid/commands/options.py",
     "hybrid/commands/simulate.py",

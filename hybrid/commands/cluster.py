@@ -41,7 +41,7 @@ ChunkOption = Annotated[
     ),
 ]
 # Of the process of a chunk: what is said where, is for the one that hands it out to say.
-NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact", "fps")
+NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
 # How long a connection may take, seconds.
 PATIENCE = 10
 

@@ -22,10 +22,8 @@ from hybrid.commands.options import (
     RateOption,
     StrictOption,
     choose,
-    judge_alike,
-    open_input,
-    say_cuts,
 )
+from hybrid.commands.shots import judge_alike, open_input, say_cuts
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -166,7 +164,7 @@ def compare(
     opened = open_input(shot, frames, layer, profile=profile, motion=motion)
     alike, said = judge_alike({"shot": opened}, strict=strict)
     noisy = alike["shot"]
-    clean = [_open_beside(spec, noisy, frames) for spec in reference]
+    clean = [_open_matching_sequence(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
     plan = cache(partial(run_apart, plan_shot, noisy))
     if sweep:
@@ -246,7 +244,7 @@ def _show(markdown: bool, text: str, table: RichTable) -> None:
         Console().print(table)
 
 
-def _open_beside(spec: str, shot: Shot, frames: str | None) -> Shot:
+def _open_matching_sequence(spec: str, shot: Shot, frames: str | None) -> Shot:
     """Open a reference or a finished sequence, and pass on its warnings."""
     from hybrid.files.shots import open_matching_sequence
 
@@ -267,7 +265,7 @@ def _methods(names: str | None, external: Sequence[str] | None, shot: Shot, fram
         name, pattern = _pair(item, "--external", "NAME=PATTERN")
         if name in METHODS or name == "reference":
             raise typer.BadParameter(f"--external is {item!r}, expected a name that no other method has")
-        chosen[name] = finished(_open_beside(pattern, shot, frames))
+        chosen[name] = finished(_open_matching_sequence(pattern, shot, frames))
     return chosen
 
 

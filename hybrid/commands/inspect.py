@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from hybrid.commands.log import Progress, printable
+from hybrid.commands.log import LOG, Progress, printable
 from hybrid.commands.options import (
     OUTPUT,
     FramesOption,
@@ -21,16 +25,11 @@ from hybrid.commands.options import (
     ProfileOption,
     ShotArgument,
     StrictOption,
-    each_view,
-    judge_input,
-    open_input,
-    rules_of,
-    say_cuts,
 )
-
-if TYPE_CHECKING:
-    from hybrid.files.layers import Layers
-    from hybrid.plan import Decision
+from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_findings, rules_of, say_cuts, views_of
+from hybrid.files.layers import Layers, describe_layers
+from hybrid.job import judge_views
+from hybrid.plan import STAGES, Decision, Rules, plan_shot
 
 
 def inspect(
@@ -42,26 +41,33 @@ def inspect(
     strict: StrictOption = False,
     stages: OnOption = None,
     no_stages: OffOption = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="all of it as one JSON object", rich_help_panel=OUTPUT)
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object", rich_help_panel=OUTPUT)] = False,
     max_pixels: PixelsOption = None,
 ) -> None:
-    """Show which channels are taken for what, and which stages the shot calls for."""
-    if each_view(inspect, locals()):
-        return
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+    """Show which channels are used as what, and which stages the shot calls for, with figures and reasons.
 
-    from hybrid.files.layers import describe_layers
-    from hybrid.plan import STAGES, plan_shot
+    Examples:
 
-    opened = open_input(shot, frames, layer, profile=profile, motion=motion, max_pixels=max_pixels)
-    pictures, judgement = judge_input(opened, strict=strict)
-    height, width = opened.shape
+    ravg inspect "shot.####.exr"
+
+    ravg inspect "shot.####.exr" --json > shot.json
+    """
+    read = ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion, max_pixels=max_pixels)
     rules = rules_of(stages, no_stages)
+    views = views_of(shot)
+    expect_views_apart(views, read, {}, {})
+    for view in views:
+        if view:
+            LOG.info(f"view {view}")
+        _inspect(in_view(read, view), rules, strict=strict, as_json=as_json)
+
+
+def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> None:
+    """Print layers, findings and plan of a shot."""
+    opened = read.open()
+    pictures, judgement = judge_views(opened, strict=strict)
+    log_findings(judgement, pictures)
+    height, width = opened.shape
     progress = Progress("look", len(opened) * len(pictures))
     layers = [picture.layers(picture.numbers[0]) for picture in pictures]
     rows = [describe_layers(taken) for taken in layers]

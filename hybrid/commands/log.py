@@ -33,6 +33,7 @@ LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
 PANEL = "What it tells"
+RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # What terminals and files that know only ASCII show in place of some signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
 
@@ -40,9 +41,12 @@ _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "..
 def logged(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options that say how much it tells, in which form, and where to."""
 
+    own = inspect.signature(command, eval_str=True)
+
     @wraps(command)
     def run(
         *,
+        context: typer.Context,
         log_format: LogFormat,
         log_file: Path | None,
         quiet: bool,
@@ -52,7 +56,9 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
         if quiet and verbose:
             raise typer.BadParameter("expected --quiet or --verbose, got both")
         start_log(log_format, log_file, quiet=quiet, verbose=verbose)
-        command(**arguments)
+        for line in context.meta.get(RENAMED, ()):
+            LOG.warning(line)
+        command(**arguments, **({"context": context} if "context" in own.parameters else {}))
 
     form = typer.Option(
         "--log-format", envvar="RAVG_LOG_FORMAT", help="of progress and messages", rich_help_panel=PANEL
@@ -69,8 +75,9 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
         "verbose": (Annotated[bool, more], False),
     }
     parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
-    own = inspect.signature(command, eval_str=True)
     added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]
+    if "context" not in own.parameters:
+        added.append(parameter("context", keyword, annotation=typer.Context))
     run.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
     return run
 

@@ -5,31 +5,34 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from hybrid.commands.log import duration, printable
 from hybrid.commands.options import OUTPUT, FramesOption, usage
-
-if TYPE_CHECKING:
-    from hybrid.records import Status
+from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
+from hybrid.records import Status, gather_status, goes_on, sequence_name
 
 
 def status(
     output: Annotated[str, typer.Argument(metavar="OUT", help="where frames are written: OUT.####.exr, or a folder")],
     frames: FramesOption = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="all of it as one JSON object", rich_help_panel=OUTPUT)
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object", rich_help_panel=OUTPUT)] = False,
 ) -> None:
-    """Show what is finished, missing and failed, by the records that runs leave beside their frames.
+    """Show which frames are finished, running, missing and failed.
 
-    Ends with 0 where all that was asked for is finished, else with 1.
+    Reads the records that runs leave beside their frames. The exit code is 0 if all frames that were asked for are
+    finished, else 1.
+
+    Example:
+
+    ravg status out --frames 1001-1100
     """
-    from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
-    from hybrid.records import gather_status, sequence_name
-
     folder, name = Path(output), None
     if not folder.is_dir():
         pattern, _ = parse_pattern(output)
@@ -69,15 +72,7 @@ def status(
 
 
 def _show(found: Status) -> None:
-    """One row for each run."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from hybrid.files.sequences import format_frames
-    from hybrid.records import goes_on
-
+    """Print one row for each run."""
     heads = "frames", "state", "made", "s a frame", "peak", "host", "last heard of"
     table = Table(*heads, box=SIMPLE_HEAD, pad_edge=False)
     for record in found.records:

@@ -23,15 +23,11 @@ from hybrid.commands.options import (
     MotionOption,
     ProfileOption,
     StrictOption,
-    check_estimate,
+    check_first_pass,
     choose,
-    import_neural,
-    judge_alike,
-    parse_input,
-    parse_layers,
-    say_cuts,
     usage,
 )
+from hybrid.commands.shots import import_neural, judge_alike, parse_layers, parse_profile, say_cuts
 from network.training.config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -108,7 +104,7 @@ def open_levels(
     return path.resolve().name, levels, counts
 
 
-def prepare(
+def make_clips(
     context: typer.Context,
     shots: Annotated[
         list[str],
@@ -135,12 +131,12 @@ def prepare(
         ),
     ] = 4,
     window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT)] = 5,
-    estimate: Annotated[
+    first_pass: Annotated[
         str,
         typer.Option(
             metavar="SOURCE",
-            callback=check_estimate,
-            help="first estimates, as for denoise; clips hold them",
+            callback=check_first_pass,
+            help="first pass, as for denoise; clips hold it",
             rich_help_panel=WHAT,
         ),
     ] = "auto",
@@ -168,7 +164,9 @@ def prepare(
     strict: StrictOption = False,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Make training clips: aligned windows at all noise levels, with first estimates and pseudo-references.
+    """Make training clips of shots at several noise levels.
+
+    Clips are aligned windows with first passes and pseudo-references.
 
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
     Shots that have clips already are left alone, so that the same command goes on where it was.
@@ -186,7 +184,7 @@ def prepare(
 
     with usage():
         samples = None if levels is None else parse_samples(levels)
-    roles, chosen = parse_layers(layer), parse_input(profile, motion)
+    roles, chosen = parse_layers(layer), parse_profile(profile)
     found = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -203,11 +201,11 @@ def prepare(
         chunks = {
             name: Chunk(arguments_of(context, {"shots": [words[name]]}), count) for name, count in frames_of.items()
         }
-        run_on_cluster(scheduler, "prepare", chunks)
+        run_on_cluster(scheduler, "make-clips", chunks)
         return
     output.mkdir(parents=True, exist_ok=True)
     reuse_freed_memory()
-    bar = Progress("prepare", sum(len(next(iter(shot.values()))) for _, shot, _ in found))
+    bar = Progress("make-clips", sum(len(next(iter(shot.values()))) for _, shot, _ in found))
     for name, shot, counts in found:
         first = next(iter(shot.values()))
         if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
@@ -226,7 +224,7 @@ def prepare(
             radius=window // 2,
             tile=tile,
             tiles=tiles,
-            estimate=estimate,
+            estimate=first_pass,
             reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
             if reference
             else None,
@@ -255,7 +253,7 @@ def parse_samples(text: str) -> dict[str, float]:
 
 
 def train(
-    clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg prepare")],
+    clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="W.safetensors", help="weights to write", rich_help_panel=OUTPUT)
     ],
@@ -356,7 +354,9 @@ def train(
         typer.Option("--resume", help="go on from W.safetensors.state, with the same options", rich_help_panel=OUTPUT),
     ] = False,
 ) -> None:
-    """Train a network on clips; torchrun -m hybrid.cli train … trains in several processes.
+    """Train a network on clips.
+
+    ``torchrun -m hybrid.cli train …`` trains in several processes.
 
     Fine-tune on your own footage, without any reference: ravg prepare it, then --init fast --rate 1e-4.
     """

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+import webbrowser
 from typing import Annotated
 
 import typer
 
 from hybrid.commands.options import INPUT, RESOURCES, WHAT, RateOption
+from hybrid.viewer.sequence import Sequence
+from hybrid.viewer.server import ViewServer
 
 
 def view(
@@ -25,16 +28,15 @@ def view(
         bool, typer.Option(help="open the page in a browser, where there is a screen", rich_help_panel=WHAT)
     ] = True,
 ) -> None:
-    """Look at frames in a browser: play, wipe, exposure, layers, weights, what each stage did. Ctrl-C ends it.
+    """Play frames in a browser: wipe, exposure, layers, weights, stages.
 
-    OUT may still be empty: frames appear as they are finished. The page is on this machine alone, and asks for nothing
-    from elsewhere.
+    OUT may still be empty: frames appear as they are finished. The page is served to this machine alone and loads
+    nothing from elsewhere. Ctrl-C ends the server.
+
+    Example:
+
+    ravg view out --beside "shot.####.exr"
     """
-    import webbrowser
-
-    from hybrid.viewer.sequence import Sequence
-    from hybrid.viewer.server import ViewServer
-
     sequences = [Sequence(output, finished=True), *(Sequence(spec, finished=False) for spec in beside or ())]
     if not any(sequence.files() for sequence in sequences):
         raise FileNotFoundError(f"no frames in {' or '.join(sequence.spec for sequence in sequences)}")

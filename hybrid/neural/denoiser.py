@@ -5,8 +5,7 @@ HWC becomes NCHW here, for running, and for training alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -18,10 +17,11 @@ from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import compress, measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
+from hybrid.denoisers import Backends, WindowDenoiser
 from hybrid.files.passes import BEAUTY
 from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
-from hybrid.neural.unet import denoise_unet, has_unet, prefilter_guides
+from hybrid.neural.unet import denoise_bundled, denoise_unet, has_unet, prefilter_guides
 from hybrid.runtime.timing import Timings
 from hybrid.steady import Denoised
 from network.checkpoint import load_model
@@ -45,7 +45,7 @@ SCRATCH_OF_TRUNK, SCRATCH = {"small": 100, "base": 100, "large": 500}, 2500
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 
-class Denoiser:
+class Denoiser(WindowDenoiser):
     """Runs a Robust Average network on aligned windows; an estimator for `hybrid.pipeline.denoise_frames`.
 
     Parameters
@@ -97,16 +97,16 @@ class Denoiser:
         half = precision == "bfloat16" or (precision == "auto" and has_bfloat16(self._device))
         self.precision = "bfloat16" if half else "float32"
         self.model = for_inference(load_model(weights), half).to(self._device)
-        if threshold is not None and self.takes_estimate:
+        if threshold is not None and self.needs_first_pass:
             raise ValueError(f"threshold is {threshold}, expected none: the network of {weights.name} has no kernels")
-        self.tile = tile or (TILE_OF_TRUNK if self.takes_estimate else TILE)
+        self.tile = tile or (TILE_OF_TRUNK if self.needs_first_pass else TILE)
         self.threshold = threshold
         self.breakdown = breakdown
         self.add_layers = add_layers
         self.timings = timings or Timings()
 
     @property
-    def takes_estimate(self) -> bool:
+    def needs_first_pass(self) -> bool:
         """Whether the network works beside per-frame estimates."""
         return isinstance(self.model, RobustUNet)
 
@@ -119,11 +119,31 @@ class Denoiser:
         return denoise_unet if self.device == "cpu" and not self._exact and has_unet() else None
 
     @property
+    def backends(self) -> Backends:
+        """Functions for the first pass: OIDN's networks in torch, and a network that ships with ravg."""
+        return Backends(self.quicker, denoise_bundled)
+
+    @property
+    def settings(self) -> Mapping[str, object]:
+        """JSON values that pixels depend on."""
+        return {"tile": self.tile, "threshold": self.threshold, "precision": self.precision}
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """The network's device."""
+        return {"network": self.device}
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that pixels depend on."""
+        return ("torch",)
+
+    @property
     def halo(self) -> int:
         """Pixels of context around a tile."""
-        return HALO_OF_TRUNK if self.takes_estimate else HALO
+        return HALO_OF_TRUNK if self.needs_first_pass else HALO
 
-    def holds(self, shape: tuple[int, int]) -> int:
+    def memory(self, shape: tuple[int, int]) -> int:
         """Bytes that the network takes while it runs on frames of this height and width, beside its weights."""
         model = self.model
         each = SCRATCH_OF_TRUNK[model.config.size] if isinstance(model, RobustUNet) else SCRATCH
@@ -140,31 +160,25 @@ class Denoiser:
         with self.timings.stage("network"):
             return self._run(aligned)
 
-    def counting(self, breakdown: Breakdown) -> Denoiser:
-        """Return the same denoiser, which counts the weights of the frames and adds what each contributes as layers."""
-        other = copy(self)
-        other.breakdown = breakdown
-        return other
-
     def _run(self, aligned: AlignedWindow) -> Denoised:
         layers = self._layers(aligned)
         irradiance, filtered, parts = self._run_tiles(aligned, layers)
-        if self.takes_estimate:
+        if self.needs_first_pass:
             irradiance = hold_to_window(irradiance, layers["estimate"], layers["residual"])
-        alone = _averaged(aligned, irradiance) if self.takes_estimate else _apart(filtered, aligned)
+        alone = _averaged(aligned, irradiance) if self.needs_first_pass else _apart(filtered, aligned)
         aovs, color, add_up = _share_out(aligned, alone, irradiance, add=self.add_layers)
         extra = {}
         if parts is not None and self.breakdown is not None:
             self.breakdown.add(parts[..., 3])
             extra = layers_of(parts[..., :3] * aligned.modulation, parts[..., 3]) | stage_layers(aligned, irradiance)
-            if not self.takes_estimate:
+            if not self.needs_first_pass:
                 add_up |= {name for name, layer in extra.items() if layer.ndim == 3}
         return Denoised(color, aovs, extra, frozenset(add_up))
 
     def _layers(self, aligned: AlignedWindow) -> dict[str, Array]:
         """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
         layers = {"confidence": aligned.confidence[..., None]}
-        if self.takes_estimate:
+        if self.needs_first_pass:
             if aligned.estimate is None or aligned.residual is None:
                 raise ValueError("estimate: expected those of the frames, as this network takes, got none")
             guides = self._guides(aligned)
@@ -175,7 +189,7 @@ class Denoiser:
             for name, guide in (("albedo", aligned.albedo), ("normal", aligned.normal)):
                 if guide is not None:
                     layers[name] = aligned.mixed(guide)
-        if aligned.aovs and not self.takes_estimate:
+        if aligned.aovs and not self.needs_first_pass:
             layers["aovs"] = np.concatenate([aligned.mixed(layer) for layer in aligned.aovs.values()], axis=-1)
         return layers
 
@@ -222,7 +236,7 @@ class Denoiser:
 
     def _borders(self, outer: Block, height: int, width: int) -> Borders:
         """By how many pixels a part is mirrored: where the picture ends, and up to the size that a trunk needs."""
-        if not self.takes_estimate:
+        if not self.needs_first_pass:
             return (0, 0), (0, 0)
 
         def border(part: slice, size: int) -> tuple[int, int]:
@@ -234,7 +248,7 @@ class Denoiser:
 
     def _cut(self, layer: Array, outer: Block) -> torch.Tensor:
         # The final stage reads them where they lie, and mirrors them itself.
-        if self.takes_estimate:
+        if self.needs_first_pass:
             return tensor_of(layer[:, *outer], copied=False).to(self._device)
         return tensor_of(pad(layer[:, *outer], self.model.multiple)).to(self._device)
 

@@ -1,6 +1,6 @@
 """Where compiled loops are kept, and what becomes of them where that fails.
 
-numba asks this module because the command names it (`hybrid.cli.FOLDERS`). It would raise "cannot cache function" where
+numba asks this module because `hybrid.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
 neither the package's folder nor the user's can be written to, as on a render farm, and whatever unpickling raises where
 a file was cut short.
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import sys
 
+#: Where numba looks for a folder for compiled loops: its own list, and after that ours (`hybrid.runtime.compiled`).
+CACHE_LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.runtime.compiled.Fallback"
 #: Turns that a waiting thread makes before it sleeps, of GNU's OpenMP: 1,000 and 10,000 do nearly as well.
 SPINS = 3000
 
@@ -49,6 +51,12 @@ def let_waiting_threads_sleep() -> None:
     """
     if os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE").upper() == "PASSIVE":
         os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
+
+
+def prepare_libraries() -> None:
+    """Set environment variables that numba and OpenMP read once; to be called before either is imported."""
+    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", CACHE_LOCATORS)
+    let_waiting_threads_sleep()
 
 
 def limit_threads(count: int) -> None:

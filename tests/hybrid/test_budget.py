@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid import budget, cli
+from hybrid import budget, cli, job
 from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
-from hybrid.commands.denoise import _fitting
-from hybrid.estimates import MODE_OF
+from hybrid.estimates import choose_estimate
 from hybrid.files.shots import open_shot
+from hybrid.job import MEASURED, DenoiseOptions
 from hybrid.plan import Rules
 from hybrid.steady import Denoised
 from tests.scenes import Scene
@@ -40,18 +40,31 @@ def test_a_part_is_cut_out_of_the_middle(tmp_path):
     np.testing.assert_array_equal(cut_out(shot, 99).read(SCENE.first).color, whole.color)
 
 
+class Fake:
+    """A denoiser that calls a function with each window."""
+
+    radius = 1
+
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, window):
+        self.function(window)
+        return Denoised(window.color[1])
+
+
 @pytest.mark.parametrize("estimate", ["nlm", "sequence"])
-def test_presets_are_measured_from_the_most_accurate_on(tmp_path, monkeypatch, estimate):
+def test_presets_are_measured_in_turn(tmp_path, monkeypatch, estimate):
     monkeypatch.setattr(budget, "SIDE", 16)
     folder = SCENE.write(tmp_path)
     shot, seen = open_shot(folder), []
+    source = choose_estimate(str(folder) if estimate == "sequence" else estimate, shot)
 
     def load(preset):
-        return (lambda window: seen.append((preset, window.number)) or Denoised(window.color[1])), 1
+        return Fake(lambda window: seen.append((preset, window.number))), source
 
-    spec = str(folder) if estimate == "sequence" else estimate
-    measured = list(measure_presets(shot, Rules(), spec, load))
-    assert [m.preset for m in measured] == ["quality", "balanced", "fast"] == list(reversed(MODE_OF))
+    measured = list(measure_presets(shot, Rules(), MEASURED, load))
+    assert [m.preset for m in measured] == ["quality", "balanced", "fast"]
     assert all(m.seconds > 0 for m in measured)
     # Two frames in the middle, and those beside them, whose pictures they are averaged with.
     assert seen == [(m.preset, SCENE.first + k) for m in measured for k in (0, 1, 2, 3)]
@@ -59,12 +72,10 @@ def test_presets_are_measured_from_the_most_accurate_on(tmp_path, monkeypatch, e
 
 def test_of_two_frames_that_are_all_both_count(tmp_path):
     shot = open_shot(replace(SCENE, frames=2).write(tmp_path))
-
-    def load(preset):
-        return (lambda window: time.sleep(0.2) or Denoised(window.color[1])), 1
-
+    source = choose_estimate("nlm", shot)
     # Both pictures are made for the first frame; the second alone would have cost next to nothing.
-    assert all(m.seconds >= 0.2 for m in measure_presets(shot, Rules(), "nlm", load))
+    measured = measure_presets(shot, Rules(), MEASURED, lambda _: (Fake(lambda window: time.sleep(0.2)), source))
+    assert all(m.seconds >= 0.2 for m in measured)
 
 
 @pytest.mark.parametrize(("asked", "chosen", "tried"), [("9s", "quality", 1), ("5s", "balanced", 2), ("1s", "fast", 3)])
@@ -78,9 +89,9 @@ def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, caplog, ask
             measured.append(preset)
             yield Measured(preset, seconds)
 
-    monkeypatch.setattr(budget, "measure_presets", measure)
+    monkeypatch.setattr(job, "measure_presets", measure)
     with caplog.at_level("INFO"):
-        assert _fitting(shot, asked, "nlm", Rules(), "float32", "cpu") == chosen
+        assert job._fit_budget(shot, DenoiseOptions(preset="auto", budget=asked)).preset == chosen
     assert len(measured) == tried  # nothing is measured that is not needed
     said = caplog.text
     assert f"preset: {chosen}" in said

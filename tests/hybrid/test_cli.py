@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 import typer
 
-from hybrid.cli import app, main
-from hybrid.commands.options import check_estimate
+from hybrid.cli import COMMANDS, LazyCommand, main
+from hybrid.commands.options import check_first_pass
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import SPECS
 from hybrid.files.exr import read_exr
 from hybrid.records import read_records
 from tests.exr_files import write_layers
 from tests.scenes import Scene
+
+ALL = {name: LazyCommand(name, entry).load() for name, entry in COMMANDS.items()}
 
 
 def run(capsys, *arguments):
@@ -35,6 +37,11 @@ def test_help_works(capsys, word):
     code, out, _ = run(capsys, word)
     assert code == 0
     assert "--install-completion" in out
+
+
+def test_the_help_names_each_command_as_the_command_itself_does():
+    for name, entry in COMMANDS.items():
+        assert ALL[name].help.splitlines()[0] == entry.summary
 
 
 def test_the_version_is_that_of_the_package(capsys):
@@ -56,7 +63,7 @@ def test_completion_can_be_had_and_completes(capsys, monkeypatch):
     assert done.stdout.split() == ["denoise"]
 
 
-@pytest.mark.parametrize("command", ["inspect", "denoise", "pseudoref", "compare", "prepare", "train", "simulate"])
+@pytest.mark.parametrize("command", ["inspect", "denoise", "compare", "make-clips", "train", "simulate"])
 def test_options_have_one_name_and_one_group_everywhere(command, capsys):
     code, out, _ = run(capsys, command, "-h")
     assert code == 0
@@ -77,23 +84,24 @@ SAID_BY_EACH = {
     "--reference",
     "--resume",
     "--beside",
+    "--frames",
 }
 
 
 def test_an_option_of_one_name_says_the_same_in_every_command():
     said: dict[str, dict[str, set[str]]] = {}
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in ALL.items():
         for parameter in command.params:
             for option in parameter.opts:
                 said.setdefault(option, {}).setdefault(parameter.help, set()).add(name)
-    assert {"denoise", "pseudoref", "inspect"} <= set.union(*said["--stages"].values())
+    assert {"denoise", "inspect"} <= set.union(*said["--stages"].values())
     differ = {option for option, helps in said.items() if len(helps) > 1 and option.startswith("--")}
-    assert differ <= SAID_BY_EACH | {"--estimate"}  # prepare has it "as for denoise"
+    assert differ <= SAID_BY_EACH | {"--first-pass"}  # make-clips has it "as for denoise"
 
 
 def test_an_option_of_one_name_stands_in_one_group_of_every_help():
     groups: dict[str, set[str | None]] = {}
-    for command in typer.main.get_command(app).commands.values():
+    for command in ALL.values():
         for parameter in command.params:
             for option in parameter.opts if parameter.param_type_name == "option" else ():
                 groups.setdefault(option, set()).add(parameter.rich_help_panel)
@@ -133,7 +141,7 @@ def test_the_documentation_names_every_default_of_a_site():
     text = (Path(__file__).parents[2] / "docs" / "farm.md").read_text(encoding="utf-8")
     there = {
         (str(parameter.envvar), option)
-        for command in typer.main.get_command(app).commands.values()
+        for command in ALL.values()
         for parameter in command.params
         for option in parameter.opts
         if parameter.envvar and option.startswith("--")
@@ -310,7 +318,8 @@ def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys,
     if option == "-o":
         words += ["-o", shot_folder / "shot.####.exr"]
     else:
-        words += ["-o", tmp_path / "out", option, shot_folder / "shot.1002.exr"]
+        os.link(shot_folder / "shot.1002.exr", tmp_path / "look.png")
+        words += ["-o", tmp_path / "out", option, tmp_path / "look.png"]
     assert "overwrite" in one_line_error(capsys, *words)
     assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
     assert not (tmp_path / "out").exists()  # it was refused before anything was made
@@ -375,9 +384,9 @@ def test_bad_usage_is_two_and_makes_nothing(arguments, shot_folder, tmp_path, ca
 
 @pytest.mark.parametrize("source", SPECS)
 def test_every_source_of_estimates_can_be_asked_for(source):
-    assert check_estimate(source) == source
-    with pytest.raises(typer.BadParameter, match=f"it is 'theirs', expected one of .*{source}"):
-        check_estimate("theirs")
+    assert check_first_pass(source) == source
+    with pytest.raises(typer.BadParameter, match=f"first-pass is 'theirs', expected one of .*{source}"):
+        check_first_pass("theirs")
 
 
 @pytest.mark.neural
@@ -488,8 +497,8 @@ def test_a_lack_of_memory_is_one_line_whoever_says_so(shot_folder, capsys, monke
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("hybrid.plan.plan_shot", fail)
+    monkeypatch.setattr("hybrid.commands.inspect.plan_shot", fail)
     assert "not enough memory" in one_line_error(capsys, "inspect", shot_folder)
-    monkeypatch.setattr("hybrid.plan.plan_shot", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
+    error = RuntimeError("a bug")
     with pytest.raises(RuntimeError, match="a bug"):
         main(["inspect", str(shot_folder)])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 NOBODY = 65534
 LOOP = """
 from numba import njit
@@ -22,10 +22,10 @@ RUN = """
 import os, sys, tempfile
 if "NO_TEMPORARY_FILES" in os.environ:
     tempfile.tempdir = "/nonexistent"
-from hybrid.cli import FOLDERS
+from hybrid.runtime.threads import CACHE_LOCATORS
 from hybrid.commands.log import start_log
 start_log()
-os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = FOLDERS
+os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = CACHE_LOCATORS
 import numba, hybrid.runtime.compiled
 numba.njit(lambda x: 2 * x)(1)  # all that compiling needs is loaded
 if os.geteuid() == 0:  # who may write anywhere

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybrid
-from hybrid import denoising
+from hybrid import job
 from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.pipeline import Failed
@@ -28,10 +28,10 @@ def same(made, expected):
 @pytest.mark.parametrize(("preset", "estimate"), [("draft", None), ("draft", "nlm")])
 def test_without_a_network_it_is_pseudoref(shot_folder, tmp_path, preset, estimate):
     shot = hybrid.open_shot(shot_folder)
-    made = list(hybrid.denoise_shot(shot, tmp_path / "made", preset=preset, estimate=estimate))
+    made = list(hybrid.denoise_shot(shot, tmp_path / "made", preset=preset, first_pass=estimate or ""))
     assert [frame.number for frame in made] == [1001, 1002, 1003]
-    words = ["pseudoref", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", preset]
-    assert main([*words, *(["--estimate", estimate] if estimate else [])]) == 0
+    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", preset]
+    assert main([*words, *(["--first-pass", estimate] if estimate else [])]) == 0
     same(tmp_path / "made", tmp_path / "out")
 
 
@@ -39,8 +39,8 @@ def test_without_a_network_it_is_pseudoref(shot_folder, tmp_path, preset, estima
 def test_with_a_network_it_is_denoise(shot_folder, tmp_path):
     pytest.importorskip("torch")
     shot = hybrid.open_shot(shot_folder)
-    assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="fast", estimate="nlm"))) == 3
-    assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--estimate", "nlm"]) == 0
+    assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="fast", first_pass="nlm"))) == 3
+    assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--first-pass", "nlm"]) == 0
     same(tmp_path / "made", tmp_path / "out")
 
 
@@ -49,7 +49,7 @@ def resumed(folder, out, **options):
     return [frame.resumed for frame in hybrid.denoise_shot(shot, out, resume=True, **options)]
 
 
-@pytest.mark.parametrize("changed", [{"no_stages": ["gate"]}, {"stages": ["warp"]}, {"estimate": "nlm"}])
+@pytest.mark.parametrize("changed", [{"no_stages": ["gate"]}, {"stages": ["warp"]}, {"first_pass": "nlm"}])
 def test_it_resumes_what_would_be_the_same_alone(shot_folder, tmp_path, changed):
     """Stages that were forced were no reason to make a frame again."""
     assert resumed(shot_folder, tmp_path / "out", preset="draft") == [False] * 3
@@ -64,7 +64,7 @@ def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
     from safetensors import safe_open
     from safetensors.numpy import save_file
 
-    weights, more = tmp_path / "w.safetensors", {"estimate": "nlm", "weights": tmp_path / "w.safetensors"}
+    weights, more = tmp_path / "w.safetensors", {"weights": tmp_path / "w.safetensors"}
     weights.write_bytes((ROOT / "tests" / "data" / "small.safetensors").read_bytes())
     assert resumed(shot_folder, tmp_path / "out", **more) == [False] * 3
     assert resumed(shot_folder, tmp_path / "out", **more) == [True] * 3
@@ -78,7 +78,7 @@ def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
 def test_the_example_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    tried = doctest.testmod(denoising)
+    tried = doctest.testmod(job)
     assert tried.attempted == 3
     assert tried.failed == 0
 

@@ -1,0 +1,183 @@
+"""Denoise frames in memory, without files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.motion import MotionConvention
+from hybrid.alignment.align import Aligner
+from hybrid.estimates import SPECS
+from hybrid.files.frame import Frame
+from hybrid.files.profile import parse_motion
+from hybrid.files.shots import Shot
+from hybrid.job import DenoiseOptions, choose_first_pass, open_denoiser, replace_options
+from hybrid.plan import Plan, as_run
+from hybrid.steady import Pictures
+
+Array = NDArray[np.float32]
+
+# Layers of a frame in memory; any other name is an AOV.
+LAYERS = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
+
+
+class ArrayFrames:
+    """Frames in memory, read as those of a shot.
+
+    Parameters
+    ----------
+    frames : sequence or mapping of int to mapping of str to array
+        Layers of each frame: those of `denoise_arrays`. Frames of a mapping may be computed when they are looked up.
+    motion : str, optional
+        Convention of the motion vectors; see `denoise_arrays`.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]],
+        motion: str | None = None,
+    ) -> None:
+        self.numbers = tuple(sorted(frames) if isinstance(frames, Mapping) else range(len(frames)))
+        if not self.numbers:
+            raise ValueError("frames: expected at least one, got none")
+        self.step = int(np.gcd.reduce(np.diff(self.numbers))) if len(self.numbers) > 1 else 1
+        self._frames = frames
+        self._convention = None if motion is None else MotionConvention(**parse_motion(motion))
+        self.shape = self.read(self.numbers[0]).color.shape[:2]
+
+    def with_neighbours(self, reach: int) -> ArrayFrames:
+        """The same frames: all of them are there."""
+        return self
+
+    def layers(self, number: int) -> Frame:
+        """The layers of a frame; `estimate` is None where there is none."""
+        return self.read(number)
+
+    def has(self, number: int) -> bool:
+        """Whether there is such a frame."""
+        return number in self.numbers
+
+    def read(self, number: int) -> Frame:
+        """A frame; ValueError where a layer does not fit the others."""
+        layers = {name: np.asarray(layer, np.float32) for name, layer in self._frames[number].items()}
+        if "color" not in layers:
+            raise ValueError(f"frame {number}: expected the layer color, got {', '.join(layers) or 'none'}")
+        if ("motion" in layers) and self._convention is None:
+            raise ValueError(f"frame {number} has the layer motion, expected its convention as `motion`")
+        aovs = {name: layer if layer.ndim == 3 else layer[..., None] for name, layer in layers.items()}
+        found = {name: layers[name] for name in LAYERS if name in layers}
+        frame = Frame(
+            number,
+            **found,  # type: ignore[arg-type]
+            motion_convention=self._convention if "motion" in layers else None,
+            aovs={name: layer for name, layer in aovs.items() if name not in LAYERS},
+        )
+        if number != self.numbers[0] and frame.color.shape[:2] != self.shape:
+            raise ValueError(f"frame {number} has shape {frame.color.shape[:2]}, expected {self.shape}")
+        return frame
+
+
+@dataclass(frozen=True)
+class ArrayResult:
+    """A denoised frame.
+
+    Attributes
+    ----------
+    number : int
+        The frame's number: its key, or its index.
+    layers : mapping of str to (H, W, C) array of float32
+        "color" (linear radiance), and the AOVs and alpha that were denoised along.
+    plan : Plan
+        Which stages ran, and why.
+    """
+
+    number: int
+    layers: Mapping[str, Array]
+    plan: Plan
+
+
+def denoise_arrays(
+    frames: Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]],
+    options: DenoiseOptions | None = None,
+    *,
+    motion: str | None = None,
+    numbers: Collection[int] | None = None,
+    progress: Callable[[ArrayResult], bool | None] | None = None,
+    **changes: object,
+) -> Iterator[ArrayResult]:
+    """Denoise frames in memory.
+
+    The pixels are those that `hybrid.denoise_shot` computes from the same layers; layers are not validated. At most a
+    window of frames is held.
+
+    Parameters
+    ----------
+    frames : sequence or mapping of int to mapping of str to array
+        Layers of each frame, all of one size: "color" (H, W, 3), linear radiance; optional "albedo", "normal",
+        "variance" of the color's mean, "estimate", an image denoised already, (H, W, 3) each; "depth", "alpha" (H, W);
+        "motion" (H, W, 2 or 4). Any other name is an AOV (H, W, C), which a network denoises along. Numbers of a
+        mapping decide which frames are neighbours.
+    options : DenoiseOptions, optional
+        What is asked for; options about files, passes and memory are refused.
+    motion : str, optional
+        Convention of the vectors in words of ``ravg --motion`` (docs/renderers.md), such as "next,pixels,y-down".
+    numbers : collection of int, optional
+        Frames to denoise; all without. The others are neighbours.
+    progress : callable, optional
+        Called with each result; if it returns False, the work ends there.
+    **changes : object
+        Fields of `DenoiseOptions`, in place of those of `options`.
+
+    Yields
+    ------
+    ArrayResult
+
+    Raises
+    ------
+    ValueError
+        If a layer or an option is not as expected.
+    ImportError
+        If OIDN is asked for and pyoidn is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybrid import denoise_arrays
+    >>> noisy = [{"color": np.random.default_rng(n).gamma(4, 0.25, (32, 48, 3))} for n in range(3)]
+    >>> [result.layers["color"].shape for result in denoise_arrays(noisy, preset="draft")]
+    [(32, 48, 3), (32, 48, 3), (32, 48, 3)]
+    """
+    chosen = replace_options(options, changes)
+    defaults = {entry.name: entry.default for entry in fields(chosen)}
+    for name in ("budget", "keep_first_pass", "passes", "breakdown", "max_memory", "resume", "keep_going", "strict"):
+        if getattr(chosen, name) != defaults[name]:
+            raise ValueError(f"{name} is {getattr(chosen, name)!r}, expected none for frames in memory")
+    if chosen.first_pass not in SPECS:
+        raise ValueError(f"first_pass is {chosen.first_pass!r}, expected one of {', '.join(SPECS)}")
+    shot = ArrayFrames(frames, motion)
+    wanted = shot.numbers if numbers is None else tuple(sorted(numbers))
+    if missing := [number for number in wanted if not shot.has(number)]:
+        raise ValueError(f"numbers: frame {missing[0]} is not there, expected some of {shot.numbers}")
+    return _denoise(shot, wanted, chosen, progress)
+
+
+def _denoise(
+    shot: ArrayFrames,
+    numbers: Sequence[int],
+    options: DenoiseOptions,
+    progress: Callable[[ArrayResult], bool | None] | None,
+) -> Iterator[ArrayResult]:
+    denoiser = open_denoiser(options)
+    source = choose_first_pass(cast("Shot", shot), options, denoiser)
+    pictures = Pictures(Aligner(shot, options.rules, radius=denoiser.radius, estimates=source.estimates), denoiser)
+    for number in numbers:
+        denoised, counts = pictures.make(number)
+        plan = as_run(options.rules.plan(*counts.facts), counts.stages, counts.shares)
+        result = ArrayResult(number, {"color": denoised.color, **denoised.aovs}, plan)
+        yield result
+        if progress is not None and progress(result) is False:
+            return

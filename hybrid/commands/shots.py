@@ -1,0 +1,199 @@
+"""How commands open a shot, validate its layers, and report findings."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import typer
+
+from hybrid.commands.log import LOG, printable
+from hybrid.commands.options import split_names, usage
+from hybrid.files.exr import MAX_PIXELS
+from hybrid.files.profile import ROLES, Profile, open_profile, parse_motion
+from hybrid.files.sequences import find_views, name_view, parse_frames
+from hybrid.files.shots import Shot, open_shot
+from hybrid.files.sidecars import names_sequence
+from hybrid.job import import_neural as import_torch
+from hybrid.plan import Plan, Rules
+from hybrid.runtime.compiled import watch_compiling
+from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
+
+Value = TypeVar("Value")
+
+
+def import_neural() -> ModuleType:
+    """Return the boundary to torch, as `hybrid.job.import_neural`, for a process that runs nothing else."""
+    gc.disable()
+    try:
+        neural = import_torch()
+    finally:
+        gc.enable()
+    # Hundreds of thousands of objects of libraries, which stay: looking for garbage among them took 2 % of the CPU time
+    # of ten frames of 1920×1080 by `fast`.
+    gc.freeze()
+    return neural
+
+
+@dataclass(frozen=True)
+class ShotInput:
+    """The options that say which shot is read, and how; bad usage raises BadParameter before a file is opened."""
+
+    shot: str
+    frames: str | None = None
+    layer: Sequence[str] = ()
+    aovs: Sequence[str] = ()
+    profile: str | None = None
+    motion: str | None = None
+    max_pixels: int | None = None
+
+    def __post_init__(self) -> None:
+        parse_layers(self.layer)
+        with usage():
+            if self.frames is not None:
+                parse_frames(self.frames)
+            if self.motion not in (None, "auto", "none"):
+                parse_motion(self.motion or "")
+
+    def open(self) -> Shot:
+        """Open the shot; warnings are logged."""
+        watch_compiling()
+        opened = open_shot(
+            self.shot,
+            frames=self.frames,
+            layers=parse_layers(self.layer),
+            profile=parse_profile(self.profile),
+            motion=self.motion,
+            aovs=tuple(self.aovs),
+            keep=0,  # the stream of windows holds what is made of a frame
+            max_pixels=MAX_PIXELS if self.max_pixels is None else self.max_pixels,
+        )
+        for warning in opened.warnings:
+            LOG.warning(warning)
+        return opened
+
+
+def parse_profile(profile: str | None) -> Profile | None:
+    """Open the profile that is asked for."""
+    with usage():
+        return None if profile is None else open_profile(profile)
+
+
+def parse_layers(layer: Iterable[str] | None) -> dict[str, str]:
+    """Role → layer, of ROLE=LAYER."""
+    overrides = {}
+    for item in layer or ():
+        role, _, name = item.partition("=")
+        if role not in ROLES or not name:
+            raise typer.BadParameter(f"--layer is {item!r}, expected ROLE=LAYER; roles: {', '.join(ROLES)}")
+        if role in overrides:
+            raise typer.BadParameter(f"--layer names {role} twice, expected once")
+        overrides[role] = name
+    return overrides
+
+
+def views_of(spec: str) -> list[str]:
+    """The stereo views that %V or %v stands for in the name of a shot; [""] where it has neither."""
+    return find_views(spec) or [""]
+
+
+def in_view(value: Value, view: str) -> Value:
+    """Put the name of a view into all names that a value holds: strings, paths, lists and dataclasses of them."""
+    found: Any = value
+    if not view:
+        return value
+    if isinstance(value, str):
+        found = name_view(value, view)
+    elif isinstance(value, Path):
+        found = Path(name_view(str(value), view))
+    elif isinstance(value, list | tuple):
+        found = type(value)(in_view(item, view) for item in value)
+    elif is_dataclass(value):
+        found = replace(value, **{f.name: in_view(getattr(value, f.name), view) for f in fields(value)})  # type: ignore[type-var]
+    return found  # type: ignore[no-any-return]
+
+
+def expect_views_apart(
+    views: Sequence[str], shot: ShotInput, folders: Mapping[str, str | None], files: Mapping[str, object]
+) -> None:
+    """Refuse names that all views would share: frames written over each other, or denoised with each other's files.
+
+    `folders` may be shared where they are folders and the files of the views have different names.
+    """
+    if views == [""]:
+        return
+
+    def is_shared(value: str) -> bool:
+        return len({in_view(value, view) for view in views}) < len(views)
+
+    different = not is_shared(Path(shot.shot).name)
+    names = {name: value for name, value in folders.items() if value and not (different and _is_folder(value))}
+    names |= {name: str(value) for name, value in files.items() if value is not None}
+    names |= {f"layer {role}": value for role, value in parse_layers(shot.layer).items() if names_sequence(value)}
+    for name, value in names.items():
+        if is_shared(value):
+            raise typer.BadParameter(f"{name} is {value!r}, expected %V or %v in it, as the shot has")
+
+
+def _is_folder(value: str) -> bool:
+    return not value.lower().endswith(".exr")
+
+
+def open_input(
+    shot: str,
+    frames: str | None,
+    layer: Sequence[str] | None,
+    *,
+    profile: str | None = None,
+    motion: str | None = None,
+) -> Shot:
+    """Open a shot as `ShotInput.open`."""
+    return ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion).open()
+
+
+def log_findings(judgement: ValidationReport, views: Sequence[Shot]) -> None:
+    """Warn of each layer that makes no sense, and name the views where there are several."""
+    for warning in judgement.warnings:
+        LOG.warning(printable(warning))
+    if len(views) > 1:
+        colors = ", ".join(str(view.layers(view.numbers[0]).color) for view in views)
+        LOG.info(f"pictures: {printable(colors)}: each is denoised; --layer color=NAME chooses one")
+
+
+def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, Shot], list[str]]:
+    """Return renders of one shot without layers that make no sense in one of them, and the messages of the findings.
+
+    Findings are logged, and errors if `strict`. Of files with several views one has to be chosen.
+    """
+    judged = {name: validate_layers(shot) for name, shot in shots.items()}
+    for name, judgement in judged.items():
+        prefix = f"{name}: " if len(shots) > 1 else ""
+        if strict and (warnings := [*shots[name].warnings, *judgement.warnings]):
+            raise ValueError(f"{prefix}{'; '.join(warnings)}")
+        for warning in judgement.warnings:
+            LOG.warning(printable(f"{prefix}{warning}"))
+    findings = tuple(dict.fromkeys(finding for judgement in judged.values() for finding in judgement.findings))
+    applied = {name: replace(judgement, findings=findings).apply(shots[name]) for name, judgement in judged.items()}
+    return applied, [finding.message for finding in findings]
+
+
+def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
+    """Log cuts and repeated frames of a plan that are not `known`, and return them; cuts are errors if `strict`."""
+    cuts = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
+    repeats = [finding for pair in plan.repeats if (finding := find_repeat(*pair)) not in known]
+    lines = [f"{name}: {finding.message}" if name else finding.message for finding in (*cuts, *repeats)]
+    if strict and cuts:
+        raise ValueError("; ".join(lines[: len(cuts)]))
+    for line in lines:
+        LOG.warning(printable(line))
+    return [*cuts, *repeats]
+
+
+def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:
+    """The stages that the user has forced."""
+    with usage():
+        return Rules(frozenset(split_names(on)), frozenset(split_names(off)))

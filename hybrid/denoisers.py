@@ -1,0 +1,121 @@
+"""The interface of every denoiser of aligned windows, and the denoisers that need no network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.window import AlignedWindow
+from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, gather_and_denoise
+from hybrid.runtime.timing import Timings
+from hybrid.steady import Denoised
+
+Array = NDArray[np.float32]
+
+
+class Backends(NamedTuple):
+    """Functions with the parameters of `hybrid.oidn.denoise_oidn` that compute a first pass.
+
+    Attributes
+    ----------
+    quicker : callable or None
+        Runs OIDN's networks in less time.
+    bundled : callable or None
+        Runs a network that ships with ravg, where OIDN is not installed.
+    """
+
+    quicker: Callable[..., Array] | None = None
+    bundled: Callable[..., Array] | None = None
+
+
+class WindowDenoiser(Protocol):
+    """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
+
+    @property
+    def radius(self) -> int:
+        """Frames on each side of the centre."""
+        return 2
+
+    @property
+    def needs_first_pass(self) -> bool:
+        """Whether windows must hold a first pass."""
+        return True
+
+    @property
+    def pools(self) -> bool:
+        """Whether samples of the window are pooled and denoised by OIDN."""
+        return False
+
+    @property
+    def settings(self) -> Mapping[str, object]:
+        """JSON values that pixels depend on; the header of each frame holds them."""
+        return {}
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """Library → the device that it computes on."""
+        return {}
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that pixels depend on."""
+        return ()
+
+    @property
+    def backends(self) -> Backends:
+        """Functions for the first pass."""
+        return Backends()
+
+    def memory(self, shape: tuple[int, int]) -> int | None:
+        """Bytes that a network takes while it runs on frames of this height and width; None without a network."""
+        return None
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of a window."""
+
+
+@dataclass(frozen=True)
+class ClassicalDenoiser(WindowDenoiser):
+    """Average or non-local means over the window, then a guided filter (`hybrid.pseudo_reference.filter_window`)."""
+
+    preset: ClassicalPreset
+    timings: Timings
+    needs_first_pass = False
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of a window."""
+        return Denoised(filter_window(aligned, self.preset, timings=self.timings))
+
+
+@dataclass(frozen=True)
+class AverageDenoiser(WindowDenoiser):
+    """The gated average of a first pass (`hybrid.pseudo_reference.gated_average`)."""
+
+    timings: Timings
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of a window."""
+        return Denoised(gated_average(aligned, timings=self.timings))
+
+
+@dataclass(frozen=True)
+class PooledDenoiser(WindowDenoiser):
+    """OIDN on the pooled samples of the window (`hybrid.pseudo_reference.gather_and_denoise`)."""
+
+    device: str
+    timings: Timings
+    packages = ("pyoidn",)
+    pools = True
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """OIDN's device."""
+        return {"oidn": self.device}
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of a window."""
+        return Denoised(gather_and_denoise(aligned, device=self.device, timings=self.timings))

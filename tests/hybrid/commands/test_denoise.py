@@ -1,0 +1,163 @@
+"""Each option of `denoise` reaches the frames; old names do what they did."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid.cli import COMMANDS, OLD_COMMANDS, OLD_OPTIONS, LazyCommand, main
+from hybrid.files.exr import read_exr
+from hybrid.files.shots import open_shot
+from hybrid.records import read_records
+from tests.scenes import Scene
+
+KERNELS = Path(__file__).parents[2] / "data" / "small.safetensors"
+NUMBER = 1002
+
+
+@pytest.fixture
+def run(shot_folder, tmp_path):
+    """Denoise the middle of three frames with some options; return its color, and what its header says."""
+    runs = iter(range(99))
+
+    def denoise(*options, command="denoise"):
+        out = tmp_path / f"out{next(runs)}"
+        words = [command, str(shot_folder), "-o", str(out), "--frames", str(NUMBER), *map(str, options)]
+        assert main(words) == 0
+        header = read_exr(out / f"shot.{NUMBER}.exr").parts[0].header
+        return open_shot(out).read(NUMBER).color, {**header, **json.loads(header["ravg/settings"])}
+
+    return denoise
+
+
+network = pytest.mark.neural
+ALONE = ["--first-pass", "nlm", "--precision", "float32"]
+
+
+@network
+def test_the_preset_is_the_network_that_runs(run):
+    pytest.importorskip("torch")
+    made = {preset: run("--preset", preset, *ALONE) for preset in ("fast", "balanced", "quality")}
+    assert {preset: header["ravg/preset"] for preset, (_, header) in made.items()} == {name: name for name in made}
+    assert len({header["weights"] for _, header in made.values()}) == 3
+    for one, other in (("fast", "balanced"), ("balanced", "quality")):
+        assert not np.array_equal(made[one][0], made[other][0])
+    np.testing.assert_array_equal(run(*ALONE)[0], made["fast"][0])
+
+
+@network
+def test_tile_and_precision_are_those_that_were_asked_for(run):
+    pytest.importorskip("torch")
+    _, header = run(*ALONE, "--tile", 32)
+    assert (header["tile"], header["precision"]) == (32, "float32")
+    assert run("--first-pass", "nlm", "--precision", "bfloat16")[1]["precision"] == "bfloat16"
+
+
+@network
+def test_the_threshold_drops_taps(run):
+    pytest.importorskip("torch")
+    low, high = (run("--weights", KERNELS, "--threshold", value)[0] for value in (0, 0.9))
+    assert not np.array_equal(low, high)
+
+
+@network
+def test_without_a_first_pass_a_network_takes_the_classical_one(run):
+    pytest.importorskip("torch")
+    color, header = run("--first-pass", "none", "--precision", "float32")
+    assert header["ravg/first-pass"] == "nlm"
+    np.testing.assert_array_equal(color, run(*ALONE)[0])
+
+
+@network
+def test_the_first_pass_has_the_mode_of_the_preset(run):
+    pytest.importorskip("pyoidn")
+    from hybrid import neural
+
+    assert run("--preset", "fast")[1]["ravg/first-pass"] == "oidn-fast"
+    assert run("--weights", neural.shipped_weights("fast"))[1]["ravg/first-pass"] == "oidn-clean"
+
+
+def test_the_first_pass_is_kept_and_read_again(run, tmp_path):
+    pytest.importorskip("pyoidn")
+    options = ["--method", "classical", "--first-pass", "oidn-fast", "--keep-first-pass", tmp_path / "kept"]
+    color, _ = run(*options)
+    kept = tmp_path / "kept" / f"shot.{NUMBER}.exr"
+    before = kept.stat().st_mtime_ns
+    np.testing.assert_array_equal(run(*options)[0], color)
+    assert kept.stat().st_mtime_ns == before
+
+
+def test_pooled_samples_are_not_the_gated_average(run):
+    pytest.importorskip("pyoidn")
+    pooled, header = run("--method", "pooled")
+    assert header["ravg/first-pass"] == "oidn-fast"
+    average, _ = run("--method", "classical", "--first-pass", "oidn-fast")
+    assert not np.array_equal(pooled, average)
+    np.testing.assert_array_equal(run("--preset", "gathered", command="pseudoref")[0], pooled)
+
+
+@network
+def test_the_second_pass_starts_from_the_frames_of_the_first(run, tmp_path, capsys):
+    pytest.importorskip("torch")
+    _, header = run(*ALONE, "--passes", 2)
+    assert header["ravg/first-pass"] == "pass 1 of 2"
+    assert (header["first-pass"], header["passes"]) == ("nlm", 2)
+    assert "first pass: nlm (asked for); pass 1 of 2 for the last" in capsys.readouterr().err
+    assert not list(tmp_path.glob("out*/pass*"))
+
+
+def test_old_names_do_what_they_did_and_say_their_new_ones(shot_folder, tmp_path, capsys):
+    assert main(["pseudoref", str(shot_folder), "-o", str(tmp_path / "old"), "--contact", str(tmp_path / "c.png")]) == 0
+    said = capsys.readouterr().err
+    assert "ravg pseudoref is now ravg denoise --preset=standard; the old name goes in the next release" in said
+    assert "--contact is now --contact-sheet" in said
+    assert (tmp_path / "c.png").stat().st_size > 0
+    assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "new"), "--method", "classical"]) == 0
+    assert "is now" not in capsys.readouterr().err
+    files = [{path.name: path.read_bytes() for path in (tmp_path / n).glob("*.exr")} for n in ("old", "new")]
+    assert files[0] == files[1]
+    assert len(files[0]) == 3
+
+
+def test_old_names_are_those_of_commands_and_options_that_are_there():
+    options = {option for p in LazyCommand("denoise", COMMANDS["denoise"]).load().params for option in p.opts}
+    assert {*OLD_OPTIONS.values()} <= options
+    assert not {*OLD_OPTIONS} & options
+    assert {new for new, _ in OLD_COMMANDS.values()} <= {*COMMANDS}
+    assert not {*OLD_COMMANDS} & {*COMMANDS}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--preset", "auto"],
+        ["--budget", "5s"],
+        ["--method", "classical", "--preset", "fast"],
+        ["--method", "classical", "--passes", "2"],
+        ["--method", "classical", "--tile", "64"],
+        ["--method", "classical", "--stages", "skip"],
+        ["--method", "pooled", "--weights", "w.safetensors"],
+        ["--breakdown", "b.jpg"],
+        ["--breakdown", "b.png", "--max-memory", "8G"],
+        ["--first-pass", "theirs"],
+        ["--stages", "no-stage"],
+        ["--method", "classical", "--preview", "x.avi"],
+        ["--method", "classical", "--contact-sheet", "x.jpg"],
+    ],
+)
+@pytest.mark.parametrize("more", [[], ["--scheduler", "tcp://127.0.0.1:1"]])
+def test_options_that_contradict_each_other_are_refused_before_a_file_is_opened(options, more, tmp_path, capsys):
+    """With --scheduler every chunk failed on the cluster."""
+    assert main(["denoise", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out"), *options, *more]) == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_layer_that_makes_no_sense_ends_a_strict_run_and_is_on_record(tmp_path, capsys):
+    folder = Scene().write(tmp_path / "in")  # whose normal is the same everywhere
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
+    assert main([*words, "--strict"]) == 1
+    ((_, record),) = read_records(tmp_path / "out")
+    assert record["state"] == "failed"
+    assert "is the same everywhere" in record["error"]
+    assert main(words) == 0

@@ -1,0 +1,103 @@
+"""Frames in memory are denoised as those of files."""
+
+import doctest
+
+import numpy as np
+import pytest
+
+import hybrid
+from hybrid import arrays
+from hybrid.files.shots import open_shot
+from hybrid.job import judge_views
+from tests.scenes import Scene
+
+SCENE = Scene(frames=5)
+MOTION = "cycles,pixels,y-up"  # of Blender's vectors
+
+
+@pytest.fixture
+def shot(tmp_path):
+    return open_shot(SCENE.write(tmp_path / "in"))
+
+
+def layers_of(shot):
+    """The layers as the command reads them: without those that make no sense."""
+    (shot,), _ = judge_views(shot)
+    frames = {number: shot.read(number) for number in shot.numbers}
+    names = ("color", "albedo", "normal", "depth", "motion")
+    layers = {number: {name: getattr(frame, name) for name in names} for number, frame in frames.items()}
+    return {number: {n: layer for n, layer in found.items() if layer is not None} for number, found in layers.items()}
+
+
+@pytest.mark.parametrize("options", [{"preset": "draft"}, {"method": "classical", "first_pass": "nlm"}])
+def test_they_are_the_frames_of_files(shot, tmp_path, options):
+    convention = shot.read(shot.numbers[0]).motion_convention
+    assert (convention.direction, convention.unit) == ("cycles", "pixels")
+    motion = f"cycles,pixels,y-{convention.y},scale={convention.scale}"
+    made = {result.number: result for result in hybrid.denoise_arrays(layers_of(shot), motion=motion, **options)}
+    assert [*made] == [*shot.numbers]
+    files = {f.number: f for f in hybrid.denoise_shot(shot, tmp_path / "out", **options)}
+    denoised = open_shot(tmp_path / "out")
+    for number, result in made.items():
+        np.testing.assert_array_equal(result.layers["color"], denoised.read(number).color)
+        assert result.plan.stages == files[number].plan.stages
+
+
+def test_only_the_numbers_that_are_asked_for_are_denoised(shot):
+    frames = [{"color": layers["color"]} for layers in layers_of(shot).values()]
+    whole = {result.number: result.layers["color"] for result in hybrid.denoise_arrays(frames, preset="draft")}
+    (middle,) = hybrid.denoise_arrays(frames, preset="draft", numbers=[2])
+    np.testing.assert_array_equal(middle.layers["color"], whole[2])
+    assert [*whole] == [0, 1, 2, 3, 4]
+
+
+def test_frames_are_looked_up_as_they_are_needed_and_work_ends_where_asked(shot):
+    class Lazy(dict):
+        def __getitem__(self, number):
+            looked_up.append(number)
+            return super().__getitem__(number)
+
+    looked_up = []
+    frames = Lazy({n: {"color": np.ones((16, 16, 3), np.float32)} for n in range(50)})
+    ended = list(hybrid.denoise_arrays(frames, preset="draft", progress=lambda result: result.number < 1))
+    assert [result.number for result in ended] == [0, 1]
+    assert max(looked_up) < 10
+
+
+@pytest.mark.neural
+def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
+    pytest.importorskip("torch")
+    frames = [
+        {**layers, "estimate": layers["color"], "glow": layers["color"]}
+        for layers in ({"color": frame["color"]} for frame in layers_of(shot).values())
+    ]
+    results = [next(hybrid.denoise_arrays(frames, first_pass=source)) for source in ("auto", "nlm")]
+    assert not np.array_equal(results[0].layers["color"], results[1].layers["color"])
+    assert results[0].layers["glow"].shape == (40, 56, 3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "words"),
+    [
+        ([], {}, "at least one"),
+        ([{"albedo": np.ones((4, 4, 3))}], {}, "expected the layer color"),
+        ([{"color": np.ones((4, 4, 3)), "motion": np.ones((4, 4, 2))}], {}, "expected its convention"),
+        ([{"color": np.ones((4, 4, 3))}], {"passes": 2, "method": "network"}, "expected none for frames in memory"),
+        ([{"color": np.ones((4, 4, 3))}], {"first_pass": "x.####.exr"}, "expected one of"),
+        ([{"color": np.ones((4, 4, 3))}], {"numbers": [3]}, "frame 3 is not there"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_at_once(frames, options, words):
+    with pytest.raises(ValueError, match=words):
+        hybrid.denoise_arrays(frames, **({"method": "classical"} | options))
+
+
+def test_frames_of_another_size_are_refused():
+    frames = [{"color": np.ones((8, 8, 3))}, {"color": np.ones((8, 9, 3))}]
+    with pytest.raises(ValueError, match=r"frame 1 has shape \(8, 9\), expected \(8, 8\)"):
+        list(hybrid.denoise_arrays(frames, preset="draft"))
+
+
+def test_the_example_runs():
+    tried = doctest.testmod(arrays)
+    assert (tried.attempted, tried.failed) == (4, 0)
