@@ -21,6 +21,7 @@ from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLES
+from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
 from hybrid.passes import classify_passes, sample_rows
@@ -133,9 +134,10 @@ class ValidationReport:
 
     def apply(self, shot: Shot) -> Shot:
         """The shot without the layers that do not make sense, and with vectors and variance as they were measured."""
-        left_out = {finding.role for finding in self.findings if finding.left_out}
+        left_out = frozenset(finding.role for finding in self.findings if finding.left_out)
         convention = None if self.motion is None else self.motion.convention
-        return shot.reinterpreted(left_out, convention, self.variance_scale, self.passes, self.estimate_factors)
+        interpretation = Interpretation(left_out, convention, self.variance_scale, self.passes, self.estimate_factors)
+        return shot.reinterpreted(interpretation)
 
 
 def validate_layers(shot: Shot) -> ValidationReport:

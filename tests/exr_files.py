@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,3 +39,20 @@ def write_layers(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     _write(Path(path), [OpenEXR.Part(header, channels, "")])
     return clamped
+
+
+SIZE = 4, 6
+
+
+def flat_image(value: float, count: int = 3, size: tuple[int, int] = SIZE) -> np.ndarray:
+    return np.full((*size, count), value, np.float32)
+
+
+def save_frames(
+    folder: Path, numbers: Iterable[int], name: str = "shot.{:04d}.exr", size: tuple[int, int] = SIZE
+) -> Path:
+    """Frames whose color is their number."""
+    for number in numbers:
+        layers = {"color": flat_image(number, size=size), "motion": flat_image(-number, 2, size)}
+        write_layers(folder / name.format(number), layers)
+    return folder

@@ -98,18 +98,18 @@ class _Clock:
 
 @contextmanager
 def _clock_reading(shot: Shot) -> Iterator[_Clock]:
-    """Count the time that `shot.read` takes, whoever calls it: on the instance, so that its own calls count."""
-    clock, read = _Clock(), shot.read
+    """Count the time that `shot.read` takes, whoever calls it."""
+    clock, read = _Clock(), shot.reader.read
 
     def clocked(number: int) -> Frame:
         with clock:
             return read(number)
 
-    shot.read = clocked  # type: ignore[method-assign]
+    shot.reader.read = clocked  # type: ignore[method-assign]
     try:
         yield clock
     finally:
-        del shot.read
+        del shot.reader.read
 
 
 def _middle_of(shot: Shot) -> Shot:

@@ -15,32 +15,31 @@ from hybrid.files.passes import NO_PASSES, Passes
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame of a shot; all arrays of all frames of a shot are of one size.
+    """One frame of a shot, of float32; all arrays of all frames of a shot are of one size.
 
     Attributes
     ----------
     number : int
         Frame number.
-    color : (H, W, 3) array of float32
+    color : (H, W, 3) array
         Linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
-    albedo, normal, variance, estimate : (H, W, 3) array of float32, optional
+    albedo, normal, variance, estimate : (H, W, 3) array, optional
         Variance is that of the color's mean, in squared radiance.
-    depth, alpha : (H, W) array of float32, optional
-    motion : (H, W, C) array of float32, optional
-        As the renderer wrote it, C at least 2; `motion_convention` says what it means.
+    depth, alpha : (H, W) array, optional
+    motion : (H, W, C) array, optional
+        As rendered, C at least 2, in the convention `motion_convention`.
     resolution : (int, int), optional
-        Height and width, pixels, of the whole picture, which NDC units of the motion are fractions of; without,
-        those of `color`.
-    aovs : mapping of str to (H, W, C) array of float32
-        By name, those that were asked for.
-    pass_colors : mapping of str to (H, W, 3) array of float32
-        What those of them are multiplied by that are light without its color.
+        Height and width of the whole picture in pixels, of which NDC motion is a fraction; default: of `color`.
+    aovs : mapping of str to (H, W, C) array
+        The AOVs that were asked for, by name.
+    pass_colors : mapping of str to (H, W, 3) array
+        Colors by which AOVs are multiplied that hold light without color.
     passes : Passes
-        What is known of `aovs`.
+        How `aovs` add up to the beauty.
     source : Path, optional
-        The file, if there is one.
+        The file.
     beyond : (H, W, 3) array of bool, optional
-        Where the color is +Inf as its light is beyond the range of half; the color is NaN there.
+        Where the color is +Inf because its light exceeds the range of half; the color is NaN there.
     """
 
     number: int
@@ -82,51 +81,36 @@ class Frame:
             raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
 
     def flows(self) -> Motion | None:
-        """The motion in our own convention; None where there is none."""
+        """Return the motion in our own convention; None without motion."""
         if self.motion is None or self.motion_convention is None:
             return None
         return normalize_motion(self.motion, self.motion_convention, resolution=self.resolution)
 
 
 class Frames(Protocol):
-    """Numbered frames, read one by one: a `Shot`, a `MappedShot`, or frames in memory.
+    """Numbered frames, read one by one: a `Shot`, a `MappedShot`, or frames in memory."""
 
-    Attributes
-    ----------
-    numbers : tuple of int
-        The frames that were asked for, ascending.
-    step : int
-        Distance between neighbouring frames.
-    shape : (int, int)
-        Height and width of every frame.
-    """
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The frames that were asked for, ascending."""
 
-    numbers: tuple[int, ...]
-    step: int
+    @property
+    def step(self) -> int:
+        """Distance between neighbouring frames."""
 
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width of every frame."""
 
     def has(self, number: int) -> bool:
-        """Whether there is such a frame, asked for or not."""
+        """Whether this frame exists, asked for or not."""
 
     def read(self, number: int) -> Frame:
-        """A frame."""
+        """Read a frame."""
 
 
 class MappedShot:
-    """The frames of a shot, each changed as it is read.
-
-    Parameters
-    ----------
-    shot : Frames
-        Where they come from.
-    change : callable
-        From a frame to what it is to be; all of one size.
-    shape : (int, int), optional
-        Height and width of what it gives; those of the shot without.
-    """
+    """The frames of a shot, each changed as it is read; `shape` is that of the changed frames."""
 
     def __init__(self, shot: Frames, change: Callable[[Frame], Frame], *, shape: tuple[int, int] | None = None) -> None:
         self.numbers, self.step, self.shape = shot.numbers, shot.step, shape or shot.shape
@@ -134,5 +118,5 @@ class MappedShot:
         self._shot, self._change = shot, change
 
     def read(self, number: int) -> Frame:
-        """A frame, changed."""
+        """Read and change a frame."""
         return self._change(self._shot.read(number))

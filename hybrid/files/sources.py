@@ -1,8 +1,8 @@
-"""What a picture was made from: enough to tell later whether any of it has changed.
+"""What a picture was made from, to recognize later whether any of it has changed (`--resume`).
 
-It stands in the header of each picture that is made, as the string `MADE_FROM`: JSON with ``files``, a mapping from
-what each was for (``frame 1001``, ``estimate 1001``) to its name, size in bytes, time of its last change in seconds,
-and a hash of its content; and with whatever else decided, by name.
+The header of each result holds the string `MADE_FROM`: JSON with ``files``, a mapping from the use of each file
+(``frame 1001``, ``estimate 1001``) to its name, size in bytes, modification time in seconds, and a hash of its
+content; and with all other facts that the pixels depend on, by name.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.replace import refuse_other_kinds
 
 MADE_FROM = "ravg/made-from"
-# Of larger files so many bytes are hashed, in blocks all over: two renders differ everywhere, and what an editor has
-# changed in one place has another time. Reading all of it would take as long as half a frame.
+# Of larger files so many bytes are hashed, in blocks all over: two renders differ everywhere, and an edit in one place
+# changes the time. Reading all of a file would take as long as half a frame.
 HASHED = 2**20
 _BLOCKS = 16
 # Packages that all pixels depend on.
@@ -32,20 +32,9 @@ _SECONDS = 2.0
 
 @dataclass(frozen=True)
 class Source:
-    """A file as it was when it was read.
+    """A file as it was when it was read: name without folder, bytes, modification time in seconds, hash (`HASHED`).
 
-    Attributes
-    ----------
-    name : str
-        Of the file, without its folder.
-    size : int
-        Bytes.
-    modified : float
-        When it was last changed, seconds.
-    hash : str
-        Of its content, or of blocks all over it (`HASHED`).
-    inode : int
-        Which file of that name it was; means nothing later, and is not recorded.
+    The inode tells files of one name apart during a run, and is not recorded.
     """
 
     name: str
@@ -55,19 +44,39 @@ class Source:
     inode: int = field(default=0, compare=False)
 
     def same_as(self, other: Source) -> bool:
-        """Whether nothing but the name is different; times to two seconds."""
+        """Whether size, hash and time are the same, the time to two seconds; names may differ."""
         same = self.size == other.size and self.hash == other.hash
         return same and abs(self.modified - other.modified) <= _SECONDS
 
 
-def identify(path: Path) -> Source:
-    """Say what a file is now.
+class ReadSources:
+    """The files of a run as they were when they were first identified."""
 
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    """
+    def __init__(self) -> None:
+        self._sources: dict[Path, Source] = {}
+
+    def identify(self, path: Path) -> Source:
+        """Return a file as it was when this was first called for it."""
+        if path not in self._sources:
+            self._sources[path] = identify(path)
+        return self._sources[path]
+
+    def check_unchanged(self, path: Path) -> None:
+        """Raise OSError if an identified file has been written again since, or is gone."""
+        if (source := self._sources.get(path)) is None:
+            return
+        status = path.stat()
+        now = status.st_size, _modified(status.st_mtime_ns), status.st_ino
+        if now != (source.size, source.modified, source.inode):
+            raise OSError(f"{path} has changed since it was read; --resume makes again what was made from it")
+
+
+def _modified(nanoseconds: int) -> float:
+    return round(nanoseconds / 1e9, 3)
+
+
+def identify(path: Path) -> Source:
+    """Return a file as it is now; raise OSError if it cannot be read."""
     refuse_other_kinds(path)
     status = path.stat()
     size = status.st_size
@@ -80,30 +89,25 @@ def identify(path: Path) -> Source:
             for index in range(_BLOCKS):
                 file.seek((size - block) * index // (_BLOCKS - 1))
                 found.update(file.read(block))
-    return Source(path.name, size, round(status.st_mtime_ns / 1e9, 3), found.hexdigest(), status.st_ino)
+    return Source(path.name, size, _modified(status.st_mtime_ns), found.hexdigest(), status.st_ino)
 
 
 def describe_sources(files: Mapping[str, Source], **facts: object) -> str:
-    """Describe what a frame was made from, for its header.
+    """Return JSON for `MADE_FROM`: the same for the same files and facts, to the byte.
 
     Parameters
     ----------
     files : mapping of str to Source
-        What a frame was made from, by what it is.
+        Use of a file (``frame 1001``) → file.
     **facts : object
-        What else its pixels depend on, by name.
-
-    Returns
-    -------
-    str
-        JSON: the same for the same files and facts, to the byte.
+        All else that the pixels depend on.
     """
-    listed = {what: [s.name, s.size, s.modified, s.hash] for what, s in files.items()}
+    listed = {use: [s.name, s.size, s.modified, s.hash] for use, s in files.items()}
     return json.dumps({**facts, "files": listed}, sort_keys=True)
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Versions of those of some packages that are installed, without the name of the build (torch 2.13.0+cpu).
+    """Return the versions of the installed packages among `packages`, without the build's name (torch 2.13.0+cpu).
 
     The wheels for Linux and Windows differ in that name alone, and machines of both may work on one shot.
     """
@@ -115,21 +119,15 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def why_stale(path: Path, attributes: Mapping[str, str], *, whole: bool = True) -> str | None:
-    """Say why a picture has to be made again.
+    """Return the reason why a result must be made again; "" if it is missing, None if it is whole and up to date.
 
     Parameters
     ----------
     path : Path
-        The picture.
     attributes : mapping of str to str
-        What would stand in its header if it was made now, `MADE_FROM` among them.
+        Header strings of a result made now, `MADE_FROM` among them.
     whole : bool
-        Read all of it, to see that it can be read; else the header alone.
-
-    Returns
-    -------
-    str or None
-        The reason, "" if it is not there; None if it is whole and would be the same.
+        Read the pixels too, to check that the file is not damaged.
     """
     try:
         header = read_exr(path, pixels=whole).parts[0].header
@@ -145,18 +143,18 @@ def why_stale(path: Path, attributes: Mapping[str, str], *, whole: bool = True) 
         if old.get(name) != new.get(name):
             return _difference(name, old.get(name), new.get(name))
     before, now = (_files(document) for document in (old, new))
-    for what in sorted(before.keys() | now.keys()):
-        if what not in before:
-            return f"{what} was not there"
-        if what not in now:
-            return f"{what} is not there any more"
-        if not before[what].same_as(now[what]):
-            return f"{what}, {now[what].name}, has changed"
+    for use in sorted(before.keys() | now.keys()):
+        if use not in before:
+            return f"{use} was not there"
+        if use not in now:
+            return f"{use} is not there any more"
+        if not before[use].same_as(now[use]):
+            return f"{use}, {now[use].name}, has changed"
     return None
 
 
 def sources_in(path: Path) -> dict[str, Any]:
-    """What a picture says it was made from; {} where it does not say so, or is none."""
+    """Return the `MADE_FROM` of a file; {} if it has none or cannot be read."""
     try:
         header = read_exr(path, pixels=False).parts[0].header
     except (OSError, ExrError):
@@ -165,7 +163,7 @@ def sources_in(path: Path) -> dict[str, Any]:
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
-    """What is different of an option or a fact; of several in one string, which."""
+    """Say how a fact differs; for several facts in one JSON string, the first that does."""
     if old is None:
         return f"nothing says of which {name} it is"
     before, now = _parse(old), _parse(new)
@@ -181,7 +179,7 @@ def _short(value: object) -> str:
 
 
 def _parse(text: object) -> dict[str, Any]:
-    """The object that a header's string holds; {} where it holds none."""
+    """The object in a JSON string; {} if it holds none."""
     try:
         document = json.loads(text) if isinstance(text, str) else text
     except (ValueError, RecursionError):
@@ -190,9 +188,9 @@ def _parse(text: object) -> dict[str, Any]:
 
 
 def _files(document: Mapping[str, Any]) -> dict[str, Source]:
-    """The files of a record; a hostile one has none."""
+    """The files of a `MADE_FROM`; {} for a malformed one."""
     try:
         listed = document["files"].items()
-        return {what: Source(str(n), int(s), float(m), str(h)) for what, (n, s, m, h) in listed}
+        return {use: Source(str(n), int(s), float(m), str(h)) for use, (n, s, m, h) in listed}
     except (LookupError, TypeError, ValueError, AttributeError):
         return {}

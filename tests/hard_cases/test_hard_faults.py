@@ -486,7 +486,7 @@ def test_too_little_memory_is_refused_before_any_pixel_is_read(tmp_path, monkeyp
         assert not pixels
         return read_exr(path, pixels=False, **options)
 
-    monkeypatch.setattr("hybrid.files.shots.read_exr", headers_only)
+    monkeypatch.setattr("hybrid.files.reader.read_exr", headers_only)
     assert draft(tmp_path, tmp_path / "out", "--max-memory", "1G") == 1
     assert "expected at least" in capsys.readouterr().err
 

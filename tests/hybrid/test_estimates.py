@@ -15,6 +15,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
 from hybrid.files import sources
+from hybrid.files.reader import ShotReader
 from hybrid.files.shots import open_shot
 from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
@@ -115,7 +116,7 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
 
     for source in (None, OfFrames(same), OfGuidedFrames(lambda frame, _: frame.color), OfWindows(DRAFT)):
         aligner, read = Aligner(shot, stages, estimates=source), []
-        aligner.shot.read = lambda number, read=read: read.append(number) or type(shot).read(shot, number)
+        aligner.shot.reader.read = lambda number, read=read: read.append(number) or ShotReader.read(shot.reader, number)
         aligner.align(scene.first + 7)
         reach = 2 if source is None else source.reach(2)
         assert sorted(read) == list(range(scene.first + 7 - reach, scene.first + 8 + reach))

@@ -10,7 +10,7 @@ from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
 from hybrid.estimates import OfFrames
-from hybrid.files import shots as shots_module
+from hybrid.files import reader as reader_module
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.pipeline import denoise_frames
@@ -117,14 +117,14 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
 
 def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_over(tmp_path, monkeypatch):
     shot, read = open_shot(replace(CALM, frames=8).write(tmp_path / "in", edit=burnt)), []
-    whole = shots_module.read_exr
+    whole = reader_module.read_exr
 
     def counted(path, *, pixels=True, **options):
         if pixels:
             read.append(path.name)
         return whole(path, pixels=pixels, **options)
 
-    monkeypatch.setattr(shots_module, "read_exr", counted)
+    monkeypatch.setattr(reader_module, "read_exr", counted)
     for _ in denoise_frames(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
         pass
     assert len(read) == 16

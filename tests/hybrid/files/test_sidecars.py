@@ -169,7 +169,7 @@ def test_renderman_s_variance_file_is_found_beside_the_beauty(tmp_path: Path) ->
         frame = shot.read(10)
         np.testing.assert_array_equal(frame.albedo, FRAMES[1].albedo)
         np.testing.assert_array_equal(frame.variance, FRAMES[1].variance)
-        assert shot.reads(tmp_path / "sh_variance.0010.exr")  # and nothing writes over it
+        assert shot.is_input(tmp_path / "sh_variance.0010.exr")  # and nothing writes over it
     assert main(["inspect", str(tmp_path / "sh_variance.####.exr")]) == 1  # it holds no color
 
 
