@@ -10,7 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from hybrid.files.exr import ExrError, ExrImage, Layer, read_exr
-from hybrid.files.layers import find_layers, fit_alone
+from hybrid.files.layers import find_layers, fit_sidecar
 from hybrid.files.profile import COMMON, ROLES, Profile, find_profile, plain_name, read_profiles
 from hybrid.files.sequences import Pattern, find_files, format_frames, list_patterns, pattern_of
 
@@ -47,7 +47,7 @@ class SidecarSequence:
         ExrError
             If there is none, or several could be it.
         """
-        return replace(fit_alone(image, self.role, self.layer, profile), file=self.spec)
+        return replace(fit_sidecar(image, self.role, self.layer, profile), file=self.spec)
 
     def expect(self, numbers: Sequence[int]) -> None:
         """Raise FileNotFoundError unless all these frames are there."""
