@@ -100,7 +100,8 @@ class _Clock:
 def _clock_reading(shot: Shot) -> Iterator[_Clock]:
     """Count the time that `shot.read` takes, whoever calls it."""
     owner: Any = getattr(shot, "reader", shot)  # frames in memory have no reader
-    clock, read = _Clock(), owner.read
+    clock = _Clock()
+    read: Callable[[int], Frame] = owner.read
 
     def clocked(number: int) -> Frame:
         with clock:
