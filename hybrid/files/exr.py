@@ -1,10 +1,10 @@
 """Read and write OpenEXR files: pixels and headers. `hybrid.files.layers` says which channels are what.
 
-A file is read whole: its channels are compressed together, and taking 3 of 40 channels costs two thirds of
-the time of taking all. `read_exr(path, pixels=False)` reads the headers alone, which takes no time.
+A file is read whole: its channels are compressed together, and reading 3 of 40 channels costs two thirds of the time
+of reading all. `read_exr(path, pixels=False)` reads the headers alone, which takes no time.
 
-Channels go by *qualified* names: the name in the file, preceded in a multi-part file by the part's name
-unless the channel already starts with it, so that one scheme covers both kinds (``ViewLayer.Combined.R``).
+Channels have *qualified* names: the name in the file, preceded in a multi-part file by the part's name unless the
+channel already starts with it, so that one scheme covers both kinds (``ViewLayer.Combined.R``).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from hybrid.files.replace import refuse_other_kinds, replace_file
 from hybrid.files.strings import readable_copy, restore_strings, without_surrogates
 from hybrid.runtime.streams import open_standard_streams
 
-# 16384 × 16384: four times the area of the largest frames anybody renders (IMAX, LED walls), and small enough
-# that a hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
+# 16384 × 16384: four times the area of the largest frames that are rendered (IMAX, LED walls), and small enough that a
+# hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
 MAX_PIXELS = 2**28
 _MAX_SIDE = 2**16
 _MAX_TILE = 2**13
@@ -38,7 +38,7 @@ _MAX_TILE = 2**13
 _MAX_BYTES_PER_PIXEL = 64
 
 HALF_MAX = 65504.0
-# Compressions that change values whenever they are written; PXR24 changes those that it has written no further.
+# Compressions that change values each time they are written; PXR24 does not change values that it has written.
 _LOSSY = {"B44_COMPRESSION", "B44A_COMPRESSION", "DWAA_COMPRESSION", "DWAB_COMPRESSION", "LJ2K_COMPRESSION"}
 _MAGIC = b"\x76\x2f\x31\x01"
 
@@ -47,17 +47,13 @@ class ExrError(ValueError):
     """An OpenEXR file that cannot be used, or that lacks a layer. One line; names the file."""
 
 
-# --------------------------------------------------------------------------------------------------------
-# What is in a file
-
-
 @dataclass(frozen=True)
 class Layer:
     """Channels that belong together, all of one part.
 
-    `channels` are qualified names, in the order R G B A or X Y Z W, any others after those. `name` is what
-    they share (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file. `file` names the
-    sequence that it lies in where that is not the frame's own. Gray that is read as a color is one channel three times.
+    `channels` are qualified names, in the order R G B A or X Y Z W, any others after those. `name` is their common part
+    (``ViewLayer.Combined``); "" for the bare channels R, G, B, A, Z of a single-part file. `file` names the sidecar
+    sequence that holds the layer. Gray that is read as a color is one channel three times.
     """
 
     name: str
@@ -92,12 +88,9 @@ class Part:
         return self.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile)
 
     def would_lose(self, replaced: Collection[str]) -> str | None:
-        """The compression that would change channels when the part is written again; None where none does.
+        """Return the compression that would change kept channels when the part is written again, or None.
 
-        Parameters
-        ----------
-        replaced : collection of str
-            Channels that are replaced, by their names in the part; alpha is kept in some frames.
+        `replaced` names channels as in the part; alpha counts as kept, as it is in some frames.
         """
         compression = self.header["compression"].name
         # DWA and its like keep alpha exactly.
@@ -153,7 +146,7 @@ class ExrImage:
         return origin
 
     def _qualify(self, part: Part, name: str) -> str:
-        """The name of a channel in the whole file; the same for single-part and multi-part stereo."""
+        """The qualified name of a channel; the same for single-part and multi-part stereo."""
         if len(self.parts) == 1:
             return name
         # Part names are unique, so writers add the view to them: Blender "ViewLayer.Combined-left", with channels
@@ -167,17 +160,11 @@ class ExrImage:
         return ".".join([*layer, component])
 
     def own_name(self, channel: str) -> str:
-        """The name that a channel has in its part."""
+        """Return the name of a channel in its part."""
         return self._origin[channel][1]
 
     def recompressed(self, replaced: Collection[str]) -> dict[int, str]:
-        """The parts whose compression would change what is kept (`Part.would_lose`), and that compression.
-
-        Parameters
-        ----------
-        replaced : collection of str
-            Qualified names of the channels that are replaced.
-        """
+        """Return part index → compression of the parts that would lose kept channels (`Part.would_lose`)."""
         places = {self._origin[name] for name in replaced}
         lossy = {i: p.would_lose({own for at, own in places if at == i}) for i, p in enumerate(self.parts)}
         return {index: compression for index, compression in lossy.items() if compression is not None}
@@ -203,25 +190,13 @@ class ExrImage:
         return tuple(self._origin)
 
     def part_of(self, name: str) -> Part:
-        """The part that holds a channel.
-
-        Raises
-        ------
-        ExrError
-            If there is no such channel.
-        """
+        """Return the part that holds a channel; raise ExrError if there is none."""
         if name not in self._origin:
             raise ExrError(f"{self.path}: no channel {name!r}; {self.listing()}")
         return self.parts[self._origin[name][0]]
 
     def channel(self, name: str) -> np.ndarray:
-        """Pixels of a channel: (H, W) float16, float32 or uint32, as in the file; not a copy.
-
-        Raises
-        ------
-        ExrError
-            If there is no such channel.
-        """
+        """Return the pixels of a channel: (H, W) float16, float32 or uint32, as in the file; not a copy."""
         part = self.part_of(name)
         pixels: np.ndarray | None = part.channels[self._origin[name][1]].pixels
         if pixels is None or pixels.shape != part.shape:
@@ -229,13 +204,7 @@ class ExrImage:
         return pixels
 
     def pixels(self, channels: tuple[str, ...]) -> np.ndarray:
-        """Several channels of one part, stacked: (H, W, C) float32.
-
-        Raises
-        ------
-        ExrError
-            If a channel is not there.
-        """
+        """Return several channels of one part, stacked: (H, W, C) float32."""
         planes = [self.channel(name) for name in channels]
         out = np.empty((*planes[0].shape, len(planes)), np.float32)
         for index, plane in enumerate(planes):
@@ -243,11 +212,11 @@ class ExrImage:
         return out
 
     def layer(self, name: str) -> Layer:
-        """The layer with this name, or the one channel with it as a layer of one.
+        """Return the layer with this name, or a channel as a layer of its own.
 
         Tried in this order: the name of a layer, or ``RGBA`` or ``RGB`` for the bare channels; the name of a layer
         without its view; the name of a channel; a layer with its channels (``ViewLayer.Combined.RGBA``, as listed);
-        the name of a part; all these whatever the case; the end of a layer's name (``DiffDir`` for
+        the name of a part; all of these in any case; the end of a layer's name (``DiffDir`` for
         ``ViewLayer.DiffDir``). The default stereo view goes before the others.
 
         Raises
@@ -267,7 +236,7 @@ class ExrImage:
 
     @cached_property
     def _known_names(self) -> list[list[tuple[str, Layer]]]:
-        """Names and the layers they stand for; what stands first goes first."""
+        """Lists of (name, layer), in the order in which `layer` tries them."""
         layers = self.layers
         bare = [(alias, layer) for layer in layers if not layer.name for alias in ("RGBA", "RGB")]
         return [
@@ -279,7 +248,7 @@ class ExrImage:
         ]
 
     def _only(self, name: str, found: list[Layer]) -> Layer:
-        """The one layer that a name stands for, of the default view if there are several."""
+        """The only layer that a name fits, of the default view if there are several."""
         if len(found) > 1:
             found = [layer for layer in found if layer.view in (None, *self.views[:1])] or found
         if len(found) > 1:
@@ -287,19 +256,13 @@ class ExrImage:
         return found[0]
 
     def again(self, layer: Layer) -> Layer:
-        """The same layer as in another file of a shot.
-
-        Raises
-        ------
-        ExrError
-            If a channel of it is not there.
-        """
+        """Return a layer of another file of the shot as it is in this file; raise ExrError if a channel is missing."""
         for channel in layer.channels:
             self.part_of(channel)
         return replace(layer, part=self._origin[layer.channels[0]][0])
 
     def listing(self) -> str:
-        """What is in the file, for an error message; shortened if there is much of it."""
+        """Return the names of the layers for an error message, at most 24."""
         names = [str(layer) for layer in self.layers]
         more = f" and {len(names) - 24} more" if len(names) > 24 else ""
         return f"it has {', '.join(names[:24])}{more}"
@@ -319,15 +282,11 @@ def component_of(channel: str) -> str:
 
 
 def without_view(layer: Layer) -> str:
-    """The layer's name less the name of its view (``ViewLayer.Combined.left`` → ``ViewLayer.Combined``)."""
+    """Return the layer's name without its view (``ViewLayer.Combined.left`` → ``ViewLayer.Combined``)."""
     tokens = layer.name.split(".")
     if layer.view in tokens:
         tokens.remove(layer.view)
     return ".".join(tokens)
-
-
-# --------------------------------------------------------------------------------------------------------
-# Reading
 
 
 def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIXELS) -> ExrImage:
@@ -336,9 +295,8 @@ def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIX
     Parameters
     ----------
     path : str or Path
-        The file.
     pixels : bool
-        False reads the headers only; the channels' names are there, their pixels are not.
+        False reads the headers only.
     max_pixels : int
         The largest data window accepted. Memory is bounded by 64 bytes for each of these pixels.
 
@@ -374,7 +332,7 @@ def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
         except Exception as error:  # the binding raises RuntimeError, UnicodeDecodeError, MemoryError, …
             reason = str(error).replace(f" '{path}'", "").removesuffix(" when attempting to open for read")
             messages.append(reason.replace("\n", " "))
-    # A part whose pixels cannot be read is left out by the binding, with a message and no exception.
+    # The binding leaves out a part whose pixels cannot be read, with a message and no exception.
     if messages or not parts:
         reason = messages[0] if messages else "no parts"
         raise ExrError(f"{path}: damaged or truncated OpenEXR file ({reason})")
@@ -382,7 +340,7 @@ def _open(path: Path, *, header_only: bool) -> tuple[Part, ...]:
 
 
 def _load(path: Path, strings: Mapping[tuple[int, str], str], *, header_only: bool) -> tuple[Part, ...]:
-    """The parts of a file, with some strings of their headers, by part and name, in place of those in the file."""
+    """The parts of a file; `strings`, by part and name, replace strings of their headers."""
     file = OpenEXR.File(_for_library(path), separate_channels=True, header_only=header_only)
     parts = []
     for index, part in enumerate(file.parts):
@@ -394,13 +352,13 @@ def _load(path: Path, strings: Mapping[tuple[int, str], str], *, header_only: bo
 
 
 def _for_library(path: Path) -> str | bytes:
-    """A path as the library takes it: as bytes where these are not UTF-8, of which it takes no string."""
+    """A path for the library: bytes if it is not UTF-8, which the library refuses as a string."""
     name = str(path)
     return name if without_surrogates(name) == name else os.fsencode(name)
 
 
 def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> None:
-    """Raise ExrError for what is well-formed and cannot be denoised, before memory is taken for it."""
+    """Raise ExrError for a well-formed file that cannot be denoised, before memory is allocated for it."""
     total = 0
     if parts and all(part.deep for part in parts):
         raise ExrError(f"{path}: deep image, expected a flat one, or one with a flat part")
@@ -422,7 +380,7 @@ def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> No
 
 
 class _Listener:
-    """Stands in for sys.stdout and keeps what one thread writes; all else goes where it would have gone."""
+    """Replaces sys.stdout and records the output of one thread; other threads write to the stream as before."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream or io.StringIO()  # None where the process was started without one
@@ -440,21 +398,19 @@ class _Listener:
 
 
 _LIBRARY_LOCK = threading.Lock()
-_own_stderr: int | None = None  # where descriptor 2 led, while it is listened to
+_own_stderr: int | None = None  # the process's stderr while descriptor 2 is captured
 
 
 @contextmanager
 def hold_library(seconds: float) -> Iterator[None]:
-    """Let nothing be read or written within, once what is under way has ended: descriptor 2 is the process's own.
+    """Block reading and writing of files, so that descriptor 2 is the process's own stderr.
 
-    Parameters
-    ----------
-    seconds : float
-        How long to wait for that. What takes longer is listened to no more: the process is about to end.
+    Waits up to `seconds` for a call that is running; after that its messages are no longer captured, as the process is
+    about to end.
     """
     held = _LIBRARY_LOCK.acquire(timeout=seconds)
     if not held and _own_stderr is not None:
-        with suppress(OSError):  # it has ended meanwhile, and has put descriptor 2 back itself
+        with suppress(OSError):  # the call has ended meanwhile, and has restored descriptor 2 itself
             os.dup2(_own_stderr, 2)
     try:
         yield
@@ -465,10 +421,10 @@ def hold_library(seconds: float) -> Iterator[None]:
 
 @contextmanager
 def _library_messages() -> Iterator[list[str]]:
-    """Gather what OpenEXR says about a damaged file, which it prints instead of raising.
+    """Capture OpenEXR's messages about a damaged file, which it prints instead of raising.
 
-    The C library prints to file descriptor 2 and the binding to sys.stdout. What others write to descriptor
-    2 meanwhile (decoding releases the GIL) is passed on afterwards. The list is filled on leaving.
+    The C library prints to file descriptor 2 and the binding to sys.stdout. Output of other threads to descriptor 2
+    (decoding releases the GIL) is passed on afterwards. The list is filled on leaving.
     """
     global _own_stderr
     messages: list[str] = []
@@ -492,7 +448,7 @@ def _library_messages() -> Iterator[list[str]]:
                 if b"(EXR_ERR" not in line:
                     with suppress(OSError):  # its reader has gone
                         os.write(2, line)
-            # The first line of the C library says most precisely what is wrong.
+            # The first line of the C library is the most precise.
             reasons = [
                 line.decode(errors="replace").partition("(EXR_ERR")[2].partition(") ")[2].strip()
                 for line in printed
@@ -500,10 +456,6 @@ def _library_messages() -> Iterator[list[str]]:
             ]
             reasons += [line.rpartition(" - ")[2] for line in listener.heard.splitlines()]
             messages[:0] = reasons
-
-
-# --------------------------------------------------------------------------------------------------------
-# Writing
 
 
 def write_exr(
@@ -518,30 +470,29 @@ def write_exr(
     Parameters
     ----------
     path : str or Path
-        The file to write; may be the source itself. Nothing is there before all of it is.
+        May be the source itself. The file appears when all of it is written.
     source : ExrImage
-        What to write, from `read_exr`.
+        With pixels.
     replaced : mapping of str to array
-        Qualified channel name → (H, W), of the size of its part's data window. Converted to the pixel type
-        the channel has in the source.
+        Qualified channel name → (H, W), of the size of its part's data window. Converted to the source's pixel type.
     extra : mapping of str to array, optional
         Layers to add: name → (H, W) or (H, W, C), of the size of some part's data window; float16, float32 or
-        uint32, written as such.
+        uint32, stored as such.
     attributes : mapping of str to str, optional
         Strings to add to the header of the first part.
 
     Returns
     -------
     int
-        How many finite values were too large for a half channel, and were written as ±65504, not as Inf.
+        How many finite values were too large for a half channel, and were written as ±65504 instead of Inf.
 
     Raises
     ------
     ExrError
         If the source has no such channel.
     ValueError
-        If an array has the wrong shape, a layer to be added is there already, or an attribute would change one that
-        is not a string.
+        If an array has the wrong shape, an added layer exists already, or an attribute would replace one that is not
+        a string.
     OSError
         If the file cannot be written; no partial file is left.
 
@@ -593,7 +544,7 @@ def write_exr(
     return clamped
 
 
-# What a part that is added to a multi-part file takes from the one it lies over.
+# Attributes that an added part copies from the part of the same size.
 _SHARED = (
     "compression",
     "dataWindow",
@@ -608,9 +559,9 @@ _SHARED = (
 
 
 def _writable(header: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes without the channel list, which the binding makes from the channels.
+    """The attributes without the channel list, which the binding makes from the channels, and without empty lists.
 
-    An empty list is left out too: the binding cannot tell of what, refuses it, and it says nothing.
+    The binding refuses an empty list, as it does not know the type of its items.
     """
     return {k: v for k, v in header.items() if k != "channels" and not (isinstance(v, list) and not v)}
 
@@ -637,10 +588,10 @@ def _named(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _convert(values: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, int]:
-    """`values` as contiguous pixels of this type, and how many finite ones were beyond its range."""
+    """Return `values` as contiguous pixels of this type, and how many finite values exceeded its range."""
     clamped = 0
     if kind == np.float16 and values.dtype != np.float16:
-        # 65520 and above round to Inf. What is Inf or NaN already stays so: it was not made here.
+        # 65520 and above round to Inf. Values that are Inf or NaN already stay.
         beyond = (np.abs(values) > HALF_MAX) & np.isfinite(values)
         clamped = int(np.count_nonzero(beyond))
         if clamped:
@@ -652,7 +603,7 @@ def _convert(values: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, int]:
 
 
 def _write(path: Path, parts: list[OpenEXR.Part]) -> None:
-    """Write parts so that `path` is never a part of a file."""
+    """Write parts to a temporary file, then rename it to `path`."""
     odd = []
     for part in parts:
         texts = {name: value for name, value in part.header.items() if isinstance(value, str)}

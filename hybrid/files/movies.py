@@ -1,4 +1,4 @@
-"""Movies and loops to look at: MP4 by PyAV, animated WebP by Pillow."""
+"""Movies: MP4 by PyAV, animated WebP by Pillow."""
 
 from __future__ import annotations
 
@@ -22,15 +22,7 @@ LARGEST = {".mp4": 1920, ".webp": 960}
 
 
 def check_movie(path: Path) -> None:
-    """Refuse what `write_movie` could not write, before any work is done.
-
-    Raises
-    ------
-    ValueError
-        If the name does not end in .mp4 or .webp.
-    ImportError
-        If it needs PyAV, and that is not installed.
-    """
+    """Raise ValueError for a name that does not end in .mp4 or .webp, ImportError if PyAV is needed and missing."""
     if path.suffix.lower() not in LARGEST:
         raise ValueError(f"{path} is no movie, expected a name that ends in {' or '.join(LARGEST)}")
     if path.suffix.lower() == ".mp4" and importlib.util.find_spec("av") is None:
@@ -38,21 +30,16 @@ def check_movie(path: Path) -> None:
 
 
 def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
-    """Write a movie, as a whole or not at all, and make the folder.
+    """Write a movie, and make its folder. Errors are those of `check_movie`.
 
     Parameters
     ----------
     path : Path
-        Ends in .mp4 (H.264, for any player and browser) or .webp (plays for ever in a page).
+        Ends in .mp4 (H.264, for any player and browser) or .webp (loops in a page).
     pictures : iterable of (H, W, 3) uint8 arrays
-        sRGB encoded, all of one size, at least one. Larger ones than `LARGEST` are made smaller.
+        sRGB encoded, all of one size, at least one. Sizes above `LARGEST` are reduced.
     rate : float
         Pictures per second.
-
-    Raises
-    ------
-    ValueError, ImportError
-        As `check_movie`.
     """
     check_movie(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -79,7 +66,7 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
     from av.video.reformatter import ColorRange, Colorspace
 
     first = next(pictures)
-    # H.264 with color at half resolution, which is what all players know, holds even sizes only.
+    # H.264 with chroma at half resolution, the format that all players decode, needs even sizes.
     height, width = (side + side % 2 for side in first.shape[:2])
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
@@ -103,7 +90,7 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
 
 def _write_webp(path: Path, pictures: Iterator[Picture], rate: float) -> None:
     first, *later = (Image.fromarray(picture) for picture in pictures)
-    # Whole milliseconds each, which add up to the true time.
+    # Durations in whole milliseconds that add up to the exact time.
     ends = np.round(np.arange(len(later) + 2) * 1000 / rate).astype(int)
     first.save(
         path,

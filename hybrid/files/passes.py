@@ -1,4 +1,4 @@
-"""What the further layers of a shot are to its picture: parts that add up to it, light of their own, or no light."""
+"""How AOVs relate to the beauty: parts that add up to it, light of their own, or no light."""
 
 from __future__ import annotations
 
@@ -12,23 +12,13 @@ from nlm.parts import above, may_differ, sums_to
 
 Array = NDArray[np.float32]
 
-# The picture's own name among those of its layers.
+# Stands for the beauty among the names of AOVs.
 BEAUTY = ""
 
 
 @dataclass(frozen=True)
 class Sum:
-    """Layers that add up to the picture, or to one of its layers.
-
-    Attributes
-    ----------
-    whole : str
-        `BEAUTY`, or the name of a layer.
-    parts : tuple of str
-        Names of layers.
-    complete : bool
-        False where there is further light, which is in no layer.
-    """
+    """AOVs `parts` that add up to `whole`: `BEAUTY` or an AOV; not `complete` if some light is in no AOV."""
 
     whole: str
     parts: tuple[str, ...]
@@ -37,18 +27,18 @@ class Sum:
 
 @dataclass(frozen=True)
 class Passes:
-    """What is known of the further layers of a shot.
+    """How the AOVs of a shot relate to its beauty.
 
     Attributes
     ----------
     sums : tuple of Sum
-        No layer is a part twice; a sum that is a layer comes after those that this layer is a part of.
+        No AOV is a part twice; the sum that makes an AOV comes after those that this AOV is a part of.
     textured : tuple of str
-        Layers that were multiplied by the surfaces' color.
+        AOVs that were multiplied by the surfaces' albedo.
     kept : tuple of str
-        Layers without noise, which are not denoised.
+        AOVs without noise, which are not denoised.
     light : float
-        Mean of all layers of light together, as a share of the picture's.
+        Mean of all AOVs of light together, as a share of the beauty's.
     """
 
     sums: tuple[Sum, ...] = ()
@@ -57,16 +47,10 @@ class Passes:
     light: float = 0.0
 
     def in_frame(self, color: Array, lights: Mapping[str, Array], exposure: float) -> Passes:
-        """The same, without the sums that are none in a frame, whose parts are then denoised by themselves.
+        """Return the passes without the sums that do not hold in a frame: their parts are denoised by themselves.
 
-        Parameters
-        ----------
-        color : (H, W, 3) array
-            As rendered, finite.
-        lights : mapping of str to (H, W, 3) array
-            Layers, multiplied by their color where they are written without.
-        exposure : float
-            Radiance of middle brightness.
+        `color` (H, W, 3) is the noisy beauty, finite; `lights` are AOVs times their pass colors; `exposure` is the
+        radiance of middle brightness.
         """
         return replace(self, sums=tuple(self._holding(color, lights, exposure)))
 

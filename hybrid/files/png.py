@@ -1,4 +1,4 @@
-"""PNG pictures to look at."""
+"""PNG files, and the sRGB encoding of their pixels."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def encode_srgb(linear: NDArray[Any]) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-# From 16 bits to 8; near black, where they are longest, its steps are a twentieth of one of 8 bits.
+# From 16 bits to 8; near black a step of 16 linear bits is a twentieth of a step of 8 sRGB bits.
 _CODES = np.round(encode_srgb(np.arange(2**16) / (2**16 - 1)) * 255).astype(np.uint8)
 
 
 def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
-    """Clip finite values to [0, 1] and encode them as sRGB of 8 bits, in half the time; any shape."""
+    """Clip finite values to [0, 1] and encode them as sRGB of 8 bits, in half the time of `encode_srgb`; any shape."""
     scaled = np.clip(linear, 0, 1, dtype=np.float32)
     scaled *= np.float32(2**16 - 1)
     scaled += np.float32(0.5)
@@ -33,12 +33,11 @@ def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, picture: NDArray[Any]) -> None:
-    """Write a picture with 8 bits, whole or not at all.
+    """Write a picture with 8 bits, and make its folder.
 
     Parameters
     ----------
     path : Path
-        Of the file. Its folder is made.
     picture : (H, W, 3) array
         Encoded, in [0, 1].
     """

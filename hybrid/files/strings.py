@@ -1,8 +1,8 @@
 """Strings in the headers of OpenEXR files, kept to the byte whatever their encoding.
 
-Studios write Latin-1 and Shift-JIS; the library's binding reads and writes UTF-8 alone. So it is shown a copy in which
-each byte that is not UTF-8 is a question mark, of the same length, and the bytes themselves are kept as Python keeps
-such names of files: as lone surrogates (PEP 383).
+Studios write Latin-1 and Shift-JIS; the library's binding reads and writes UTF-8 alone. The binding reads a copy in
+which each byte that is not UTF-8 is a question mark; the bytes themselves are kept as lone surrogates (PEP 383), as
+Python keeps such names of files.
 """
 
 from __future__ import annotations
@@ -13,29 +13,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-# Of the version field: several parts, each with a header, and one more that is empty.
+# Bit of the version field: several parts, each with a header, and one more that is empty.
 _MULTI_PART = 0x1000
-# Headers and tables of offsets are within so many bytes; of what is behind them a reader of headers sees nothing.
+# Headers and tables of offsets lie within so many bytes; reading headers needs nothing behind them.
 _HEADERS = 2**24
 
 
 def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
-    """Find the attributes that are strings.
+    """Yield part, name and byte range of each string attribute in a file or its beginning.
 
-    Parameters
-    ----------
-    data : bytes
-        A file, or the beginning of one. What ends in the midst, or makes no sense, ends the search.
-
-    Yields
-    ------
-    (int, str, slice)
-        The part, the attribute's name, and where its bytes are.
+    The search ends where the data is truncated or malformed.
     """
     several = bool(int.from_bytes(data[4:8], "little") & _MULTI_PART)
     part, at = 0, 8
     while at < len(data):
-        if data[at] == 0:  # the end of a header, and of all where there is nothing before it
+        if data[at] == 0:  # the end of a header; an empty header ends the last part
             part, at = part + 1, at + 1
             if not several or data[at : at + 1] in (b"\0", b""):
                 return
@@ -55,19 +47,13 @@ def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
 
 @contextmanager
 def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict[tuple[int, str], str]]]:
-    """Give a copy of a file whose strings are UTF-8, and those that are not in the file itself.
+    """Yield a copy of a file whose strings are UTF-8, and (part, name) → original string of the changed ones.
 
     Parameters
     ----------
     path : Path
-        The file.
     header_only : bool
-        Nothing behind the headers has to be there.
-
-    Yields
-    ------
-    (Path, dict of (int, str) to str)
-        The copy, which goes when the block ends; part and name of an attribute → its string.
+        The copy need not have anything behind the headers.
     """
     with path.open("rb") as file:
         data = bytearray(file.read(_HEADERS if header_only else -1))
@@ -77,7 +63,7 @@ def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict
         if (plain := without_surrogates(text)) != text:
             strings[part, name] = text
             data[where] = plain.encode()
-    # A folder, for Windows opens no temporary file a second time by its name.
+    # In a folder: Windows opens no temporary file a second time by its name.
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy.exr"
         copy.write_bytes(data)
@@ -91,9 +77,8 @@ def restore_strings(path: Path, headers: Sequence[dict[str, str]]) -> None:
     Parameters
     ----------
     path : Path
-        The file.
     headers : sequence of dict of str to str
-        For each part the strings to put there, by name.
+        Name → string, for each part.
     """
     with path.open("r+b") as file:
         for part, name, where in find_strings(file.read(_HEADERS)):
@@ -103,5 +88,5 @@ def restore_strings(path: Path, headers: Sequence[dict[str, str]]) -> None:
 
 
 def without_surrogates(text: str) -> str:
-    """A string of the same length in bytes, with a question mark for each byte that is not UTF-8."""
+    """Replace each byte that is not UTF-8 by a question mark; the length in bytes stays."""
     return "".join("?" if "\udc80" <= sign <= "\udcff" else sign for sign in text)
