@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from flow.warp import interpolate, locate, weigh
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
@@ -80,7 +80,7 @@ def estimate_confidence(
         absent if layer is None else np.ascontiguousarray(layer, np.float32).reshape(*layer.shape[:2], -1)
         for layer in (flow, reverse, albedo, warped_albedo, normal, warped_normal)
     ]
-    on_all_cores(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
+    run_bands(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
 
 
@@ -169,7 +169,7 @@ def mix_centre(
     planes = (*centre.shape[:2], -1)
     warped, centre, confidence = (np.asarray(layer, np.float32) for layer in (warped, centre, confidence))
     layers = warped.reshape(planes), centre.reshape(planes), confidence, mixed.reshape(planes)
-    on_all_cores(_mix, len(centre), *layers)
+    run_bands(_mix, len(centre), *layers)
     return mixed
 
 

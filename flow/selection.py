@@ -10,7 +10,7 @@ from numba import njit
 
 from flow.guide import GuidePair
 from flow.warp import interpolate, locate, weigh
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 # Share of the incumbent's error by which another flow must be better.
 _MARGIN = 0.15
@@ -72,7 +72,7 @@ def select_flow(
         error = np.empty(shape, np.float32)
         vectors = np.ascontiguousarray(candidate, np.float32)
         layers = guides.centre, guides.neighbour, scale, vectors, error, evidence
-        on_all_cores(_photometric_error, shape[0], *layers)
+        run_bands(_photometric_error, shape[0], *layers)
         errors.append(error)
     errors = [error * evidence for error in errors]
     incumbent = _find_incumbent([_box_mean(error, _WIDE_BOX) for error in errors], chance)

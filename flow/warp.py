@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 Four = tuple[Any, Any, Any, Any]
 
@@ -257,7 +257,7 @@ def warp(
     warped = result.reshape(*shape, source.shape[2])
     inside = np.empty(shape, np.bool_)
     vectors = np.ascontiguousarray(flow, np.float32)
-    on_all_cores(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
+    run_bands(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
     return result, inside
 
 

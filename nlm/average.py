@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -41,7 +41,7 @@ def average(window: Floats, weight: Floats) -> Floats:
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
-    on_all_cores(_average, len(out), window, weight, out)
+    run_bands(_average, len(out), window, weight, out)
     return out
 
 
@@ -85,7 +85,7 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
-    on_all_cores(_robust_average, len(out), window, weight, out)
+    run_bands(_robust_average, len(out), window, weight, out)
     return out
 
 
@@ -131,8 +131,8 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     """
     window, weight = check_window(window, weight)
     cleaned, mask, level = window.copy(), np.zeros(weight.shape, np.bool_), np.empty(weight.shape, np.float32)
-    on_all_cores(_channel_mean, window.shape[1], window, level)
-    on_all_cores(_reject_outliers, window.shape[1], window, weight, level, cleaned, mask)
+    run_bands(_channel_mean, window.shape[1], window, level)
+    run_bands(_reject_outliers, window.shape[1], window, weight, level, cleaned, mask)
     return cleaned, mask
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import check_window
 from nlm.variance import gaussian_mean
 
@@ -76,7 +76,7 @@ def drift_weights(
     rows, columns = -(-(above + height) // _CELL), -(-width // _CELL)
     sums = np.zeros((5, rows, columns), np.float32)
     given = estimates, np.ascontiguousarray(noisy, np.float32), confidence, np.float32(exposure), above
-    on_all_cores(_hold_out, rows, *given, sums)
+    run_bands(_hold_out, rows, *given, sums)
     worse, lags, squares, trusted, apart = sums
     worse, lags, trusted, apart = (gaussian_mean(part, _SIGMA) for part in (worse, lags, trusted, apart))
     # The squares of a Gaussian's weights are those of one narrower by √2, over 4πσ².
@@ -111,7 +111,7 @@ def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats) -> Non
     e_s becomes e_t + m_s (e_s − e_t), m_s = w_s Σ c / Σ c w. Near frames may move away from the centre by it, by a
     third at most in windows of seven: what is sought is the average.
     """
-    on_all_cores(_pull, estimates.shape[1], estimates, confidence, weight)
+    run_bands(_pull, estimates.shape[1], estimates, confidence, weight)
 
 
 def _ratio(a: Floats, b: Floats) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -98,7 +98,7 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
     estimates, noisy = (np.ascontiguousarray(images, np.float32) for images in (estimates, noisy))
     centre, difference = estimates[centre_index], np.empty(shape, np.float32)
     both = np.empty(shape[:2], np.bool_)
-    on_all_cores(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
+    run_bands(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
     noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
     rates = [1 / np.square(np.float32(share) * noise + np.float32(_FLOOR)) for share in shares]
@@ -106,11 +106,11 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
     for t, estimate in enumerate(estimates):
         if t == centre_index:
             continue
-        on_all_cores(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
+        run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
         around = cv2.blur(mean, _AROUND_SIZE)
         for rate, weight in zip(rates, weights, strict=True):
-            on_all_cores(_weigh, shape[0], mean, around, rate, both, weight[t])
+            run_bands(_weigh, shape[0], mean, around, rate, both, weight[t])
     return weights
 
 
@@ -136,7 +136,7 @@ def _compare(
 
 def _mean_square(x: Floats) -> Floats:
     mean = np.empty(x.shape[:2], np.float32)
-    on_all_cores(_square, len(x), x, mean)
+    run_bands(_square, len(x), x, mean)
     return mean
 
 

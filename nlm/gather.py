@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import check_window
 
 Floats = NDArray[np.float32]
@@ -83,7 +83,7 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
     average, image = np.empty(estimates.shape[1:], np.float32), np.empty(estimates.shape[1:], np.float32)
     samples = np.empty(estimates.shape[1:3], np.float32)
     given = estimates, residuals, confidence, np.float32(exposure)
-    on_all_cores(_gather, len(samples), *given, average, image, samples)
+    run_bands(_gather, len(samples), *given, average, image, samples)
     return Gathered(average, image, samples)
 
 
@@ -104,7 +104,7 @@ def hold_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Flo
         of any frame have within 3×3 pixels. Values that are not finite do not count.
     """
     low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
-    on_all_cores(_range, len(picture), estimates, residuals, low, high)
+    run_bands(_range, len(picture), estimates, residuals, low, high)
     box = np.ones((3, 3), np.uint8)
     return np.clip(picture, cv2.erode(low, box).reshape(low.shape), cv2.dilate(high, box).reshape(low.shape))
 

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import replace_nonfinite
 
 Floats = NDArray[np.float32]
@@ -95,10 +95,10 @@ def guided_filter(
     size, channels, planes = small_guide.shape[:2], image.shape[2], guide.shape[2]
     strips = -(-size[0] // _STRIP)
     boxes, coefficients = (np.empty((*size, channels * planes + channels + 1), np.float32) for _ in range(2))
-    on_all_cores(_solve, strips, small_image, small_guide, small_trust, small_radius, float(eps), boxes)
-    on_all_cores(_box_sum, strips, boxes, small_radius, coefficients)
+    run_bands(_solve, strips, small_image, small_guide, small_trust, small_radius, float(eps), boxes)
+    run_bands(_box_sum, strips, boxes, small_radius, coefficients)
     output = np.empty(image.shape, np.float32)
-    on_all_cores(_apply, len(output), coefficients, guide, image, subsample, output)
+    run_bands(_apply, len(output), coefficients, guide, image, subsample, output)
     box = np.ones((4 * radius + 1, 4 * radius + 1), np.uint8)
     low, high = (np.asarray(fold(image, box)).reshape(image.shape) for fold in (cv2.erode, cv2.dilate))
     return np.asarray(np.clip(output, low, high), np.float32)
@@ -119,7 +119,7 @@ def measure_guide(guide: Floats) -> Doubles:
     """
     pixels = guide.shape[0] * guide.shape[1]
     rows = np.zeros((guide.shape[0], 2, guide.shape[2]))
-    on_all_cores(_row_moments, len(rows), np.ascontiguousarray(guide, np.float32), rows)
+    run_bands(_row_moments, len(rows), np.ascontiguousarray(guide, np.float32), rows)
     first, second = rows.sum(axis=0) / pixels
     return np.stack([first, np.sqrt(np.maximum(second - first * first, 0))])
 
@@ -131,7 +131,7 @@ def _standardise(guide: Floats, moments: Doubles) -> Floats:
     constant = deviation <= 1e-6 * np.abs(mean)
     scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))
     out = np.empty(guide.shape, np.float32)
-    on_all_cores(_scale, len(out), guide, mean.astype(np.float32), scale.astype(np.float32), out)
+    run_bands(_scale, len(out), guide, mean.astype(np.float32), scale.astype(np.float32), out)
     return out
 
 
@@ -139,7 +139,7 @@ def _shrink(image: Floats, step: int) -> Floats:
     """Mean of each step × step block, of what there is of it at the lower and right edge."""
     height, width, channels = image.shape
     out = np.zeros((-(-height // step), -(-width // step), channels), np.float32)
-    on_all_cores(_mean_blocks, len(out), image, step, out)
+    run_bands(_mean_blocks, len(out), image, step, out)
     return out
 
 

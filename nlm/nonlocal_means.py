@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -125,7 +125,7 @@ def joint_nlm(
     out = np.empty(window.shape[1:], np.float32)
     tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
     given = window, variance, features, confidence, where, radius, patch_radius, np.float32(k)
-    on_all_cores(_filter, tiles, *given, out)
+    run_bands(_filter, tiles, *given, out)
     return out
 
 

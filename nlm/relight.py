@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import check_window
 from nlm.variance import gaussian_mean
 
@@ -63,12 +63,12 @@ def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, 
             continue
         sums = np.zeros((channels + 1, rows, columns), np.float32)
         pair = window[t], window[frames // 2], trusted[t], np.float32(exposure)
-        on_all_cores(_sum_cells, rows, *pair, above, sums)
+        run_bands(_sum_cells, rows, *pair, above, sums)
         means = [gaussian_mean(part, _SIGMA) for part in sums]
         change = np.stack([_ratio(part, means[-1]) for part in means[:-1]], axis=-1)
         whole = (columns * _CELL, rows * _CELL)
         change = np.asarray(cv2.resize(change, whole, interpolation=cv2.INTER_LINEAR), np.float32)
-        on_all_cores(_take, height, *pair, alike[t], change[above : above + height, :width])
+        run_bands(_take, height, *pair, alike[t], change[above : above + height, :width])
 
 
 def _ratio(a: Floats, b: Floats) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import check_window
 from nlm.variance import gaussian_mean
 
@@ -105,7 +105,7 @@ def average_sides(
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
     mean, frames = np.zeros(estimates.shape[1:], np.float32), np.zeros(weight.shape[1:], np.float32)
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
-    on_all_cores(_average, len(mean), *given, residuals is not None, weight, modulation, mean, frames)
+    run_bands(_average, len(mean), *given, residuals is not None, weight, modulation, mean, frames)
     middle = len(weight) // 2
     trust = np.minimum(np.maximum(confidence, geometry).sum(axis=0) - np.maximum(confidence, geometry)[middle], 1)
     return SampleMean(mean, frames, np.where(frames > 0, trust, 0))
@@ -162,7 +162,7 @@ def blend_samples(
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
     mean = sides.mean * _relative_light(noisy, sides, rate)[..., None]
     sums = np.zeros((4, *light.shape), np.float32)
-    on_all_cores(_compare, len(light), picture, noisy, mean, sides.frames, sides.trust, rate, sums)
+    run_bands(_compare, len(light), picture, noisy, mean, sides.frames, sides.trust, rate, sums)
     together, squares, products, temporal = sums
     # Over as many pixels as a Gaussian averages, 1 / Σ weight².
     noise = gaussian_mean(products, _SIGMA_SHARED) / np.float32(4 * np.pi * _SIGMA_SHARED**2)

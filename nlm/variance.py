@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from nlm.average import check_window
 from nlm.nonlocal_means import joint_nlm
 
@@ -87,7 +87,7 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
 def _temporal_variance(window: Floats, confidence: Floats) -> tuple[Floats, Floats]:
     """The variance that side frames tell, and in [0, 1] whether two of those are trusted."""
     deviation, trust = np.zeros(window.shape[1:], np.float32), np.zeros(window.shape[1:3], np.float32)
-    on_all_cores(_centre_deviation, len(trust), window, confidence, deviation, trust)
+    run_bands(_centre_deviation, len(trust), window, confidence, deviation, trust)
     return smooth_variance(deviation), trust
 
 

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 
 _VALUES = 512  # at a time, about: those of all frames fit the fastest cache
 _WRITTEN_OUT = (3, 5, 7)  # frames of windows for which the average is
@@ -68,7 +68,7 @@ def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor,
     result = given.new_empty(len(kept) * batch, height, width, channels)
     rows = [_bits(values).reshape(-1, batch * height, width * channels) for values in (given, result)]
     share = np.tile(weight.detach().float().numpy(), max(_VALUES // channels, 1))
-    on_all_cores(_blend, batch * height, *rows, np.asarray(order), np.asarray(kept), share)
+    run_bands(_blend, batch * height, *rows, np.asarray(order), np.asarray(kept), share)
     return result.permute(0, 3, 1, 2)
 
 
@@ -98,7 +98,7 @@ def convolve_to_picture(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     result = torch.empty(count, height, width, 3)
     taps = weight.detach().contiguous().numpy()
     for features, picture in zip(_bits(given).reshape(count, height, -1), result.numpy(), strict=True):
-        on_all_cores(_convolve_to_picture, height, features, taps, bias.detach().numpy(), picture)
+        run_bands(_convolve_to_picture, height, features, taps, bias.detach().numpy(), picture)
     return result.permute(0, 3, 1, 2)
 
 

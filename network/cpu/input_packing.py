@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from loops.cores import on_all_cores
+from loops.parallel import run_bands
 from network import unet as trunk
 
 #: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
@@ -85,7 +85,7 @@ def entering(
         alike, still, average = (np.empty((batch, *size, channels), np.float32) for channels in (ALIKE, 9, 3))
         for n in range(batch):
             given = *(layer[n] for layer in layers), exposure[n], gain[n], rows, columns
-            on_all_cores(_enter, size[0], n, *given, frames, alike, still, average, _curve())
+            run_bands(_enter, size[0], n, *given, frames, alike, still, average, _curve())
         own = frames.reshape(count * batch, *size, OWN)
         return _planes(own), _planes(alike), _planes(still), _planes(average)
 

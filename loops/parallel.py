@@ -16,7 +16,7 @@ from itertools import pairwise
 from numba import get_num_threads
 
 
-def on_all_cores(loop: Callable[..., None], count: int, *arguments: object) -> None:
+def run_bands(loop: Callable[..., None], count: int, *arguments: object) -> None:
     """Run a loop over `count` steps, most often rows, on as many threads as numba may use.
 
     Parameters

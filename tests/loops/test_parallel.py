@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-import loops.cores
-from loops.cores import on_all_cores
+import loops.parallel
+from loops.parallel import run_bands
 
 
 @njit(nogil=True)
@@ -20,27 +20,27 @@ def _mark(first: int, last: int, seen: np.ndarray, step: int) -> None:
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_each_step_runs_once(monkeypatch, threads, count):
-    monkeypatch.setattr(loops.cores, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(loops.parallel, "get_num_threads", lambda: threads)
     seen = np.zeros(count, np.int64)
-    on_all_cores(_mark, count, seen, 3)
+    run_bands(_mark, count, seen, 3)
     np.testing.assert_array_equal(seen, 3 * np.arange(1, count + 1))
 
 
 def test_it_runs_on_as_many_threads_as_numba_may_use(monkeypatch):
-    monkeypatch.setattr(loops.cores, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(loops.parallel, "get_num_threads", lambda: 2)
     met, names = threading.Barrier(2, timeout=60), set()
 
     def meet(first: int, last: int) -> None:
         names.add(threading.current_thread().name)
         met.wait()  # raises if the other band does not run at the same time
 
-    on_all_cores(meet, 2)
+    run_bands(meet, 2)
     assert len(names) == 2
 
 
 @pytest.mark.parametrize("bad", [0, 1, 2])
 def test_an_error_in_any_band_comes_back_when_all_have_ended(monkeypatch, bad):
-    monkeypatch.setattr(loops.cores, "get_num_threads", lambda: 3)
+    monkeypatch.setattr(loops.parallel, "get_num_threads", lambda: 3)
     ended = []
 
     def run(first: int, last: int) -> None:
@@ -49,7 +49,7 @@ def test_an_error_in_any_band_comes_back_when_all_have_ended(monkeypatch, bad):
         ended.append(first)
 
     with pytest.raises(ValueError, match=f"band {bad}"):
-        on_all_cores(run, 3)
+        run_bands(run, 3)
     assert sorted(ended) == sorted({0, 1, 2} - {bad})
 
 
@@ -57,13 +57,13 @@ def test_an_error_in_any_band_comes_back_when_all_have_ended(monkeypatch, bad):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_process_that_was_forked_has_threads_of_its_own(monkeypatch):
-    monkeypatch.setattr(loops.cores, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(loops.parallel, "get_num_threads", lambda: 2)
     seen = np.zeros(4, np.int64)
-    on_all_cores(_mark, 4, seen, 1)
+    run_bands(_mark, 4, seen, 1)
     child = os.fork()
     if child == 0:
         signal_after(60)
-        on_all_cores(_mark, 4, seen, 1)
+        run_bands(_mark, 4, seen, 1)
         os._exit(0 if seen.sum() == 20 else 1)
     assert os.waitpid(child, 0)[1] == 0
 
