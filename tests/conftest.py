@@ -19,6 +19,7 @@ os.environ["TERM"] = "xterm"
 import shutil
 import signal
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,8 +29,12 @@ import pytest
 from tests.scenes import Scene
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs POSIX on Windows."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests of reliability unless `-m` names them; skip what needs POSIX on Windows."""
+    if "reliability" not in config.option.markexpr:
+        many = {item for item in items if item.get_closest_marker("reliability")}
+        config.hook.pytest_deselected(items=list(many))
+        items[:] = [item for item in items if item not in many]
     for item in items:
         if sys.platform == "win32" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX: pipes, signals, links or shells"))
@@ -39,6 +44,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def shot_folder(tmp_path: Path) -> Path:
     """Three noisy frames on disk."""
     return Scene().write(tmp_path / "noisy")
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """An empty folder that every user may enter; `tmp_path` is its owner's alone."""
+    with tempfile.TemporaryDirectory(prefix="ravg-", ignore_cleanup_errors=True) as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
 
 
 @pytest.fixture

@@ -11,6 +11,13 @@ import numpy as np
 from tests.exr_files import write_layers
 
 
+def grained(picture: np.ndarray, seed: object, noise: float = 0.3) -> np.ndarray:
+    """Multiply by unbiased noise, skewed as that of a path tracer is."""
+    shape = 1 / noise**2
+    grain = np.random.default_rng(seed).gamma(shape, 1 / shape, (*picture.shape[:2], 1)).astype(np.float32)
+    return picture * grain
+
+
 @dataclass(frozen=True)
 class Scene:
     """A textured wall lit by a soft gradient, passing the camera by whole pixels per frame."""
@@ -46,10 +53,7 @@ class Scene:
     def noisy(self, index: int) -> dict[str, np.ndarray]:
         """The same with unbiased multiplicative noise in the color, skewed as that of a path tracer is."""
         layers = self.clean(index)
-        shape = 1 / self.noise**2
-        rng = np.random.default_rng((11, index))
-        grain = rng.gamma(shape, 1 / shape, (self.height, self.width, 1)).astype(np.float32)
-        layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * grain
+        layers["ViewLayer.Combined"] = grained(layers["ViewLayer.Combined"], (11, index), self.noise)
         return layers
 
     def write(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -30,17 +29,6 @@ from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from hybrid.runtime.interrupt import interruptible
 from tests.hard_cases.test_hard_files import ROOT, run_alone
 from tests.scenes import Scene
-
-
-def test_kills_at_random_moments_lose_nothing(record_property):
-    """`benchmarks/kill_runs.py`: kills, Ctrl-C, no space, a locked folder, two at once; each checked to the byte."""
-    done = run_alone("benchmarks/kill_runs.py", "--kills", "50")
-    assert done.returncode == 0, done.stdout + done.stderr
-    result = json.loads(done.stdout.splitlines()[-1])
-    assert result["problems"] == []
-    # Some runs must have been killed in their midst, or nothing was tried.
-    assert result["runs_that_ended_before"] < 40
-    record_property("cases", result["kills"] + result["stops"] + 6)
 
 
 def draft(folder, out, *more):

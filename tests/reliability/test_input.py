@@ -1,0 +1,497 @@
+"""Odd, hostile and damaged input: rows 3, 11, 12, 13, 17, 18 and 20 of docs/reliability.md."""
+
+# ruff: noqa: E501 - tables of cases, one a line
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.commands import ROOT, ravg, run_python
+from tests.reliability.shots import (
+    COLOR,
+    DRAFT,
+    Layers,
+    cases,
+    color,
+    names,
+    nothing,
+    pseudoref,
+    same,
+    shot,
+    wall,
+    write,
+)
+from tests.scenes import grained
+
+pytestmark = [pytest.mark.reliability, pytest.mark.posix]
+Metadata = dict[str, str]
+
+# --- 3: names mean one thing, or are refused
+
+NAMES = {
+    "shot-{:04d}.exr": "",
+    "a_b-{:03d}.exr": "a_b-###.exr",
+    "v2-{:d}.exr": "v2-#.exr",
+    "-{:04d}.exr": "",
+    "shot.{:04d}_final.exr": "",
+    "7_{:04d}.exr": "7_%04d.exr",
+    "shot - {:04d}.exr": "",
+}
+
+
+@pytest.mark.parametrize(("name", "given"), NAMES.items())
+def test_time_runs_forward_under_any_name(folder, name, given):
+    first = -5 if name.startswith("-") else 1  # a hyphen before the digits is a sign
+    for out, form, spec in (("plain", "shot.{:04d}.exr", "plain"), ("named", name, f"named/{given}")):
+        shot(folder / out, 5, step=(3, 1), name=form, first=1 if out == "plain" else first)
+        ravg("pseudoref", spec, "-o", f"{out} out", *DRAFT, folder=folder).succeeds()
+    for index in range(5):
+        one = color(folder / "plain out" / f"shot.{1 + index:04d}.exr")
+        np.testing.assert_array_equal(one, color(folder / "named out" / name.format(abs(first + index))))
+
+
+PICTURES = {
+    "the compositor's beside a view layer": ([COLOR, "Composite.Combined"], ["Composite.Combined"]),
+    "two view layers": ([COLOR, "Fog.Combined"], []),
+    "three view layers": ([COLOR, "A.Combined", "Z.Combined"], []),
+}
+
+
+@cases(PICTURES)
+def test_each_view_layer_is_denoised_and_a_composite_kept(folder, case):
+    layers, kept = case
+
+    def edit(index: int, found: Layers) -> None:
+        for layer in layers[1:]:
+            group = layer.rpartition(".")[0]
+            found[layer] = found[COLOR].copy()
+            found |= {f"{group}.{n}": found[f"ViewLayer.{n}"] for n in ("Denoising Albedo", "Vector")}
+
+    shot(folder / "in", 3, edit)
+    if ravg(*pseudoref(), folder=folder).ends("either").code == 0:
+        for layer in layers:
+            before, after = (color(folder / x / "shot.1002.exr", layer) for x in ("in", "out"))
+            assert np.array_equal(before, after) == (layer in kept)
+
+
+@pytest.mark.neural
+@cases(("normal", "albedo", "Combined", "ViewLayer.Combined", "color"), "name")
+def test_an_aov_that_is_a_role_changes_nothing_else(folder, name):
+    """Or it is refused."""
+    shot(folder / "in", 3, step=(2, 0))
+    words = ["denoise", "in", "--estimate", "nlm"]
+    if ravg(*words, "-o", "out", "--aov", name, folder=folder).ends("either").code == 0:
+        ravg(*words, "-o", "plain", folder=folder).succeeds()
+        same(folder / "plain", folder / "out")
+
+
+@cases((["color", "beauty"], ["color", "beauty", "rgba"]), "extra")
+def test_layers_that_could_be_one_thing_are_refused(folder, extra):
+    def edit(index: int, layers: Layers) -> None:
+        layers |= {name: layers[COLOR].copy() for name in extra}
+        del layers[COLOR]
+
+    shot(folder / "in", 3, edit)
+    ravg(*pseudoref(), folder=folder).is_refused()
+
+
+# --- 11: weights that ask for too much
+
+
+def described(**changes: object) -> Callable[[Metadata], object]:
+    def change(metadata: Metadata) -> None:
+        description = json.loads(metadata["description"])
+        description["config"] |= changes
+        metadata["description"] = json.dumps(description)
+
+    return change
+
+
+def nested(depth: int) -> Callable[[Metadata], object]:
+    kernel = {"frames": 5, "size": 5, "threshold": 0.5, "activation": "relu"}
+    inner: object = {"model": "RAUNet", "config": {"kernel": kernel, "widths": [16, 32, 64], "ra_scales": [1]}}
+    for _ in range(depth):
+        inner = {"model": "MultiScale", "scales": 2, "base": inner}
+    return entry("description", json.dumps(inner))
+
+
+def entry(name: str, text: str) -> Callable[[Metadata], object]:
+    return lambda metadata: metadata.update({name: text})
+
+
+KERNELS = {"conv_size": 99}, {"width": 10**9}, {"width": 10**400}, {"blocks": 255}, {"temporal_blocks": 255}
+UNETS = {"frames": 255}, {"frames": 5.0}, {"widths": [256] * 100}, {"widths": [2**40]}, {"cell": 0}, {"cell": 10**6}
+TEXTS = "[" * 10**5, '{"a":' * 10**5, "null", "1e999", '{"model": "RobustUNet", "config": null}'
+HOSTILE_WEIGHTS: dict[str, tuple[Callable[[Metadata], object], str]] = {
+    **{f"scales of scales, {depth} deep": (nested(depth), "fast") for depth in (2, 12, 25, 400)},
+    **{f"tkpcn {str(changes)[:40]}": (described(**changes), "tkpcn") for changes in KERNELS},
+    **{str(changes)[:40]: (described(**changes), "fast") for changes in UNETS},
+    **{f"a megabyte of {name}": (entry(name, "x\n" * 500_000), "fast") for name in ("description", "version", "format")},
+    **{f"a description {text[:12]}": (entry("description", text), "fast") for text in TEXTS},
+}  # fmt: skip
+
+
+@pytest.mark.neural
+@cases(HOSTILE_WEIGHTS)
+def test_hostile_weights_are_refused_in_a_line_with_next_to_no_memory(folder, case):
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    change, base = case
+    with safe_open(ROOT / "network" / "weights" / f"{base}.safetensors", "np") as file:
+        metadata = dict(file.metadata())
+        change(metadata)
+        save_file({name: file.get_tensor(name) for name in file.keys()}, folder / "w.safetensors", metadata)  # noqa: SIM118
+    shot(folder / "in", 1)
+    words = ["denoise", "in", "-o", "out", "--estimate", "auto", "--weights", "w.safetensors"]
+    done = ravg(*words, folder=folder, seconds=60, memory=3 * 2**30).is_refused()
+    error = next(line for line in done.said.splitlines() if line.startswith("error: "))
+    assert len(error) <= 600
+
+
+# --- 12: no crash, no hang: one line
+
+
+def make_special(kind: str, path: Path) -> None:
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(path))
+    elif kind == "device":
+        os.mknod(path, 0o020666, os.makedev(1, 5))  # /dev/zero: without end
+    elif kind == "loop":
+        path.symlink_to(path)
+    else:
+        path.mkdir()
+
+
+@cases((["inspect", "in"], pseudoref()), "words")
+@cases(("pipe", "socket", "device", "loop", "folder"), "kind")
+def test_no_frame_that_is_no_file_is_waited_for(folder, kind, words):
+    path = shot(folder / "in", 5) / "shot.1003.exr"
+    path.unlink()
+    make_special(kind, path)
+    done = ravg(*words, folder=folder, seconds=60)
+    assert done.code != -9
+    assert "Traceback" not in done.said
+
+
+LOOPS = ["inspect", "a"], ["pseudoref", "in", "-o", "a/x"], pseudoref("--preview", "a/x.png")
+SIZES = "9" * 400, "1" + "0" * 400 + "G", "9" * 400 + ".5T", "1e400"
+
+
+@cases([*LOOPS, *(pseudoref("--max-memory", size) for size in SIZES)], "words")
+def test_loops_of_links_and_numbers_without_end_are_refused(folder, words):
+    shot(folder / "in", 3)
+    (folder / "a").symlink_to(folder / "b")
+    (folder / "b").symlink_to(folder / "a")
+    ravg(*words, folder=folder).is_refused()
+
+
+@cases((50, 300), "mebibytes")
+def test_little_memory_ends_in_one_line(folder, mebibytes):
+    shot(folder / "in", 3, size=(1500, 2000), noise=0)
+    ravg(*pseudoref(), folder=folder, memory=mebibytes * 2**20).is_refused()
+
+
+@cases(("[red]x[/blue]", "[/]", "[link=http://a]b", "\x1b[2J", "[bold]"), "name")
+def test_a_name_is_shown_as_it_is(folder, name):
+    shot(folder / "in", 2)
+    shot(folder / "clean", 2, noise=0)
+    words = ["compare", "in", "--reference", "clean", "--methods", "draft", "--rounds", "1"]
+    done = ravg(*words, "--external", f"{name}=clean", folder=folder).ends("either")
+    assert done.code or "".join(name.split())[:12] in "".join(done.said.split())
+
+
+RESULTS = (
+    "", "null", "[]", "{}", "[" * 10**5, '{"results": 1}', '{"shot": 1, "results": [{}], "facts": {}}',
+    '{"shot": "x", "results": [{"metrics": []}], "facts": {}}', '{"shot": "x", "results": "abc", "facts": {}}',
+    '{"shot": "x", "results": [null], "facts": null}', "\\ud800", '{"results": [{"metrics": {"psnr": 0}}]}',
+)  # fmt: skip
+
+
+@cases(RESULTS, "text")
+def test_results_that_are_none_are_refused(folder, text):
+    (folder / "report").mkdir()
+    (folder / "report" / "results.json").write_text(text)
+    ravg("compare", "--beside", "report", "-o", "page", folder=folder, seconds=60).is_refused()
+
+
+WITHOUT_LIBRARY = """
+import sys, types
+broken = types.ModuleType("pyoidn")
+broken.__spec__ = __import__("importlib.machinery").machinery.ModuleSpec("pyoidn", None)
+def absent(name):
+    if name.startswith("__"):
+        raise AttributeError(name)
+    raise OSError("libOpenImageDenoise.so.2: cannot open shared object file")
+broken.__getattr__ = absent
+sys.modules["pyoidn"] = broken
+from hybrid.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.neural
+@cases(("auto", "oidn", "oidn-best"), "estimate")
+def test_pyoidn_without_its_library(folder, estimate):
+    """auto does without, and says so."""
+    shot(folder / "in", 2)
+    words = ["denoise", "in", "-o", "out", "--estimate", estimate]
+    done = run_python("-c", WITHOUT_LIBRARY, *words, folder=folder).ends("works" if estimate == "auto" else "refused")
+    assert estimate != "auto" or re.search(r"estimates: (nlm|bundled)\b", done.said)
+
+
+# --- 13: words of any encoding, folders of any name, usage
+
+VALUES = {"Latin-1": "Ærø Müller".encode("latin-1"), "Shift-JIS": "レンダー太郎".encode("shift_jis")}
+VALUES |= {"UTF-8": "Zoë 渲染".encode(), "bytes of no encoding": b"\xff\xfe\x80abc\x81"}
+
+
+@cases(VALUES, "value")
+def test_a_string_in_a_header_is_kept_to_the_byte(folder, value):
+    for path in shot(folder / "in", 2, owner="A" * len(value)).iterdir():
+        data = path.read_bytes()
+        assert data.count(b"A" * len(value)) == 1
+        path.write_bytes(data.replace(b"A" * len(value), value))
+    ravg(*pseudoref(), folder=folder).succeeds()
+    made = (folder / "out" / "shot.1001.exr").read_bytes()
+    assert b"owner\0string\0" + len(value).to_bytes(4, "little") + value in made
+
+
+FOLDERS = (
+    "a#b", "####", "a@b", "@@@@", "%04d", "$F4", "<frame04>", "[1]", "a[1-3]b", "a*b", "a?b", "{x}", "ä 渲", " a",
+)  # fmt: skip
+
+
+@cases((False, True), "pattern")
+@cases(FOLDERS, "name")
+def test_a_folder_may_be_called_anything(folder, name, pattern):
+    noisy, out = shot(folder / name / "in", 2), folder / name / "out"
+    spec, target = (noisy / "shot.####.exr", out / "made.####.exr") if pattern else (noisy, out)
+    ravg("pseudoref", spec, "-o", target, *DRAFT).succeeds()
+    assert len(names(out)) == 2
+
+
+@cases((["inspect", "ä"], ["pseudoref", "ä", "-o", "ö", *DRAFT], ["denoise", "--help"]), "words")
+def test_a_terminal_may_know_ascii_alone(folder, words):
+    shot(folder / "ä", 2)
+    run_python("-m", "ravg", *words, folder=folder, PYTHONIOENCODING="ascii", LC_ALL="C").succeeds()
+
+
+USAGE = (
+    ["--max-memory", "0"], ["--max-memory", "0G"], ["-o", ""], ["-o", "x.tif"], ["-o", "x.####.png"],
+    ["--layer", "color="], ["--layer", "=x"], ["--layer", "nonsense=x"], ["--layer", "albedo"],
+    ["--max-memory", ""], ["--max-memory", "-1G"], ["--preset", "best"], ["--frames", ""], ["--frames", "1-x"],
+    ["--stages", "magic"], ["--preview", "x.tif"], ["--max-pixels", "0"],
+)  # fmt: skip
+
+
+@cases(USAGE, "words")
+def test_bad_usage_ends_with_two_and_makes_nothing(folder, words):
+    shot(folder / "in", 3)
+    before = set(folder.rglob("*"))
+    output = [] if "-o" in words else ["-o", "out"]
+    done = ravg("pseudoref", "in", *DRAFT, *words, *output, folder=folder)
+    assert done.code == 2
+    assert "Traceback" not in done.said
+    assert set(folder.rglob("*")) == before
+
+
+# --- 17: records that are hostile or damaged
+
+
+@pytest.fixture(scope="module")
+def denoised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A shot of two frames, denoised, to be copied."""
+    folder = tmp_path_factory.mktemp("denoised")
+    shot(folder / "in", 2)
+    ravg(*pseudoref(), folder=folder).succeeds()
+    return folder
+
+
+def set_to(value: object, *keys: str) -> Callable[[Any], object]:
+    def change(document: Any) -> None:
+        for key in keys[:-1]:
+            document = document[key]
+        document[keys[-1]] = value
+
+    return change
+
+
+ENTRIES = (
+    None, "x", [], {}, {"state": "made"}, {"state": "made", "seconds": "x", "file": 3}, {"state": "failed"},
+    {"state": "failed", "error": "\x1b[2J\n[red]"},
+)  # fmt: skip
+KEYS = "asked", "frames", "started", "state", "host", "process", "updated", "peak_bytes"
+RECORD_TEXTS = (
+    "", "null", "[]", "{}", "[" * 10**5, '{"a":' * 10**5, "\udcff\udcfe",
+    '{"ravg": 1, "asked": [1e999], "frames": {}, "started": 0, "state": "running"}',
+)  # fmt: skip
+RECORDS: dict[str, str | Callable[[Any], object]] = {
+    **{f"a record {text[:10].encode('utf-8', 'replace')!r}": text for text in RECORD_TEXTS},
+    **{f"{k} is {str(v)[:12]}": set_to(v, k) for k in KEYS for v in (None, "x", [{}], 10**400)},
+    **{f"a frame's entry is {str(value)[:30]!r}": set_to(value, "frames", "1001") for value in ENTRIES},
+    "a frame called x": set_to({"state": "made"}, "frames", "x"),
+    "markup as host": set_to("[red]\x1b[2J", "host"),
+}
+
+
+@cases(RECORDS)
+def test_status_of_a_hostile_record(folder, denoised, case):
+    shutil.copytree(denoised, folder, dirs_exist_ok=True)
+    (record,) = (folder / "out").rglob("*.json")
+    if isinstance(case, str):
+        record.write_bytes(case.encode("utf-8", "surrogateescape"))
+    else:
+        document = json.loads(record.read_text())
+        case(document)
+        record.write_text(json.dumps(document))
+    for words in (["status", "out"], ["status", "out/shot.####.exr", "--json", "--frames", "1001-1002"]):
+        done = ravg(*words, folder=folder, seconds=30, memory=2 * 2**30)
+        assert done.code in (0, 1)
+        assert "Traceback" not in done.said
+        assert all(sign.isprintable() or sign == "\n" for sign in done.said)
+
+
+@cases(("../outside.exr", "../../outside.exr", "shot.1001.exr", ".", "", "/dev/null", "a\0b"), "name")
+def test_frames_that_are_not_there_are_not_finished_whatever_a_record_says(folder, denoised, name):
+    shutil.copytree(denoised, folder, dirs_exist_ok=True)
+    (record,) = (folder / "out").rglob("*.json")
+    document = json.loads(record.read_text())
+    (folder / "outside.exr").write_text("x")
+    (folder / "out" / "shot.1002.exr").unlink()
+    document["frames"]["1002"].update(file=name)
+    record.write_text(json.dumps(document))
+    done = ravg("status", "out", folder=folder)
+    assert done.code == 1
+    assert "Traceback" not in done.said
+
+
+SPECIAL: dict[str, Callable[[Path], object]] = {
+    "a pipe": os.mkfifo,
+    "a folder": lambda p: p.mkdir(),
+    "a link to itself": lambda p: p.symlink_to(p),
+    "a link to a device": lambda p: p.symlink_to("/dev/zero"),
+}
+
+
+@cases(SPECIAL, "make")
+def test_no_record_that_is_no_file_is_waited_for(folder, make):
+    shot(folder / "in", 2)
+    (folder / "out" / "ravg").mkdir(parents=True)
+    for name in ("shot.1001-1002.json", "other.1.json"):
+        make(folder / "out" / "ravg" / name)
+    for words in (["status", "out"], pseudoref()):
+        done = ravg(*words, folder=folder, seconds=60)
+        assert done.code != -9
+        assert "Traceback" not in done.said
+
+
+# --- 18: the viewer, in odd folders
+
+
+def record_of(make: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda f: [(f / "ravg").mkdir(), make(f / "ravg" / "shot.1.json")]
+
+
+HOSTILE_RECORD = '{"ravg": 1, "asked": 1, "frames": [], "started": [], "state": {}}'
+ODD_NAMES = (
+    b"a#b", b"%04d", b"[1]", b"a b ", b"caf\xe9", "渲染".encode(), b"a'b\"c", b"<script>", b"a\nb", b"?x=1&y", b"..x",
+)  # fmt: skip
+VIEWED: dict[str, tuple[bytes, Callable[[Path], object]]] = {
+    **{f"a folder called {name!r}": (name, nothing) for name in ODD_NAMES},
+    "a record that is a pipe": (b"x", record_of(os.mkfifo)),
+    "a record that is hostile": (b"x", record_of(lambda p: p.write_text(HOSTILE_RECORD))),
+    "a picture of Windows' desktop": (b"x", lambda f: (f / "desktop.ini").write_bytes(b"\xff")),
+}
+
+
+@cases(VIEWED)
+def test_the_viewer_shows_a_frame_whatever_else_there_is(folder, case):
+    name, prepare = case
+    out = Path(os.fsdecode(os.fsencode(folder) + b"/" + name))
+    shot(folder / "plain", 2).rename(out)  # the library writes to no name that is not UTF-8
+    prepare(out)
+    words = [sys.executable, "-P", "-m", "ravg", "view", os.fsencode(out), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    child = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        assert child.stdout is not None
+        line = child.stdout.readline().decode("utf-8", "replace").strip()
+        assert line.startswith("http://")
+        with urllib.request.urlopen(f"{line}state", timeout=30) as answer:
+            sequence = json.loads(answer.read())["sequences"][0]
+        assert len(sequence["frames"]) == 2
+        layer = urllib.request.quote(sequence["layer"])  # type: ignore[attr-defined]
+        with urllib.request.urlopen(f"{line}frame/0/1002.png?ev=0&layer={layer}", timeout=30) as answer:
+            assert answer.read(4)[1:] == b"PNG"
+    finally:
+        child.terminate()
+        child.wait(30)
+
+
+# --- 20: gaps, negative numbers, ranges
+
+Numbers = Sequence[int | str]
+NUMBERS: dict[str, tuple[Numbers, Sequence[str], str]] = {
+    "a gap": ([1, 2, 3, 7, 8], [], "works"),
+    "every second": ([2, 4, 6, 8], [], "works"),
+    "every fifth, and one odd": ([5, 10, 15, 17], [], "works"),
+    "negative numbers": (["shot.-002.exr", "shot.-001.exr", "shot.0000.exr", "shot.0001.exr"], [], "works"),
+    "frame 0 alone": ([0], [], "works"),
+    "of nine digits": ([10**8 + 1, 10**8 + 2], [], "works"),
+    "dates": ([20260101, 20260301, 20261231], [], "works"),
+    "far apart": ([1, 10**12], [], "works"),
+    "more than 64 bits": ([f"shot.{10**25}.exr", f"shot.{10**25 + 1}.exr"], [], "either"),
+    "hundreds of digits": (["shot." + "1" * 200 + ".exr", "shot." + "1" * 199 + "2.exr"], [], "either"),
+    "padded and not": (["shot.1.exr", "shot.2.exr", "shot.0001.exr"], [], "refused"),
+    "the same number twice": (["shot.01.exr", "shot.1.exr"], [], "refused"),
+    "two sequences": (["a.1.exr", "b.1.exr"], [], "refused"),
+    "numbers alone": (["0001.exr", "0002.exr"], [], "works"),
+    "numbers before and behind": (["2shot1.exr", "2shot2.exr"], [], "works"),
+    "in other letters": (["shot.1.EXR", "shot.2.EXR"], [], "works"),
+    "mixed letters": (["shot.1.exr", "shot.2.EXR"], [], "either"),
+    "other digits": (["shot.١.exr", "shot.٢.exr"], [], "either"),
+    "a range without end": ([1, 2, 3], ["--frames", "1-100000000000"], "either"),
+    "a range of steps": ([1, 2, 3], ["--frames", "1-3x2"], "works"),
+    "a range backwards": ([1, 2, 3], ["--frames", "3-1"], "either"),
+    "a step of nothing": ([1, 2, 3], ["--frames", "1-3x0"], "refused"),
+    "a frame twice": ([1, 2, 3], ["--frames", "2,2,1-2"], "works"),
+    "digits of another script": ([1, 2, 3], ["--frames", "١-٣"], "either"),
+    "a range of 400 digits": ([1, 2], ["--frames", "1-" + "9" * 400], "either"),
+    "a step of 400 digits": ([1, 2], ["--frames", "1-2x" + "9" * 400], "either"),
+    "a hundred thousand commas": ([1, 2], ["--frames", "1," * 100_000 + "2"], "either"),
+    "a glob": ([1, 2, 3], ["in/shot.*.exr"], "works"),
+    "a glob of some": ([1, 2, 3, 12], ["in/shot.000[12].exr", "--frames", "1-2"], "works"),
+    "a range within the name": ([1, 2, 3], ["in/shot.1-2####.exr", "--frames", "1-2"], "works"),
+}
+
+
+@cases(NUMBERS)
+def test_each_frame_is_made_once_under_its_number(folder, case):
+    """Or all is refused."""
+    numbers, more, how = case
+    for index, number in enumerate(numbers):
+        layers = wall(index, (2, 1))
+        layers[COLOR] = grained(layers[COLOR], index)
+        write(folder / "in" / (number if isinstance(number, str) else f"shot.{number:04d}.exr"), layers)
+    source = [] if more and not more[0].startswith("-") else ["in"]
+    done = ravg("pseudoref", *source, *more, "-o", "out", *DRAFT, folder=folder, seconds=60, memory=2 * 2**30)
+    done.ends(how)
+    if done.code == 0 and "--frames" not in more:
+        assert names(folder / "in") <= names(folder / "out")

@@ -1,0 +1,455 @@
+"""No picture is silently wrong: rows 1, 2, 4, 5, 14 and 21 of docs/reliability.md."""
+
+# ruff: noqa: E501 - tables of cases, one a line
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from tests.commands import ROOT, ravg
+from tests.reliability.shots import (
+    ALBEDO,
+    COLOR,
+    DRAFT,
+    NORMAL,
+    RAW,
+    SIZE,
+    VECTOR,
+    Edit,
+    Layers,
+    assert_no_worse,
+    blurred,
+    cases,
+    color,
+    names,
+    pseudoref,
+    read,
+    read_layers,
+    same,
+    shot,
+    wall,
+    write,
+)
+from tests.scenes import grained
+
+pytestmark = [pytest.mark.reliability, pytest.mark.posix]
+
+# --- 1: what one window has and no other is found there
+
+ODD = 6
+
+
+def flare(factor: float, part: slice = slice(None)) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        layers[COLOR][part] *= factor if index == ODD else 1
+
+    return edit
+
+
+def switch(factor: float) -> Edit:
+    def edit(index: int, layers: Layers) -> None:
+        layers[COLOR] *= np.float32(factor if index >= ODD else 1)
+
+    return edit
+
+
+def burst(index: int, layers: Layers) -> None:
+    """From frame 7 to 9 the wall slides by three pixels per frame."""
+    layers |= wall(min(max(index - ODD, 0), 3), (3, 0))
+    layers[VECTOR][:] = 0
+    layers[VECTOR][..., 0] = -3 if ODD < index <= ODD + 3 else 0
+    layers[VECTOR][..., 2] = -3 if ODD <= index < ODD + 3 else 0
+
+
+def cut(index: int, layers: Layers) -> None:
+    for name in (COLOR, ALBEDO) if index >= ODD else ():
+        layers[name] = np.ascontiguousarray(layers[name][::-1, ::-1])
+
+
+def sparks(count: int, value: float = 5000) -> Edit:
+    def late(index: int, layers: Layers) -> None:
+        if index == ODD:
+            places = np.random.default_rng(count).integers(4, (SIZE[0] - 4, SIZE[1] - 4), (count, 2))
+            layers[COLOR][places[:, 0], places[:, 1]] = value
+
+    return late
+
+
+# Event → changes before and after noise.
+EVENTS: dict[str, tuple[Edit | None, Edit | None]] = {
+    "a frame five times brighter": (flare(5), None),
+    "a frame at a fifth of its light": (flare(0.2), None),
+    "a light switched down": (switch(0.2), None),
+    "a light switched on": (switch(5), None),
+    "half of a frame four times brighter": (flare(4, slice(0, SIZE[0] // 2)), None),
+    "a tenth of a frame darker": (flare(0.2, slice(0, 4)), None),
+    "a burst of motion": (burst, None),
+    "a cut": (cut, None),
+    "a firefly": (None, sparks(1)),
+    "five fireflies": (None, sparks(5, 800)),
+}
+FORCED = "--stages", "warp", "--stages", "gate", "--stages", "outliers"
+
+
+@cases((False, True), "estimates")
+@cases(EVENTS, "event")
+def test_no_frame_is_worse_than_with_every_guard_forced_on(folder, event, estimates):
+    """By more than 0.2 dB or 1 % of its mean."""
+    noisy, clean = shot(folder / "in", 18, *event), shot(folder / "clean", 18, *event, noise=0)
+    more = ["--estimate", blurred(folder / "single", noisy)] if estimates else []
+    for out, forced in (("planned", ()), ("forced", FORCED)):
+        done = ravg("pseudoref", noisy, "-o", folder / out, *more, *forced)
+        if estimates and f"error: the estimate of frame {1001 + ODD}: it has" in done.said:
+            return  # an estimate that has spread a firefly's light all over a small picture is refused
+        done.succeeds()
+    for index in range(ODD - 3, ODD + 4):
+        name = f"shot.{1001 + index:04d}.exr"
+        truth = color(clean / name)
+        if truth.max() > 100:  # the firefly is in it
+            truth = color(clean / "shot.1001.exr")
+        planned, forced = (color(folder / out / name) for out in ("planned", "forced"))
+        assert_no_worse(planned, forced, truth, name)
+        assert 0.8 < planned.mean() / truth.mean() < 1.25, name
+
+
+@cases(EVENTS, "event")
+def test_a_frame_is_the_same_in_chunks(folder, event):
+    noisy = shot(folder / "in", 18, *event)
+    for out, frames in (("all", "1001-1018"), ("part", "1005-1007"), ("part", "1008")):
+        ravg("pseudoref", noisy, "-o", folder / out, *DRAFT, "--frames", frames).succeeds()
+    same(folder / "part", folder / "all")
+
+
+@pytest.mark.parametrize(
+    ("edit", "late", "stage", "frames"),
+    [
+        (flare(5), None, "gate", "1005-1009"),
+        (burst, None, "warp", "1006-1011"),
+        (None, sparks(1), "fireflies", "1005-1009"),
+    ],
+    ids=["light", "motion", "fireflies"],
+)
+def test_inspect_names_the_frames(folder, edit, late, stage, frames):
+    said = ravg("inspect", shot(folder, 18, edit, late)).words
+    assert frames in " ".join(said[said.find(stage) :].split()[:60])
+
+
+# --- 2: absurd values make no picture; frames not made are no success
+
+
+@cases((1e15, 1e30, -1e30, 3e38), "value")
+@cases((COLOR, ALBEDO, NORMAL, VECTOR), "layer")
+def test_one_absurd_pixel_changes_no_frame(folder, layer, value):
+    def late(index: int, layers: Layers) -> None:
+        if index == 2:
+            layers[layer][10, 20] = value
+
+    for name, change in (("plain", None), ("absurd", late)):
+        noisy = shot(folder / f"{name} in", 5, late=change, step=(2, 1))
+        ravg("pseudoref", noisy, "-o", folder / name, *DRAFT).succeeds()
+    for name in sorted(names(folder / "plain")):
+        absurd, plain = color(folder / "absurd" / name), color(folder / "plain" / name)
+        assert np.isfinite(absurd).all()
+        assert abs(absurd.mean() / plain.mean() - 1) <= 0.05
+
+
+WRONG_ESTIMATES: dict[str, Callable[[np.ndarray], object]] = {
+    "nan": lambda x: x.fill(np.nan),
+    "half nan": lambda x: x[:16].fill(np.nan),
+    "of 1e30": lambda x: x.fill(1e30),
+    "black": lambda x: x.fill(0),
+    "four times too bright": lambda x: np.multiply(x, 4, out=x),
+    "without red": lambda x: x[..., 0].fill(0),
+}
+
+
+@cases(WRONG_ESTIMATES, "change")
+def test_an_estimate_that_cannot_be_right_is_refused_by_its_frame(folder, change):
+    estimates = blurred(folder / "single", shot(folder / "in", 5, step=(2, 1)))
+    layers = wall(2, (2, 1))
+    change(layers[COLOR])
+    write(estimates / "shot.1003.exr", layers)
+    done = ravg(*pseudoref("--estimate", "single"), folder=folder).is_refused()
+    assert "1003" in done.said
+
+
+@cases(("1001-1005", "1003", "1004-1009", "1-3,1004"), "asked")
+def test_frames_that_are_not_there_are_an_error(folder, asked):
+    (shot(folder / "in", 5) / "shot.1003.exr").unlink()
+    ravg(*pseudoref("--frames", asked), folder=folder).is_refused()
+
+
+@pytest.mark.neural
+@cases((30.0, 300.0, -30.0), "factor")
+def test_absurd_weights_make_no_picture(folder, factor):
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(ROOT / "network" / "weights" / "fast.safetensors", "np") as file:
+        tensors = {name: np.clip(file.get_tensor(name) * np.float16(factor), -6e4, 6e4) for name in file.keys()}  # noqa: SIM118
+        save_file(tensors, folder / "w.safetensors", file.metadata())
+    shot(folder / "in", 3, step=(2, 1))
+    done = ravg("denoise", "in", "-o", "out", "--estimate", "nlm", "--weights", "w.safetensors", folder=folder)
+    for path in (folder / "out").glob("*.exr"):
+        made, given = color(path), color(folder / "in" / path.name)
+        assert np.isfinite(made).all()
+        assert 1 / 3 < made.mean() / given.mean() < 3
+    done.ends("either")
+
+
+# --- 4: one seed is told from detail
+
+
+@pytest.mark.parametrize(
+    ("samples", "moves", "fixed", "vectors", "number"),
+    list(product((16, 256, 4096), (False, True), (False, True), (True, False), (1, 2))),
+)
+def test_one_seed_is_told_from_detail(folder, samples, moves, fixed, vectors, number):
+    """Detail of a pixel's size correlates between frames as a fixed noise does."""
+    size, step = (96, 128), (3, 1) if moves else (0, 0)
+    detail = np.random.default_rng(number).uniform(0.5, 1.5, (200, 200, 1)).astype(np.float32)
+    for index in range(4):
+        layers = wall(index, step, size)
+        y, x = 40 - step[1] * index, 40 - step[0] * index
+        clean = layers[COLOR] * detail[y : y + 96, x : x + 128]
+        layers[COLOR] = grained(clean, (number, 0 if fixed else index), 2 / samples**0.5)
+        if not vectors:
+            del layers[VECTOR]
+        write(folder / f"shot.{1001 + index}.exr", layers)
+    assert ("one seed for all" in ravg("inspect", folder).words) == fixed
+
+
+# --- 5: what is opaque stays opaque
+
+
+def covered(hole: Callable[[int], bool], share: float = 0.0) -> Edit:
+    """An alpha that is opaque but for a hole in some frames."""
+
+    def edit(index: int, layers: Layers) -> None:
+        alpha = np.ones((*SIZE, 1), np.float32)
+        if hole(index):
+            alpha[8:16, 8:16] = share
+            layers[COLOR][8:16, 8:16] *= share
+        layers[COLOR] = np.concatenate([layers[COLOR], alpha], axis=-1)
+
+    return edit
+
+
+HOLES = {"every frame": lambda i: True, "the first": lambda i: i == 0, "a later one": lambda i: i == 3}
+
+
+@pytest.mark.neural
+@cases((0.0, 0.5), "share")
+@cases(HOLES, "hole")
+def test_opaque_pixels_stay_opaque(folder, hole, share):
+    shot(folder / "in", 5, covered(hole, share), step=(2, 0))
+    ravg("denoise", "in", "-o", "out", "--estimate", "nlm", folder=folder).succeeds()
+    for name in names(folder / "out"):
+        before, after = (read(folder / where / name)[f"{COLOR}.A"] for where in ("in", "out"))
+        inside = cv2.erode((before == 1).astype(np.uint8), np.ones((5, 5), np.uint8)) == 1
+        assert (after[inside] == 1).all()
+        assert after.min() >= -1e-6
+        assert after.max() <= 1 + 1e-6
+
+
+@pytest.mark.neural
+def test_alpha_is_denoised_where_some_frame_has_a_hole(folder):
+    """Whatever the first frame has."""
+    shot(folder / "in", 8, covered(lambda index: index >= 5, 0.5), step=(2, 0))
+    for first in (1001, 1005):
+        words = ["denoise", "in", "-o", f"from {first}", "--estimate", "nlm", "--frames", f"{first}-1008"]
+        ravg(*words, folder=folder).succeeds()
+    same(folder / "from 1005", folder / "from 1001")
+
+
+def test_pseudoref_claims_no_stage_of_a_network(folder):
+    shot(folder / "in", 3, covered(lambda index: True))
+    said = ravg(*pseudoref(), folder=folder).succeeds().said
+    assert not re.search(r"\brun: (alpha|skip)", re.sub(r"not run: \w+", "", said))
+
+
+# --- 14: fireflies go, lamps stay
+
+PLACES = [(12, 16), (20, 34), (8, 40), (25, 8)]
+
+
+@pytest.mark.parametrize(
+    ("value", "estimate", "count"),
+    [*product((300.0, 20_000.0, 60_000.0), ("none", "nlm", "oidn", "oidn-fast", "oidn-best"), (1,)),
+     (5000.0, "none", 4), (5000.0, "oidn", 4)],
+)  # fmt: skip
+def test_a_spark_leaves_no_ring(folder, value, estimate, count):
+    """Of light in 9×13 pixels around it."""
+
+    def late(index: int, layers: Layers) -> None:
+        for at in PLACES[:count] if index == 2 else ():
+            layers[COLOR][at] = value
+
+    for name, change in (("plain", None), ("burnt", late)):
+        noisy = shot(folder / f"{name} in", 5, late=change, step=(1, 0))
+        words = ["--estimate", estimate, "--preset", "standard"]
+        ravg("pseudoref", noisy, "-o", folder / name, *words).succeeds()
+    for number in (1002, 1003, 1004):
+        plain, made = (color(folder / name / f"shot.{number}.exr") for name in ("plain", "burnt"))
+        for y, x in PLACES[:count]:
+            block = slice(y - 4, y + 5), slice(x - 6, x + 7)
+            assert made[block].mean() / plain[block].mean() <= 1.1
+            assert made[block].max() / plain[block].max() <= 1.5
+
+
+@cases((50.0, 5000.0), "value")
+@cases(((0, 0), (2, 1)), "step")
+def test_a_lamp_of_one_pixel_stays(folder, step, value):
+    def late(index: int, layers: Layers) -> None:
+        layers[COLOR][16 + step[1] * index, 20 + step[0] * index] = value
+
+    shot(folder / "in", 5, late=late, step=step)
+    ravg(*pseudoref("--estimate", "oidn"), folder=folder).succeeds()
+    for index in range(5):
+        y, x = 16 + step[1] * index, 20 + step[0] * index
+        block = color(folder / "out" / f"shot.{1001 + index}.exr")[y - 3 : y + 4, x - 3 : x + 4]
+        assert 0.5 * value < block.mean(axis=-1).sum() < 2 * value
+
+
+def test_light_that_is_taken_out_is_on_record(folder):
+    def late(index: int, layers: Layers) -> None:
+        if index == 1:
+            layers[COLOR][12, 16] = 5000
+
+    shot(folder / "in", 3, late=late)
+    ravg(*pseudoref(), folder=folder).succeeds()
+    (record,) = (json.loads(path.read_text()) for path in (folder / "out").rglob("*.json"))
+    given = color(folder / "in" / "shot.1002.exr")
+    share = max(entry.get("light_removed", 0) for entry in record["frames"].values())
+    assert share == pytest.approx(5000 * 3 / given.sum(), rel=0.1)
+    assert record["mean"]["with_fireflies"] - record["mean"]["without"] == pytest.approx(
+        5000 / given[..., 0].size / 3, rel=0.1
+    )
+
+
+# --- 21: a frame that is not like the others
+
+
+def stored(path: Path, layers: Layers, kind: type = np.float32, parts: bool = False, **header: object) -> None:
+    """Write layers as halves, as parts, in tiles, with another window."""
+    settings = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    named = {
+        name: {
+            f"{name}.{c}": np.ascontiguousarray(plane.astype(kind))
+            for c, plane in zip("XYZW" if name in (VECTOR, NORMAL) else "RGBA", np.moveaxis(layer, 2, 0), strict=False)
+        }
+        for name, layer in layers.items()
+    }
+    if parts:
+        made = [OpenEXR.Part(dict(settings), channels, name) for name, channels in named.items()]
+    else:
+        made = [OpenEXR.Part(settings, {k: v for channels in named.values() for k, v in channels.items()}, "")]
+    OpenEXR.File(made).write(str(path))
+
+
+def tiles() -> OpenEXR.TileDescription:
+    found = OpenEXR.TileDescription()
+    found.xSize = found.ySize = 16
+    return found
+
+
+def window(left: int, top: int, height: int, width: int, whole: Sequence[int]) -> dict[str, object]:
+    """The data window of a header, and a display window: first column and row, last column and row."""
+    last = left + width - 1, top + height - 1
+    return {
+        "dataWindow": (np.array([left, top], np.int32), np.array(last, np.int32)),
+        "displayWindow": (np.array(whole[:2], np.int32), np.array(whole[2:], np.int32)),
+    }
+
+
+Change = Callable[[Path, Layers], object]
+
+
+def edited(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change every layer."""
+    return lambda p, x: write(p, {k: np.ascontiguousarray(change(v)) for k, v in x.items()})
+
+
+def with_layer(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change one layer."""
+    return lambda p, x: write(p, {**x, name: np.float32(change(x[name]))})
+
+
+def without(*left_out: str) -> Change:
+    return lambda p, x: write(p, {k: v for k, v in x.items() if not any(word in k for word in left_out)})
+
+
+def cropped(p: Path, x: Layers) -> None:
+    part = {k: np.ascontiguousarray(v[4:20, 8:40]) for k, v in x.items()}
+    stored(p, part, **window(8, 4, 16, 32, (0, 0, SIZE[1] - 1, SIZE[0] - 1)))
+
+
+def moved(p: Path, x: Layers) -> None:
+    stored(p, x, **window(100, 50, *SIZE, (100, 50, 100 + SIZE[1] - 1, 50 + SIZE[0] - 1)))
+
+
+UNLIKE: dict[str, tuple[Change, str]] = {
+    "half as large": (edited(lambda v: v[::2, ::2]), "refused"),
+    "one row less": (edited(lambda v: v[:-1]), "refused"),
+    "turned by 90 degrees": (edited(lambda v: v.swapaxes(0, 1)), "refused"),
+    "cropped": (cropped, "either"),
+    "of another origin": (moved, "works"),
+    "of halves": (lambda p, x: stored(p, x, np.float16), "works"),
+    "in parts": (lambda p, x: stored(p, x, parts=True), "works"),
+    "in tiles": (lambda p, x: stored(p, x, type=OpenEXR.tiledimage, tiles=tiles()), "works"),
+    "of another compression": (lambda p, x: stored(p, x, compression=OpenEXR.PIZ_COMPRESSION), "works"),
+    "uncompressed": (lambda p, x: stored(p, x, **RAW), "works"),
+    "of PXR24": (lambda p, x: stored(p, x, compression=OpenEXR.PXR24_COMPRESSION), "either"),
+    "without an albedo": (without("Albedo"), "refused"),
+    "without a normal": (without("Normal"), "either"),
+    "without vectors": (without("Vector"), "works"),
+    "without any guide": (without("Albedo", "Normal", "Vector"), "refused"),
+    "without a color": (without("Combined"), "refused"),
+    "with a layer more": (lambda p, x: write(p, {**x, "ViewLayer.Mist": x[COLOR][..., 0]}), "works"),
+    "with another view layer too": (lambda p, x: write(p, {**x, "Fog.Combined": x[COLOR]}), "either"),
+    "of another view layer": (lambda p, x: write(p, {k.replace("ViewLayer", "Fog"): v for k, v in x.items()}), "refused"),
+    "with an alpha": (with_layer(COLOR, lambda v: np.concatenate([v, np.ones((*SIZE, 1))], -1)), "either"),
+    "of one channel": (lambda p, x: write(p, {"": x[COLOR][..., 0]}), "refused"),
+    "that is black": (with_layer(COLOR, lambda v: 1e-20 + 0 * v), "either"),
+    "of vectors that are not finite": (with_layer(VECTOR, lambda v: np.nan * v), "works"),
+    "of vectors of a million": (with_layer(VECTOR, lambda v: 1e6 + v), "works"),
+    "with normals of zero": (with_layer(NORMAL, lambda v: 0 * v), "works"),
+    "with a negative albedo": (with_layer(ALBEDO, lambda v: -v), "works"),
+    "with an albedo of zero": (with_layer(ALBEDO, lambda v: 0 * v), "works"),
+    "with an albedo of a thousand": (with_layer(ALBEDO, lambda v: 1000 * v), "works"),
+    "a thousand times brighter": (with_layer(COLOR, lambda v: 1000 * v), "works"),
+    "a millionth as bright": (with_layer(COLOR, lambda v: 1e-6 * v), "works"),
+    "of negative light": (with_layer(COLOR, lambda v: -v), "either"),
+    "cut short": (lambda p, x: os.truncate(p, p.stat().st_size - 500), "refused"),
+    "that is empty": (lambda p, x: os.truncate(p, 0), "refused"),
+}  # fmt: skip
+
+
+@cases(UNLIKE)
+def test_a_frame_unlike_the_others_is_refused_by_its_name_or_keeps_what_it_had(folder, case):
+    change, how = case
+    path = shot(folder / "in", 5, step=(2, 1)) / "shot.1003.exr"
+    change(path, read_layers(path))
+    done = ravg(*pseudoref(), folder=folder, seconds=60).ends(how)
+    if done.code:
+        assert "1003" in done.said
+        return
+    for name in names(folder / "in"):
+        before, after = read(folder / "in" / name), read(folder / "out" / name)
+        assert {k: (v.dtype, v.shape) for k, v in before.items()} == {k: (v.dtype, v.shape) for k, v in after.items()}
+        red = next(k for k in before if k.endswith("Combined.R") or k == "R")
+        assert np.isfinite(after[red]).all()
+        assert 0.7 < after[red].mean() / before[red].mean() < 1.4
+        for channel in before:
+            if not channel.endswith(("Combined.R", "Combined.G", "Combined.B")):
+                np.testing.assert_array_equal(before[channel], after[channel])

@@ -1,0 +1,334 @@
+"""Nobody else's file is touched: rows 8, 9, 10 and 19 of docs/reliability.md."""
+
+# ruff: noqa: E501 - tables of cases, one a line
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from tests.commands import OURS, ROOT, ravg, run_python
+from tests.reliability.shots import DRAFT, blurred, cases, contents, no_leftovers, pseudoref, shot, unchanged, weights
+
+pytestmark = [pytest.mark.reliability, pytest.mark.posix]
+Make = Callable[[Path], object]
+ROOT_ONLY = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs root")
+
+# --- 8: nobody else's file is written over
+
+
+def spared(folder: Path, words: Callable[[Path], Sequence[object]]) -> None:
+    """Assert that nothing that was there before is another afterwards, whatever a command is told to write."""
+    blurred(folder / "single", shot(folder / "in", 3))
+    weights(folder, ROOT)
+    given = words(folder)
+    before, kinds = contents(folder), {path: path.lstat().st_mode for path in folder.rglob("*")}
+    done = ravg(*given, folder=folder)
+    assert "Traceback" not in done.said
+    assert done.code != -9
+    assert {path: path.lstat().st_mode for path in kinds} == kinds
+    unchanged(before)
+
+
+def device(folder: Path) -> Path:
+    os.mknod(folder / "null.png", 0o020666, os.makedev(1, 3))
+    return folder / "null.png"
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe.png")
+    return folder / "pipe.png"
+
+
+def link(to: str, name: str = "soft.png") -> Make:
+    def make(folder: Path) -> str:
+        (folder / name).symlink_to(folder / to)
+        return name
+
+    return make
+
+
+def hard_link(to: str) -> Make:
+    def make(folder: Path) -> str:
+        os.link(folder / to, folder / "hard.png")
+        return "hard.png"
+
+    return make
+
+
+TARGETS: dict[str, Make] = {
+    "a frame": lambda f: "in/shot.1002.exr",
+    "an estimate": lambda f: "single/shot.1002.exr",
+    "an estimate, by a link": link("single/shot.1002.exr"),
+    "an estimate, by a hard link": hard_link("single/shot.1002.exr"),
+    "a frame, by a folder's other name": lambda f: "single/../in/shot.1001.exr",
+    "a device": device,
+    "a pipe": pipe,
+    "the output": lambda f: "in/../in/shot.1003.exr",
+}
+WEIGHTS: dict[str, Make] = {
+    "the weights": lambda f: "w.safetensors",
+    "the weights, by a link": link("w.safetensors"),
+    "the weights, by a hard link": hard_link("w.safetensors"),
+}
+
+
+@cases(TARGETS, "target")
+def test_a_preview_is_written_over_nothing(folder, target):
+    spared(folder, lambda f: pseudoref("--estimate", "single", "--preview", target(f)))
+
+
+DENOISE = ["denoise", "in", "-o", "out", "--weights", "w.safetensors", "--estimate", "nlm"]
+
+
+@pytest.mark.neural
+@cases({name: TARGETS[name] for name in ("a frame", "a device")} | WEIGHTS, "target")
+def test_a_breakdown_is_written_over_nothing(folder, target):
+    spared(folder, lambda f: [*DENOISE, "--breakdown", target(f)])
+
+
+@pytest.mark.neural
+@cases(WEIGHTS, "target")
+def test_a_preview_is_written_over_no_weights(folder, target):
+    spared(folder, lambda f: [*DENOISE, "--preview", target(f)])
+
+
+@cases(("single", "in"), "where")
+def test_an_output_is_written_over_no_input(folder, where):
+    spared(folder, lambda f: ["pseudoref", "in", "-o", where, *DRAFT, "--estimate", "single"])
+
+
+@cases(("ravg.json", "ravg", "ravg/shot.1001-1003.json"), "name")
+def test_a_record_is_written_over_no_file_of_that_name(folder, name):
+    def words(folder: Path) -> Sequence[object]:
+        path = folder / "out" / name
+        path.parent.mkdir(parents=True)
+        path.write_text('{"mine": true}')
+        return pseudoref()
+
+    spared(folder, words)
+
+
+def test_links_under_temporary_names_are_not_followed(folder):
+    """Under all names that temporary files could have, were they told by host and process."""
+
+    def words(folder: Path) -> Sequence[object]:
+        (folder / "out").mkdir()
+        (folder / "victim").write_text("mine")
+        host = re.sub(r"\W", "_", socket.gethostname()) or "host"
+        for number, process in product(range(1001, 1004), range(os.getpid(), os.getpid() + 3000)):
+            name = f".shot.{number}.exr.{host}-{process}-{threading.get_ident()}.tmp"
+            (folder / "out" / name).symlink_to(folder / "victim")
+        return pseudoref()
+
+    spared(folder, words)
+
+
+@cases(("../../evil", "../../../in/shot.1001", "/tmp/ravg-evil", "..", "a/../../../b", "x" * 300), "name")
+def test_a_comparison_writes_into_its_folder_alone(folder, name):
+    shot(folder / "in", 3)
+    shot(folder / "clean", 3, noise=0)
+    (folder / "a" / "b").mkdir(parents=True)
+    before, inside = set(folder.rglob("*")), folder / "a" / "b" / "c"
+    words = ["compare", "in", "--reference", "clean", "--methods", "draft", "--rounds", "1", "-o", "a/b/c"]
+    ravg(*words, "--external", f"{name}=clean", folder=folder).ends("either")
+    assert [p for p in folder.rglob("*") if p not in before and inside not in (p, *p.parents)] == []
+    assert not Path("/tmp/ravg-evil").exists()
+
+
+# --- 9: two containers leave each other's files alone
+
+HOLD = """
+import os, pathlib, sys
+from hybrid.files.replace import replace_file, temporary_folder
+kind, path, number = sys.argv[1], pathlib.Path(sys.argv[2]), int(sys.argv[3])
+while os.getpid() < number:  # each child has the next number
+    if child := os.fork():
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+with (replace_file if kind == "file" else temporary_folder)(path) as temporary:
+    inside = temporary if kind == "file" else temporary / "a.exr"
+    inside.write_bytes(b"whole")
+    print("begun", flush=True)
+    sys.stdin.read(1)
+    print(inside.read_bytes().decode(), flush=True)
+"""
+
+
+def hold(folder: Path, kind: str, number: int, *prefix: str) -> subprocess.Popen[str]:
+    """A process that is in the midst of writing into `out`."""
+    shot(folder / "in", 2)
+    (folder / "out").mkdir()
+    child = subprocess.Popen(
+        [*prefix, sys.executable, "-P", "-c", HOLD, kind, str(folder / "out" / "other.0001.exr"), str(number)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "begun\n"
+    return child
+
+
+@ROOT_ONLY
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare")
+@cases((False, True), "proc_of_its_own")
+@cases(("file", "folder"), "kind")
+def test_a_process_of_another_container_keeps_what_it_writes(folder, kind, proc_of_its_own):
+    # The lowest number that no process has which is seen here: the other one may have it there.
+    free = next(number for number in range(2, 10**6) if not Path(f"/proc/{number}").exists())
+    words = ["unshare", "--pid", "--fork", *(["--mount-proc"] if proc_of_its_own else [])]
+    child = hold(folder, kind, free, *words)
+    ravg(*pseudoref(), folder=folder).succeeds()
+    said, _ = child.communicate("x")
+    assert child.returncode == 0
+    assert "whole" in said
+
+
+@cases(("file", "folder"), "kind")
+def test_what_a_killed_process_has_left_goes(folder, kind):
+    child = hold(folder, kind, 0)
+    child.kill()
+    child.communicate()
+    ravg(*pseudoref(), folder=folder).succeeds()
+    no_leftovers(folder / "out")
+
+
+# --- 10: a home that is read-only, compiled loops cut short
+
+# The interpreter itself may be root's alone: what it needs is loaded before.
+AS_NOBODY = f"""
+import os, sys
+sys.path.insert(0, {str(ROOT)!r})
+import numba
+import tests.loaded
+from tests.commands import OURS
+numba.njit(lambda x: 2 * x)(1)
+os.setegid(65534), os.seteuid(65534)
+for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
+    del sys.modules[name]
+sys.path[0] = os.environ["INSTALLED"]
+from hybrid.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def installed(folder: Path, *, compiled: bool) -> Path:
+    """The packages as an administrator installs them: not for the user to write to."""
+    for name in OURS:
+        ignore = None if compiled else shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, folder / "installed" / name, ignore=ignore)
+    return folder / "installed"
+
+
+COMMANDS = {"help": ["--help"], "inspect": ["inspect", "in"], "status": ["status", "--help"]}
+
+
+@ROOT_ONLY
+@cases((True, False), "temporary")
+@cases(COMMANDS, "words")
+def test_a_user_without_a_home_runs_an_installation_of_roots(folder, words, temporary):
+    packages = installed(folder, compiled=False)
+    shot(folder / "in", 1)
+    (folder / "tmp").mkdir()
+    for path in (folder, folder / "tmp"):
+        path.chmod(0o777)
+    environment = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent", "INSTALLED": str(packages)}
+    environment["TMPDIR"] = str(folder / "tmp" if temporary else folder / "none")
+    run_python("-c", AS_NOBODY, *words, packages=Path("/nonexistent"), folder=folder, **environment).succeeds()
+
+
+@cases((0, 0.5, 0.99), "share")
+@cases(("nbi", "nbc"), "kind")
+def test_compiled_loops_that_are_cut_short_are_compiled_again(folder, kind, share):
+    shot(folder / "in", 1)
+    packages = installed(folder, compiled=True)
+    run_python("-m", "ravg", *pseudoref(), packages=packages, folder=folder).succeeds()
+    files = sorted((packages / "nlm" / "__pycache__").glob(f"average*.{kind}"))
+    assert files
+    for path in files:
+        os.truncate(path, int(share * path.stat().st_size))
+    run_python("-m", "ravg", *pseudoref(), packages=packages, folder=folder).succeeds()
+
+
+# --- 19: outputs in odd places
+
+
+def linked(folder: Path, name: str, to: str) -> None:
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).symlink_to(folder / to)
+
+
+def written(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("x")
+
+
+def fifo(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    os.mkfifo(path)
+
+
+def nothing(folder: Path) -> None:
+    """Leave all as it is."""
+
+
+FRAMES = "in/shot.####.exr"
+# What is done before; what is written where; how it ends.
+ODD: dict[str, tuple[Make, Sequence[str], str]] = {
+    "an output by a link to a folder": (lambda f: [(f / "real").mkdir(), linked(f, "out", "real")], ["-o", "out"], "works"),
+    "an output by a link to the input": (lambda f: linked(f, "out", "in"), ["-o", "out"], "refused"),
+    "an output by a dangling link": (lambda f: linked(f, "out", "none"), ["-o", "out"], "either"),
+    "an output within the input": (nothing, ["-o", "in/out"], "works"),
+    "another name in the input's folder": (nothing, [FRAMES, "-o", "in/done.####.exr"], "works"),
+    "the input's name in other letters": (nothing, [FRAMES, "-o", "in/SHOT.####.EXR"], "either"),
+    "the input, padded otherwise": (nothing, [FRAMES, "-o", "in/shot.#.exr"], "refused"),
+    "the input by ./": (nothing, ["-o", "./in/../in/./shot.####.exr"], "refused"),
+    "hard links as frames": (lambda f: (f / "in/shot.1004.exr").hardlink_to(f / "in/shot.1001.exr"), ["-o", "out"], "works"),
+    "links as frames": (lambda f: linked(f, "in/shot.1004.exr", "in/shot.1001.exr"), ["-o", "out"], "works"),
+    "an output that links to a frame": (lambda f: linked(f, "out/shot.1002.exr", "in/shot.1001.exr"), ["-o", "out"], "refused"),
+    "an output that links to a stranger's": (lambda f: [written(f / "single/x"), linked(f, "out/shot.1002.exr", "single/x")], ["-o", "out"], "either"),
+    "an output that is a folder": (lambda f: (f / "out/shot.1002.exr").mkdir(parents=True), ["-o", "out"], "refused"),
+    "an output that is a pipe": (lambda f: fifo(f / "out/shot.1002.exr"), ["-o", "out"], "refused"),
+    "a preview that is an output": (nothing, ["-o", "out", "--preview", "out/shot.1002.exr"], "refused"),
+    "a preview without an extension": (nothing, ["-o", "out", "--preview", "out/x"], "refused"),
+    "a preview in a folder that is not there": (nothing, ["-o", "out", "--preview", "no/such/x.png"], "either"),
+    "a preview and a sheet in one file": (nothing, ["-o", "out", "--preview", "x.png", "--contact", "./x.png"], "refused"),
+    "a log that is a frame": (nothing, ["-o", "out", "--log-file", "in/shot.1002.exr"], "refused"),
+    "a log that is an output": (nothing, ["-o", "out", "--log-file", "out/shot.1002.exr"], "refused"),
+    "a log that is the preview": (nothing, ["-o", "out", "--log-file", "x.png", "--preview", "x.png"], "refused"),
+    "a log that is the record": (nothing, ["-o", "out", "--log-file", "out/ravg/shot.1001-1003.json"], "refused"),
+    "a log that is a pipe": (lambda f: fifo(f / "pipe"), ["-o", "out", "--log-file", "pipe"], "refused"),
+    "a log that is a folder": (nothing, ["-o", "out", "--log-file", "in"], "refused"),
+    "records in a folder that is a file": (lambda f: written(f / "out/ravg"), ["-o", "out"], "refused"),
+    "estimates that are the input": (nothing, ["-o", "out", "--estimate", "in"], "either"),
+    "estimates in the output": (nothing, ["-o", "single", "--estimate", "single"], "refused"),
+    "a very long name": (nothing, ["-o", "x" * 240 + ".####.exr"], "either"),
+    "a name that is too long": (nothing, ["-o", "x" * 300 + ".####.exr"], "refused"),
+    "a path that is too long": (nothing, ["-o", "/".join(["x" * 200] * 30)], "refused"),
+    "a name with a zero": (nothing, ["-o", "a\0b"], "refused"),
+    "a pattern with two places": (nothing, ["-o", "out_##/x.####.exr"], "works"),
+    "one name for several frames": (nothing, ["-o", "out/x.exr"], "refused"),
+    "the root": (nothing, ["-o", "/proc/x"], "refused"),
+}  # fmt: skip
+
+
+@cases(ODD)
+def test_an_odd_place_works_or_is_refused_and_spares_what_is_there(folder, case):
+    prepare, words, how = case
+    blurred(folder / "single", shot(folder / "in", 3))
+    prepare(folder)
+    before = contents(folder / "in", folder / "single")
+    source = [] if words[0] == FRAMES else ["in"]
+    ravg("pseudoref", *DRAFT, *source, *words, folder=folder, seconds=60).ends(how)
+    unchanged(before)
