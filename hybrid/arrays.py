@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.motion import MotionConvention
-from hybrid.alignment.align import Aligner
 from hybrid.estimates import SPECS
 from hybrid.files.frame import Frame
 from hybrid.files.profile import parse_motion
 from hybrid.files.shots import Shot
 from hybrid.job import DenoiseOptions, choose_first_pass, open_denoiser, replace_options
-from hybrid.plan import Plan, as_run
-from hybrid.steady import Pictures
+from hybrid.plan import Plan
+from hybrid.stabilize import FrameDenoiser
+from hybrid.stream import FrameStream
 
 Array = NDArray[np.float32]
 
@@ -173,11 +173,11 @@ def _denoise(
 ) -> Iterator[ArrayResult]:
     denoiser = open_denoiser(options)
     source = choose_first_pass(cast("Shot", shot), options, denoiser)
-    pictures = Pictures(Aligner(shot, options.rules, radius=denoiser.radius, estimates=source.estimates), denoiser)
+    stream = FrameStream(shot, options.rules, source.estimates, radius=denoiser.radius)
+    denoise = FrameDenoiser(stream, denoiser)
     for number in numbers:
-        denoised, counts = pictures.make(number)
-        plan = as_run(options.rules.plan(*counts.facts), counts.stages, counts.shares)
-        result = ArrayResult(number, {"color": denoised.color, **denoised.aovs}, plan)
+        made = denoise.make(number)
+        result = ArrayResult(number, {"color": made.denoised.color, **made.denoised.aovs}, made.plan)
         yield result
         if progress is not None and progress(result) is False:
             return

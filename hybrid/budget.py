@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from hybrid.alignment.align import Aligner, Estimates
 from hybrid.denoisers import WindowDenoiser
-from hybrid.estimates import EstimateSource, OfFrames
+from hybrid.estimates import EstimateSource, PerFrame
 from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
 from hybrid.plan import Rules
-from hybrid.steady import Pictures
+from hybrid.stabilize import FrameDenoiser
+from hybrid.stream import FirstPass, FrameStream
 
 # Pixels on a side of the part that is measured: large enough that threads have work, small enough for seconds.
 SIDE = 512
@@ -72,8 +72,8 @@ def measure_presets(
     for preset in presets:
         denoiser, source = load(preset)
         # A sequence holds whole frames, and only a part is measured.
-        given: Estimates | None = OfFrames(lambda frame: frame.color) if source.name == "sequence" else source.estimates
-        frames, spent = Pictures(Aligner(part, rules, radius=denoiser.radius, estimates=given), denoiser), []
+        given: FirstPass | None = PerFrame(lambda frame: frame.color) if source.name == "sequence" else source.estimates
+        frames, spent = FrameDenoiser(FrameStream(part, rules, given, radius=denoiser.radius), denoiser), []
         for number in numbers:
             start = time.perf_counter()
             frames.make(number)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid.alignment.window import AlignedWindow
 from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, gather_and_denoise
 from hybrid.runtime.timing import Timings
-from hybrid.steady import Denoised
+from hybrid.stabilize import Denoised
 
 Array = NDArray[np.float32]
 

@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import Aligner, Estimates
-from hybrid.alignment.loading import REACH
+from hybrid.alignment.align import align
+from hybrid.alignment.fireflies import REACH
 from hybrid.files.frame import Frame
 from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
 from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
+from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Lights, hold_lights
@@ -50,8 +50,8 @@ MODE_OF = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
 
 
 @dataclass(frozen=True)
-class OfFrames:
-    """Estimates that are a function of the frame alone.
+class PerFrame:
+    """A first pass that is a function of the frame alone.
 
     Attributes
     ----------
@@ -67,25 +67,22 @@ class OfFrames:
     holds: int = 0
     files: Shot | None = None
     from_noisy = False
+    reads_frame = True
 
     def reach(self, radius: int) -> int:
-        """See `hybrid.alignment.align.Estimates`."""
+        """See `hybrid.stream.FirstPass`."""
         return radius
 
-    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
-        """See `hybrid.alignment.align.Estimates`."""
-
-        def seen(frame: Frame) -> None:
-            with aligner.timings.stage("estimate"):
-                highlights = aligner.frames[frame.number].highlights
-                aligner.estimates[frame.number] = _checked(self.function(frame), frame, highlights)
-
-        aligner.load(numbers, seen)
+    def make(self, stream: FrameStream, number: int) -> Array | None:
+        """See `hybrid.stream.FirstPass`."""
+        frame, prepared = stream.as_read(number), stream.frame(number)
+        with stream.timings.stage("estimate"):
+            return _checked(self.function(frame), frame, None if prepared is None else prepared.highlights)
 
 
 @dataclass(frozen=True)
-class OfGuidedFrames:
-    """Estimates by a denoiser that wants to know whether it can rely on its guides.
+class GuideAware:
+    """A first pass by a denoiser whose settings depend on the noise of its guides.
 
     Attributes
     ----------
@@ -100,51 +97,46 @@ class OfGuidedFrames:
     holds: int = 0
     files = None
     from_noisy = False
+    reads_frame = False
 
     def reach(self, radius: int) -> int:
-        """See `hybrid.alignment.align.Estimates`."""
+        """See `hybrid.stream.FirstPass`."""
         return radius + GUIDE_RADIUS
 
-    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
-        """See `hybrid.alignment.align.Estimates`."""
-        ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        around = {n: aligner.frames.around(n, GUIDE_RADIUS) for n in ahead}
-        aligner.load(sorted({*numbers, *chain.from_iterable(around.values())}))
-        for n in ahead:
-            frame = aligner.frames.get(n)
-            if frame is None:
-                continue
-            noisy = "prefilter" in aligner.frames.stages_of(around[n])
-            alone = Frame(n, frame.radiance, frame.albedo, frame.normal)
-            with aligner.timings.stage("estimate"):
-                aligner.estimates[n] = _checked(self.function(alone, noisy), alone)
+    def make(self, stream: FrameStream, number: int) -> Array | None:
+        """See `hybrid.stream.FirstPass`."""
+        prepared = stream.frame(number)
+        assert prepared is not None
+        noisy = "prefilter" in stream.plan(stream.around(number, GUIDE_RADIUS)).stages
+        frame = Frame(number, prepared.radiance, prepared.albedo, prepared.normal)
+        with stream.timings.stage("estimate"):
+            return _checked(self.function(frame, noisy), frame)
 
 
 @dataclass(frozen=True)
-class OfWindows:
-    """Our own estimates, each made from the window of noisy frames around it; a window of them reaches twice as far.
+class Classical:
+    """A first pass by the classical chain, from the window of noisy frames around each frame.
 
     Attributes
     ----------
     preset : ClassicalPreset
-        How much work to put in.
+        The settings of the chain.
     """
 
     preset: ClassicalPreset
     holds = 0
     files = None
     from_noisy = True
+    reads_frame = False
 
     def reach(self, radius: int) -> int:
-        """See `hybrid.alignment.align.Estimates`."""
+        """See `hybrid.stream.FirstPass`."""
         return 2 * radius
 
-    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
-        """See `hybrid.alignment.align.Estimates`."""
-        ahead = [n for n in numbers if aligner.shot.has(n) and n not in aligner.estimates]
-        aligner.load(sorted({*numbers, *(m for n in ahead for m in aligner.frames.around(n, aligner.radius))}))
-        for n in ahead:
-            aligner.estimates[n] = filter_window(aligner.align_noisy(n), self.preset, timings=aligner.timings)
+    def make(self, stream: FrameStream, number: int) -> Array:
+        """See `hybrid.stream.FirstPass`."""
+        window = align(stream.window(number, noisy=True), timings=stream.timings)
+        return filter_window(window, self.preset, timings=stream.timings)
 
 
 @dataclass(frozen=True)
@@ -155,8 +147,8 @@ class EstimateSource:
     ----------
     name : str
         What was taken; written to the header of the output.
-    estimates : Estimates or None
-        What an `Aligner` takes; None for none.
+    estimates : FirstPass or None
+        For a `FrameStream`; None for none.
     reason : str
         Why this one.
     files : Shot or None
@@ -168,7 +160,7 @@ class EstimateSource:
     """
 
     name: str
-    estimates: Estimates | None
+    estimates: FirstPass | None
     reason: str
     files: Shot | None = None
     kept: tuple[Path, ...] = ()
@@ -248,18 +240,18 @@ def _choose(
 ) -> EstimateSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
-            return EstimateSource("file", OfFrames(_from_file), "the file holds a denoised picture")
+            return EstimateSource("file", PerFrame(_from_file), "the file holds a denoised picture")
         if (lacking := why_no_oidn()) is None:
             if quicker is not None and find_device(device) == "cpu":
                 return _oidn(mode, keep, "OIDN is installed; its networks run in torch", "cpu", quicker)
             return _oidn(mode, keep, "OIDN is installed", device)
         if bundled is not None:
             return _bundled(mode, bundled, f"{lacking}; a network comes with ravg")
-        return EstimateSource("nlm", OfWindows(own), f"no denoised picture in the file, and {lacking}")
+        return EstimateSource("nlm", Classical(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
         return EstimateSource("none", None, "asked for")
     if spec == "nlm":
-        return EstimateSource("nlm", OfWindows(own), "asked for")
+        return EstimateSource("nlm", Classical(own), "asked for")
     if spec == "bundled":
         if bundled is None:
             raise ImportError("estimate bundled: torch is needed, which this command does without; expected another")
@@ -279,13 +271,13 @@ def _choose(
     if grade is not None and grade.factors is None:
         raise ValueError(f"estimate {spec}: it {grade.message}, expected pictures of the shot's own light")
     factors, why = (None, "asked for") if grade is None else (grade.factors, f"it {grade.message}: brought to that")
-    read = OfFrames(partial(_read_sequence, sequence, factors), files=sequence)
+    read = PerFrame(partial(_read_sequence, sequence, factors), files=sequence)
     return EstimateSource("sequence", read, why, sequence)
 
 
 def _bundled(mode: str, run: Callable[..., Array], reason: str) -> EstimateSource:
     quality = OIDN_MODES[mode]["quality"]
-    return EstimateSource("bundled", OfFrames(partial(estimate_oidn, denoise=run, quality=quality)), reason)
+    return EstimateSource("bundled", PerFrame(partial(estimate_oidn, denoise=run, quality=quality)), reason)
 
 
 def _oidn(
@@ -302,7 +294,7 @@ def _oidn(
         run = partial(kept.read_or_run, run=run)
     most = HOLDS_FAST if mode == "oidn-fast" else HOLDS
     holds = most if quicker is None else 0  # networks in torch work on a strip at a time
-    estimates = OfGuidedFrames(run, holds) if mode == "oidn-clean" else OfFrames(run, holds)
+    estimates = GuideAware(run, holds) if mode == "oidn-clean" else PerFrame(run, holds)
     places = () if kept is None else tuple(kept.places.values())
     return EstimateSource(mode, estimates, reason, kept=places, device=device)
 

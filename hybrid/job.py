@@ -19,7 +19,7 @@ from types import ModuleType
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
 from hybrid.denoisers import AverageDenoiser, ClassicalDenoiser, PooledDenoiser, WindowDenoiser
-from hybrid.estimates import MODE_OF, OIDN_MODES, SPECS, EstimateSource, OfFrames, choose_estimate
+from hybrid.estimates import MODE_OF, OIDN_MODES, SPECS, EstimateSource, PerFrame, choose_estimate
 from hybrid.files.passes import BEAUTY
 from hybrid.files.replace import temporary_folder
 from hybrid.files.sequences import format_frames
@@ -27,13 +27,24 @@ from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import PACKAGES, versions
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import find_device
-from hybrid.pipeline import Failed, Finished, SourcesOf, check_written, denoise_frames, reach_of, sources_of
-from hybrid.plan import NEURAL_STAGES, Rules, plan_shot
+from hybrid.pipeline import (
+    Failed,
+    Finished,
+    RunSettings,
+    SourcesOf,
+    View,
+    check_written,
+    denoise_frames,
+    sources_of,
+    temporal_support,
+)
+from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.threads import limit_threads
 from hybrid.runtime.timing import Timings
+from hybrid.stream import plan_shot
 from hybrid.validation import ValidationReport, find_cut, validate_layers
 
 LOG = logging.getLogger("ravg")
@@ -317,7 +328,7 @@ class Job:
     @property
     def _margins(self) -> list[int]:
         """For each pass, the frames on each side of those asked for that later passes need."""
-        support = reach_of(None, self.denoiser.radius, self.options.rules)
+        support = temporal_support(None, self.denoiser.radius, self.options.rules)
         return [support * (self.options.passes - number) for number in range(1, self.options.passes + 1)]
 
     def header(self) -> dict[str, str]:
@@ -514,7 +525,7 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
     """
     if not denoiser.needs_first_pass:
         return EstimateSource("none", None, "the denoiser takes none")
-    support = reach_of(None, denoiser.radius, options.rules)
+    support = temporal_support(None, denoiser.radius, options.rules)
     quicker, bundled = denoiser.backends
     return choose_estimate(
         "nlm" if options.first_pass == "none" else options.first_pass,
@@ -623,29 +634,30 @@ def run_job(job: Job, progress: Progress | None = None) -> Iterator[Finished | F
         limit_threads(options.threads)
     if options.reuse_freed_memory and options.max_memory is None:
         reuse_freed_memory()
-    views, first_passes = job.views, [source.estimates for source in job.first_passes]
+    views = [View(shot, source.estimates) for shot, source in zip(job.views, job.first_passes, strict=True)]
     sources: SourcesOf | None = None
-    home = output_path(job.output, views[0], views[0].numbers[0]).parent
+    home = output_path(job.output, job.views[0], job.views[0].numbers[0]).parent
     with ExitStack() as stack:
         for run, margin in enumerate(job._margins, start=1):
             last = run == runs
-            shot = views[0].with_neighbours(margin)
+            shot = views[0].shot.with_neighbours(margin)
             output = job.output if last else str(stack.enter_context(temporary_folder(home / f"pass{run}")))
+            settings = RunSettings(
+                rows=job.rows,
+                background=options.max_memory is None,
+                resume=options.resume and last,
+                keep_going=options.keep_going and last,
+                attributes=job.header(),
+                sources=sources,
+            )
             frames = denoise_frames(
-                shot,
+                [View(shot, views[0].first_pass), *views[1:]],
                 output,
                 job.denoiser if last or job.breakdown is None else open_denoiser(options, job.timings),
                 options.rules,
+                settings,
                 radius=job.denoiser.radius,
-                estimates=first_passes[0],
-                others=list(zip(views[1:], first_passes[1:], strict=True)),
-                attributes=job.header(),
-                rows=job.rows,
-                beside=options.max_memory is None,
-                resume=options.resume and last,
-                keep_going=options.keep_going and last,
                 timings=job.timings,
-                before=sources,
             )
             for frame in frames:
                 done += 1
@@ -655,11 +667,9 @@ def run_job(job: Job, progress: Progress | None = None) -> Iterator[Finished | F
                 if last:
                     yield frame
             if not last:
-                pictures = list(zip(views, first_passes, strict=True))
-                sources = sources_of(pictures, job.denoiser.radius, options.rules, sources)
+                sources = sources_of(views, job.denoiser.radius, options.rules, sources)
                 files = {number: output_path(output, shot, number) for number in shot.numbers}
-                views = tuple(view.reopened(files) for view in views)
-                first_passes = [OfFrames(lambda frame: frame.color)] * len(views)
+                views = [View(view.shot.reopened(files), PerFrame(lambda frame: frame.color)) for view in views]
         if options.breakdown is not None:
             write_breakdown(list(job.views), job.output, 2 * job.denoiser.radius + 1, options.breakdown)
 

@@ -10,10 +10,11 @@ import math
 import re
 from collections.abc import Collection
 
-from hybrid.alignment.align import MARGIN, Estimates
+from hybrid.alignment.align import MARGIN
 from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 from hybrid.oidn import HOLDS, HOLDS_FAST
+from hybrid.stream import FirstPass
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
@@ -54,7 +55,7 @@ def plan_rows(
     limit: int,
     shot: Shot,
     stages: Collection[str],
-    estimates: Estimates | None = None,
+    estimates: FirstPass | None = None,
     *,
     radius: int = 2,
     network: int | None = None,
@@ -70,7 +71,7 @@ def plan_rows(
         Its headers are read.
     stages : collection of str
         Which may run on some frame.
-    estimates : Estimates, optional
+    estimates : FirstPass, optional
         Where the estimates of single frames come from.
     radius : int
         Frames on each side of the centre.
@@ -125,7 +126,7 @@ def plan_rows(
 
 
 def _planes(
-    shot: Shot, stages: Collection[str], estimates: Estimates | None, radius: int, neural: bool
+    shot: Shot, stages: Collection[str], estimates: FirstPass | None, radius: int, neural: bool
 ) -> tuple[float, float, float]:
     """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
     header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
@@ -166,7 +167,7 @@ def _planes_written(layers: Layers) -> float:
 
 
 def _planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
-    """Count the float32 planes of the flows that an `Aligner` keeps.
+    """Count the float32 planes of the flows that a `FrameStream` keeps.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Denoise a shot: align each window, estimate its centre, write the frame."""
+"""Denoise the frames of a shot, and write each to its file."""
 
 from __future__ import annotations
 
@@ -6,24 +6,26 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import Aligner, Estimates
-from hybrid.alignment.loading import REACH
-from hybrid.alignment.window import AlignedWindow
+from hybrid.alignment.fireflies import REACH
 from hybrid.beside import ReadAhead
 from hybrid.estimates import OIDN_MODES, EstimateSource
 from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
-from hybrid.plan import Plan, Rules, as_run
+from hybrid.plan import Plan, Rules
 from hybrid.runtime.timing import Timings
-from hybrid.steady import Denoised, DenoiseWindow, Pictures
+from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
+from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import find_nonfinite
 
 Array = NDArray[np.float32]
@@ -37,7 +39,7 @@ SourcesOf = Callable[[int], dict[str, Source]]
 
 @dataclass(frozen=True)
 class Failed:
-    """A frame that could not be made, and why."""
+    """A frame that could not be denoised or written, and why."""
 
     number: int
     error: Exception
@@ -136,258 +138,281 @@ def describe_run(
     }
 
 
+class View(NamedTuple):
+    """A picture of the files of a shot, with the first pass of its frames."""
+
+    shot: Shot
+    first_pass: FirstPass | None = None
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How frames are read, denoised and written; none of it changes a pixel.
+
+    Attributes
+    ----------
+    rows : int or None
+        How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); None for all.
+    background : bool
+        Whether to read and write in the background, which takes the memory of one frame read and one written.
+    resume : bool
+        Leave frames alone that are there, whole, and would be the same: with these attributes, of the same files.
+    keep_going : bool
+        Where a frame cannot be read, denoised or written, go on with the next.
+    attributes : mapping of str to str
+        Written to the header of each file.
+    sources : callable or None
+        The files that the frames of the shot were made from by an earlier pass (`sources_of`).
+    """
+
+    rows: int | None = None
+    background: bool = True
+    resume: bool = False
+    keep_going: bool = False
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    sources: SourcesOf | None = None
+
+
 def denoise_frames(
-    shot: Shot,
+    views: Sequence[View],
     output: str | Path,
     denoise: DenoiseWindow,
     rules: Rules,
+    settings: RunSettings = RunSettings(),
     *,
     radius: int = 2,
-    estimates: Estimates | None = None,
-    others: Sequence[tuple[Shot, Estimates | None]] = (),
-    attributes: Mapping[str, str] | None = None,
-    rows: int | None = None,
-    beside: bool = True,
-    resume: bool = False,
-    keep_going: bool = False,
     timings: Timings | None = None,
-    before: SourcesOf | None = None,
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
 
-    While a frame is made, the one before it is written in one thread; once it is denoised, the next one that its
-    successor needs is read in another.
+    While a frame is denoised, the one before it is written in one thread; after it is denoised, the next one that its
+    successor needs is read in another: memory is at its fullest while a denoiser runs.
 
     Parameters
     ----------
-    shot : Shot
-        What to denoise.
+    views : sequence of View
+        The shot, and further pictures of the same files (`Shot.pictures`), each with a window of its own. A file is
+        written once.
     output : str or Path
-        Where to write: a pattern with a placeholder for the frame number, or a folder.
+        A pattern with a placeholder for the frame number, or a folder.
     denoise : callable
         From `AlignedWindow` to `Denoised`.
     rules : Rules
-        What decides which stages run on a frame.
+        The forced stages.
+    settings : RunSettings
+        How frames are read, denoised and written.
     radius : int
         Frames on each side of the centre.
-    estimates : Estimates, optional
-        Where the estimates of single frames come from (`hybrid.estimates`).
-    others : sequence of (Shot, Estimates or None)
-        Further pictures of the same files (`Shot.views`), each with a window of its own. A file is written once.
-    attributes : mapping of str to str, optional
-        Written to the header of each file.
-    rows : int, optional
-        How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); all without. The result is the same.
-    beside : bool
-        Whether to read and write beside the work, which takes the memory of a frame that is read and one that is
-        written.
-    resume : bool
-        Leave frames alone that are there, whole, and would be made the same: with these attributes, of the same files.
-    keep_going : bool
-        Where a frame cannot be made, or read, or written, go on with those after it.
     timings : Timings, optional
-        Where to count the stages.
-    before : callable, optional
-        What the frames of the shot were made from themselves (`sources_of`), by a pass before this one.
+        Counts the stages.
 
     Yields
     ------
     Finished or Failed
         In the order of the frames, each after it has been written as a whole, or with `keep_going`, given up; most
-        often when the next one has been made.
+        often when the next one has been denoised.
 
     Raises
     ------
     ValueError
-        If a frame would be written over its own input, or its picture cannot be right: it is not finite, or its light
+        If a frame would be written over its own input, or its result cannot be right: it is not finite, or its light
         is not that of the noisy frame (`hybrid.validation.find_lost_light`).
 
     Notes
     -----
-    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). What
-    earlier processes have left half written is removed.
+    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). Files
+    that earlier processes have left half written are removed.
     """
     timings = timings or Timings()
-    all_pictures = ((shot, estimates), *others)
+    shot = views[0].shot
     paths = {number: output_path(output, shot, number) for number in shot.numbers}
     for folder in {path.parent for path in paths.values()}:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
-    sources = sources_of(all_pictures, radius, rules, before)
-    reach = reach_of(estimates, radius, rules)
-    with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
-        readers = [ReadAhead(picture, reader, timings) for picture, _ in all_pictures]
-        aligners = [
-            Aligner(frames, rules, radius=radius, estimates=theirs, timings=timings)
-            for frames, (_, theirs) in zip(readers, all_pictures, strict=True)
-        ]
-        after = dict(pairwise(shot.numbers))
-        making = shot.numbers[0]
-
-        def expect(number: int) -> None:
-            """Have the frames read ahead that the picture of a frame needs."""
-            # The outermost are read only where something shines in the one beside them, or by a later window.
-            near = shot.neighbours(number, reach - REACH) if beside else ()
-            for frames in readers:
-                frames.expect(near)
-
-        def denoise_window(aligned: AlignedWindow) -> Denoised:
-            denoised = denoise(aligned)
-            # No sooner: while a picture is denoised, memory is at its fullest.
-            expect(after.get(making, making))
-            return denoised
-
-        makers = [Pictures(aligner, denoise_window, rows=rows, keep_going=keep_going) for aligner in aligners]
-
-        def make(number: int) -> Finished | Callable[[], Finished]:
-            """Make a frame; give what writes it, or what there is to say of one that is there."""
-            nonlocal making
-            making = number
-            started, path = time.perf_counter(), paths[number]
-            read_as = [picture.layer_summary(number) for picture, _ in all_pictures]
-            # With its number: in a shot that one window holds, all frames are made from the same files.
-            made_from = describe_sources(sources(number), frame=number, layers=read_as, size=list(shot.shape))
-            planned = {**(attributes or {}), BESIDE: _others(number, makers[0].beside(number)), MADE_FROM: made_from}
-            again = why_stale(path, planned) if resume else ""
-            if again is None:
-                return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
-            expect(number)
-            made = [maker.make(number) for maker in makers]
-            counted = [counts for _, counts in made]
-            plan = as_run(rules.plan(*counted[0].facts), counted[0].stages, counted[0].shares)
-            layers = [{"color": denoised.color, **denoised.aovs} for denoised, _ in made]
-            with timings.stage("check"):
-                for images in layers:
-                    _check_finite(images, number)
-            others_there = _others(number, set.intersection(*({*counts.beside} for counts in counted)))
-            own = {
-                "ravg/stages": " ".join(sorted(plan.stages)),
-                BESIDE: others_there,
-                MADE_FROM: made_from,
-            }
-            pictures = [
-                (picture, images, denoised.extra)
-                for (picture, _), images, (denoised, _) in zip(others, layers[1:], made[1:], strict=True)
-            ]
-            extra, centre = made[0][0].extra, aligners[0].frames.get(number)
-            finished = Finished(
-                number=number,
-                path=path,
-                pixels=layers[0]["color"][..., 0].size * len(counted),
-                repaired=sum(counts.repaired for counts in counted),
-                fireflies=sum(counts.fireflies for counts in counted),
-                mean=0.0 if centre is None else centre.mean,
-                removed_radiance=0.0 if centre is None else centre.removed_radiance,
-                outliers=sum(counts.outliers for counts in counted),
-                plan=plan,
-                again=again,
-                seconds=time.perf_counter() - started,
-            )
-
-            def write() -> Finished:
-                with timings.beside("write"):
-                    for read in (shot, *(theirs.files for _, theirs in all_pictures if theirs is not None)):
-                        if read is not None:
-                            read.check_unchanged(n for n in shot.neighbours(number, reach) if read.has(n))
-                    headed = {**(attributes or {}), **own}
-                    clamped = shot.write(path, number, layers[0], extra, headed, pictures)
-                    return replace(finished, clamped=clamped + sum(counts.beyond for counts in counted))
-
-            return write
-
-        written: tuple[int, Future[Finished]] | None = None
-
-        def settle() -> list[Finished | Failed]:
-            """What became of the frame that was being written, if one was."""
-            nonlocal written
-            if written is None:
-                return []
-            (number, waited), written = written, None
+    with ExitStack() as threads:
+        reader = threads.enter_context(ThreadPoolExecutor(1, "read"))
+        writer = _Writer(threads.enter_context(ThreadPoolExecutor(1, "write")), settings.keep_going, timings)
+        frames = _ShotDenoiser(views, denoise, rules, settings, radius, reader, timings)
+        following = dict(pairwise(shot.numbers))
+        for number, path in paths.items():
+            made: Finished | Failed | Callable[[], Finished]
             try:
-                with timings.stage("write"):
-                    return [waited.result()]
-            except (ValueError, OSError) as error:
-                if not keep_going:
-                    raise
-                return [Failed(number, error)]
-
-        for number in paths:
-            outcome: Finished | Failed | Callable[[], Finished]
-            try:
-                outcome = make(number)
+                made = frames.make(number, path, following.get(number))
             except (Exception, KeyboardInterrupt) as error:
-                if not keep_going or not isinstance(error, ValueError | OSError):
-                    yield from settle()  # the frame before has been made all the same
+                if not settings.keep_going or not isinstance(error, ValueError | OSError):
+                    yield from writer.finish()  # the frame before is complete all the same
                     raise
-                outcome = Failed(number, error)
-            told = settle()
-            if isinstance(outcome, Finished | Failed):
-                told.append(outcome)
+                made = Failed(number, error)
+            done = writer.finish()
+            if callable(made):
+                writer.start(number, made)
             else:
-                written = number, writer.submit(outcome)
-            del outcome  # or the pictures would still be there while the next window is made
-            yield from told if beside else (*told, *settle())
-        yield from settle()
+                done.append(made)
+            del made  # or the result would still be there while the next window is denoised
+            yield from done if settings.background else (*done, *writer.finish())
+        yield from writer.finish()
+
+
+class _Writer:
+    """Writes one frame at a time in a thread."""
+
+    def __init__(self, thread: ThreadPoolExecutor, keep_going: bool, timings: Timings) -> None:
+        self._thread, self._keep_going, self._timings = thread, keep_going, timings
+        self._written: tuple[int, Future[Finished]] | None = None
+
+    def start(self, number: int, write: Callable[[], Finished]) -> None:
+        """Begin to write a frame; the one before is finished."""
+        self._written = number, self._thread.submit(write)
+
+    def finish(self) -> list[Finished | Failed]:
+        """Wait for the frame that is being written, if one is."""
+        if self._written is None:
+            return []
+        (number, future), self._written = self._written, None
+        try:
+            with self._timings.stage("write"):
+                return [future.result()]
+        except (ValueError, OSError) as error:
+            if not self._keep_going:
+                raise
+            return [Failed(number, error)]
+
+
+class _ShotDenoiser:
+    """Denoises frames of all views of a shot, and prepares them to be written."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        denoise: DenoiseWindow,
+        rules: Rules,
+        settings: RunSettings,
+        radius: int,
+        thread: ThreadPoolExecutor,
+        timings: Timings,
+    ) -> None:
+        self.views, self.settings, self.timings = views, settings, timings
+        self.shot = views[0].shot
+        self.support = temporal_support(views[0].first_pass, radius, rules)
+        self.sources = sources_of(views, radius, rules, settings.sources)
+        self.readers = [ReadAhead(view.shot, thread, timings) for view in views]
+        self.denoisers = []
+        for reader, view in zip(self.readers, views, strict=True):
+            stream = FrameStream(reader, rules, view.first_pass, radius=radius, timings=timings)
+            self.denoisers.append(FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going))
+
+    def make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:
+        """Denoise a frame and return the function that writes it; or the frame, if it is there already.
+
+        Then begin to read the first frame that the `following` one needs beyond this one's.
+        """
+        started, attributes = time.perf_counter(), self.settings.attributes
+        read_as = [view.shot.layer_summary(number) for view in self.views]
+        # With its number: in a shot that one window holds, all frames are made from the same files.
+        made_from = describe_sources(self.sources(number), frame=number, layers=read_as, size=list(self.shot.shape))
+        planned = {**attributes, BESIDE: _others(number, self.denoisers[0].neighbours(number)), MADE_FROM: made_from}
+        again = why_stale(path, planned) if self.settings.resume else ""
+        if again is None:
+            return Finished(number, path, resumed=True, seconds=time.perf_counter() - started)
+        self._expect(number)
+        results = [denoiser.make(number) for denoiser in self.denoisers]
+        # No sooner: while a denoiser runs, memory is at its fullest.
+        self._expect(number if following is None else following)
+        with self.timings.stage("check"):
+            for result in results:
+                for name, layer in {"color": result.denoised.color, **result.denoised.aovs}.items():
+                    if fault := find_nonfinite(layer):
+                        raise ValueError(f"frame {number}, {name}: {fault}; it was not written")
+        averaged = _others(number, set.intersection(*({*result.averaged} for result in results)))
+        stages = " ".join(sorted(results[0].plan.stages))
+        header = {**attributes, "ravg/stages": stages, BESIDE: averaged, MADE_FROM: made_from}
+        finished = Finished(
+            number=number,
+            path=path,
+            pixels=self.shot.shape[0] * self.shot.shape[1] * len(results),
+            repaired=sum(result.repaired for result in results),
+            fireflies=sum(result.fireflies for result in results),
+            mean=results[0].mean,
+            removed_radiance=results[0].removed_radiance,
+            outliers=sum(result.outliers for result in results),
+            plan=results[0].plan,
+            again=again,
+            seconds=time.perf_counter() - started,
+        )
+        return partial(self._write, finished, results, header)
+
+    def _expect(self, number: int) -> None:
+        """Read ahead the frames that the result of a frame needs."""
+        # The outermost are read only where something shines in the one beside them, or by a later window.
+        near = self.shot.neighbours(number, self.support - REACH) if self.settings.background else ()
+        for reader in self.readers:
+            reader.expect(near)
+
+    def _write(self, finished: Finished, results: Sequence[FrameResult], header: Mapping[str, str]) -> Finished:
+        number = finished.number
+        with self.timings.beside("write"):
+            for read in (self.shot, *(view.first_pass.files for view in self.views if view.first_pass is not None)):
+                if read is not None:
+                    read.check_unchanged(n for n in self.shot.neighbours(number, self.support) if read.has(n))
+            first, *others = ({"color": r.denoised.color, **r.denoised.aovs} for r in results)
+            pictures = [
+                (view.shot, layers, result.denoised.extra)
+                for view, layers, result in zip(self.views[1:], others, results[1:], strict=True)
+            ]
+            extra = results[0].denoised.extra
+            clamped = self.shot.write(finished.path, number, first, extra, header, pictures)
+        return replace(finished, clamped=clamped + sum(result.beyond for result in results))
 
 
 def _others(number: int, numbers: Iterable[int]) -> str:
     return " ".join(str(n) for n in sorted(numbers) if n != number)
 
 
-def _check_finite(images: Mapping[str, Array], number: int) -> None:
-    """Raise ValueError for a picture that is not finite: no file is better than this one."""
-    for name, layer in images.items():
-        if fault := find_nonfinite(layer):
-            raise ValueError(f"frame {number}, {name}: {fault}; it was not written")
+def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) -> int:
+    """Count the frames on each side that one frame depends on.
 
-
-def reach_of(estimates: Estimates | None, radius: int, rules: Rules) -> int:
-    """Count the frames on each side of one that it depends on.
-
-    Its window, two for what shines in a frame alone, and one for the pictures beside it, which have windows too.
+    The window's, two for the removal of fireflies, and one for the average of neighbouring results.
 
     Parameters
     ----------
-    estimates : Estimates or None
-        Where the estimates of single frames come from.
+    first_pass : FirstPass or None
+        Of the shot.
     radius : int
         Frames on each side of the centre of a window.
     rules : Rules
-        What decides which stages run.
+        The forced stages.
     """
-    return REACH + ("steady" in rules.allowed) + (radius if estimates is None else estimates.reach(radius))
+    return REACH + ("steady" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
 
 
-def sources_of(
-    pictures: Sequence[tuple[Shot, Estimates | None]], radius: int, rules: Rules, before: SourcesOf | None = None
-) -> SourcesOf:
-    """Tell of each frame which files it is made from.
+def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:
+    """List the files that each frame is made from.
 
     Parameters
     ----------
-    pictures : sequence of (Shot, Estimates or None)
-        As `denoise_frames` has them, the shot first.
+    views : sequence of View
+        As for `denoise_frames`.
     radius : int
         Frames on each side of the centre.
     rules : Rules
-        What decides which stages run.
-    before : callable, optional
-        What tells it of the frames of the shot, where they are themselves made.
+        The forced stages.
+    earlier : callable, optional
+        The same for the frames of the shot, where an earlier pass made them.
 
     Returns
     -------
     callable
-        From a frame's number to all files that its window reaches, or that these were made from.
+        From a frame's number to all files within its temporal support.
     """
-    shot, reach = pictures[0][0], reach_of(pictures[0][1], radius, rules)
+    shot, support = views[0].shot, temporal_support(views[0].first_pass, radius, rules)
 
     def sources(number: int) -> dict[str, Source]:
-        near = shot.neighbours(number, reach)
-        if before is not None:
-            return {what: source for n in near for what, source in before(n).items()}
+        near = shot.neighbours(number, support)
+        if earlier is not None:
+            return {name: source for n in near for name, source in earlier(n).items()}
         files = shot.sources(near)
-        for _, estimates in pictures:
-            if estimates is not None and (given := estimates.files) is not None:
+        for view in views:
+            if view.first_pass is not None and (given := view.first_pass.files) is not None:
                 files |= given.sources((n for n in near if given.has(n)), "estimate")
         return files
 

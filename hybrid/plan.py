@@ -1,44 +1,46 @@
-"""The plan: what a shot calls for, measured before anything runs.
+"""Decide which stages run on a window, from what was measured in its frames.
 
-No stage is paid for that the shot does not have, and nothing is skipped silently: each decision carries the
-figure that was measured, the threshold it was held against, and the reason in words.
+Each decision carries the measured figure, its threshold and the reason in words; nothing is skipped silently. A stage
+is decided here and nowhere else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from hybrid.alignment.loading import LoadedFrames
 from hybrid.alignment.measure import FIXED_NOISE_ABOVE, FrameFacts, PairFacts
-from hybrid.files.frame import Frames
 from hybrid.files.sequences import format_frames
 
-STAGES = {
-    "fireflies": "take single bright samples out of a frame before anything spreads them",
-    "demodulate": "filter light instead of light times texture",
-    "outliers": "reject what stands out of the aligned window",
-    "warp": "move side frames along the motion",
-    "dense-flow": "find the motion in the pictures",
+#: Stages that run where a figure calls for them.
+MEASURED = {
+    "outliers": "reject samples far above the aligned window",
+    "warp": "warp neighbouring frames along the motion",
+    "dense-flow": "estimate the motion from the pictures by TV-L1",
     "refine": "correct the renderer's vectors by TV-L1",
     "gate": "do not average over time where the light itself changes",
-    "drift": "average less of estimates whose light drifts, as samples tell that they do not know",
     "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
-    "steady": "average finished frames with those beside them",
-    "mean": "give pictures the local means of their samples, fireflies included, as far as these are known",
-    "samples": "blend samples into pictures where their noise is small against the difference",
+}
+#: Stages that run wherever their input is there, unless they are switched off.
+SWITCHES = {
+    "fireflies": "remove single bright samples of a frame before anything spreads them",
+    "demodulate": "divide by the albedo and filter the light alone",
+    "drift": "average less of denoised frames whose light drifts, as far as samples show",
+    "steady": "average each result with those of the neighbouring frames",
+    "mean": "restore the local means of the samples, fireflies included, as far as these are certain",
+    "samples": "blend samples into results where their noise is small against the difference",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
-# Why what is called for may yet not run.
-_NOT_RUN = {
-    "outliers": "beside estimates what single samples may add is bounded instead",
-    "drift": "needs estimates of five frames or more",
-}
-# Stages that only a network has.
+_ORDER = (
+    "fireflies demodulate outliers warp dense-flow refine gate drift fixed-noise prefilter steady mean samples alpha"
+)
+STAGES = {name: {**MEASURED, **SWITCHES}[name] for name in (*_ORDER.split(), "skip")}
+#: Stages of networks alone.
 NEURAL_STAGES = frozenset({"steady", "alpha", "skip"})
 
 # Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
@@ -56,6 +58,25 @@ GUIDE_NOISE_ABOVE = 0.003
 RADIUS = 2
 
 
+class Context(NamedTuple):
+    """The window that a plan is for.
+
+    Attributes
+    ----------
+    first_pass : bool
+        Whether its frames come with denoised frames.
+    radius : int
+        Frames on each side of the centre.
+    """
+
+    first_pass: bool
+    radius: int = RADIUS
+
+
+#: A window of noisy frames alone, and one with a first pass.
+NOISY, DENOISED = Context(first_pass=False), Context(first_pass=True)
+
+
 @dataclass(frozen=True)
 class Decision:
     """One stage, whether it runs, and why.
@@ -66,14 +87,12 @@ class Decision:
         A key of `STAGES`.
     on : bool
         Whether the stage runs.
-    figure : float or None
-        What was measured; None where there was nothing to measure.
-    threshold : float
-        What it was held against.
+    figure, threshold : float or None
+        The measured figure and its threshold; None for a switch, and where there was nothing to measure.
     reason : str
         The same in words.
     forced : bool
-        True where the user, not the figure, decided.
+        Whether the user decided, and not the figure.
     frames : tuple of int
         In a plan of several frames, those with the stage.
     """
@@ -81,7 +100,7 @@ class Decision:
     stage: str
     on: bool
     figure: float | None
-    threshold: float
+    threshold: float | None
     reason: str
     forced: bool = False
     frames: tuple[int, ...] = ()
@@ -96,68 +115,27 @@ class Plan:
     decisions : tuple of Decision
         One for each of `STAGES`.
     cuts : tuple of (int, int)
-        Neighbouring frames that show something else: nothing is averaged over them.
+        Neighbouring frames of different shots: nothing is averaged over them.
     repeats : tuple of (int, int)
-        Neighbouring frames of which one is the other once more: its samples count once.
+        Neighbouring frames with equal samples, which count once.
+    shares : mapping of str to float
+        The share of the picture, in [0, 1], on which a stage ran that runs only in places.
     """
 
     decisions: tuple[Decision, ...]
     cuts: tuple[tuple[int, int], ...] = ()
     repeats: tuple[tuple[int, int], ...] = ()
+    shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def stages(self) -> frozenset[str]:
         """Names of the stages that run."""
         return frozenset(decision.stage for decision in self.decisions if decision.on)
 
-    def force(self, on: Collection[str] = (), off: Collection[str] = ()) -> Plan:
-        """Switch stages on or off whatever was measured."""
-        return replace(
-            self,
-            decisions=tuple(
-                replace(d, on=d.stage in on, forced=True, reason=f"forced; measured: {d.reason}")
-                if d.stage in on or d.stage in off
-                else d
-                for d in self.decisions
-            ),
-        )
-
-
-def as_run(plan: Plan, stages: Collection[str], shares: Mapping[str, float] | None = None) -> Plan:
-    """Say of the plan of a window what ran.
-
-    Where there are estimates the gate compares them in any case, and no samples are rejected; where there are none, or
-    of three frames alone, drift cannot be told.
-
-    Parameters
-    ----------
-    plan : Plan
-        Of a window.
-    stages : collection of str
-        That ran.
-    shares : mapping of str to float, optional
-        On what share of the picture, in [0, 1], for those that run only where they are called for.
-
-    Returns
-    -------
-    Plan
-    """
-    decisions = []
-    for decision in plan.decisions:
-        ran, reason = decision.stage in stages, decision.reason
-        if ran and not decision.on:
-            reason = f"estimates are compared in any case; measured: {reason}"
-        elif decision.on and not ran and decision.stage in _NOT_RUN:
-            reason = f"{_NOT_RUN[decision.stage]}; {reason}"
-        if shares is not None and decision.stage in shares:
-            reason += f"; it ran on {shares[decision.stage]:.0%} of it"
-        decisions.append(replace(decision, on=ran, reason=reason))
-    return replace(plan, decisions=tuple(decisions))
-
 
 @dataclass(frozen=True)
 class Rules:
-    """What decides the stages of a window: the figures, and what the user has forced.
+    """The stages that the user has forced on or off.
 
     Attributes
     ----------
@@ -167,7 +145,7 @@ class Rules:
     Raises
     ------
     ValueError
-        A stage that does not exist, or one that is to be both on and off.
+        A stage that does not exist, or one that is both on and off.
     """
 
     on: frozenset[str] = frozenset()
@@ -187,30 +165,56 @@ class Rules:
 
     @property
     def forced(self) -> str:
-        """What the user has forced, in words: +warp -gate."""
+        """The forced stages as text: +warp -gate."""
         return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
 
-    def plan(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
-        """Decide on a window by what its frames and its pairs of neighbours show."""
+    def decide(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], context: Context = NOISY) -> Plan:
+        """Decide the stages of a window.
+
+        Parameters
+        ----------
+        frames : sequence of FrameFacts
+            Of all frames of the window that are there; at least one.
+        pairs : sequence of PairFacts
+            Of all neighbours among them.
+        context : Context
+            The window.
+
+        Notes
+        -----
+        Denoised frames are compared in any case (the stage gate), and their outliers are bounded where they are
+        averaged. Drift is the change of denoised frames over two frames on a side.
+        """
+        measured = measure_stages(frames, pairs)
+        return replace(measured, decisions=tuple(self._applied(d, pairs, context) for d in measured.decisions))
+
+    def _applied(self, decision: Decision, pairs: Sequence[PairFacts], context: Context) -> Decision:
+        """A decision under what is forced, in this window."""
+        stage, on, reason = decision.stage, decision.on, decision.reason
         vectors = bool(pairs) and all(pair.vectors for pair in pairs)
-        # Who wants frames moved, and has no vectors, wants the motion found; or nobody says where to.
-        found = {"dense-flow"} if "warp" in self.on and pairs and not vectors else set()
-        return decide(frames, pairs).force(self.on | (found - self.off), self.off)
+        # Forcing warp on a shot without vectors implies dense flow.
+        implied = stage == "dense-flow" and "warp" in self.on and bool(pairs) and not vectors and stage not in self.off
+        forced = stage in self.on | self.off or implied
+        if forced:
+            on, reason = stage not in self.off, f"forced; measured: {reason}"
+        if stage == "gate" and context.first_pass and not on and stage not in self.off:
+            on, reason = True, f"denoised frames are compared in any case; measured: {reason}"
+        if stage == "outliers" and context.first_pass and on:
+            on, reason = False, f"the averaging of denoised frames bounds what single samples add; {reason}"
+        if stage == "drift" and on and (not context.first_pass or context.radius < 2):
+            on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
+        return replace(decision, on=on, reason=reason, forced=forced)
 
-    def __call__(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> frozenset[str]:
-        """Return the stages of that plan."""
-        return self.plan(frames, pairs).stages
 
-
-def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
-    """Decide which stages a window calls for.
+def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
+    """Decide which stages the measurements of a window call for, with nothing forced.
 
     Parameters
     ----------
     frames : sequence of FrameFacts
         Of all frames of the window that are there; at least one.
     pairs : sequence of PairFacts
-        Of all neighbours among them. Of those across a cut nothing is asked.
+        Of all neighbours among them; those across a cut count for nothing.
 
     Returns
     -------
@@ -226,78 +230,42 @@ def decide(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
     speed = max((pair.speed for pair in pairs), default=0.0)
     moves = speed > STILL if vectors else changed > GATE_ABOVE
     changes = "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)")
-    pairs_beside = "{:.0f} pairs of neighbouring frames without a cut between them"
-    transparent = [frame.transparent for frame in frames if frame.transparent is not None]
-    return Plan(
-        (
-            _decide("fireflies", float(sum(f.fireflies for f in frames)), 0, "{:.0f} single samples shine alone"),
-            _decide_demodulate([f.albedo_spread for f in frames if f.albedo_spread is not None]),
-            _decide(
-                "outliers",
-                max(frame.outliers for frame in frames),
-                OUTLIERS_ABOVE,
-                "{:.2g} of the pixels stand alone far above their neighbours",
-            ),
-            _decide_warp(pairs, vectors, moves, speed, changed),
-            _decide_dense_flow(pairs, vectors, moves),
-            _decide_refine(moves, vectors, unexplained),
-            _decide("gate", unexplained, GATE_ABOVE, changes),
-            # Samples see what this plan cannot: light that moves by less than the noise of a pixel.
-            _decide("drift", float(len(pairs)), 0, pairs_beside),
-            _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
-            _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
-            _decide("steady", float(len(pairs)), 0, pairs_beside),
-            _decide("mean", 1 - min(frame.noise_free for frame in frames), 0, "{:.1%} of the tiles hold noise"),
-            # Each pixel decides by itself; a picture is nowhere to be worse than its samples.
-            Decision("samples", True, None, 0, "each pixel is compared with its samples"),
-            Decision("alpha", False, None, 0, "no alpha in the file")
-            if not transparent
-            else _decide("alpha", max(transparent), 0, "{:.1%} of the picture is transparent"),
-            _decide("skip", min(frame.noise_free for frame in frames), 0.0, "{:.1%} of the tiles hold no noise"),
-        ),
-        cuts,
-        repeats,
+    outliers = "{:.2g} of the pixels stand alone far above their neighbours"
+    fireflies = sum(frame.fireflies for frame in frames)
+    spread = max((frame.albedo_spread for frame in frames if frame.albedo_spread is not None), default=None)
+    albedo = "no albedo in the file" if spread is None else f"the albedo varies by {spread:.3g}"
+    neighbours = f"{len(pairs)} pairs of neighbouring frames without a cut between them"
+    clean = min(frame.noise_free for frame in frames)
+    transparent = max((frame.transparent for frame in frames if frame.transparent is not None), default=None)
+    alpha = "no alpha in the file" if transparent is None else f"{transparent:.1%} of the picture is transparent"
+    decisions = (
+        _switch("fireflies", fireflies > 0, f"{fireflies} single bright samples"),
+        # With one constant albedo this changes nothing; neighbouring frames may have another.
+        _switch("demodulate", spread is not None, albedo),
+        _decide("outliers", max(frame.outliers for frame in frames), OUTLIERS_ABOVE, outliers),
+        _decide_warp(pairs, vectors, moves, speed, changed),
+        _decide_dense_flow(pairs, vectors, moves),
+        _decide_refine(moves, vectors, unexplained),
+        _decide("gate", unexplained, GATE_ABOVE, changes),
+        # Samples show light that moves by less than the noise of a pixel, which no figure of this plan shows.
+        _switch("drift", bool(pairs), neighbours),
+        _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
+        _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
+        _switch("steady", bool(pairs), neighbours),
+        _switch("mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
+        _switch("samples", True, "each pixel is compared with its samples"),
+        _switch("alpha", bool(transparent), alpha),
+        _switch("skip", clean > 0, f"{clean:.1%} of the tiles hold no noise"),
     )
+    return Plan(decisions, cuts, repeats)
 
 
-def plan_shot(
-    shot: Frames, rules: Rules | None = None, *, radius: int = RADIUS, advance: Callable[[], object] = lambda: None
-) -> Plan:
-    """Plan every frame of a shot, and say on which frames each stage runs.
-
-    Parameters
-    ----------
-    shot : Frames
-        All of its frames are read.
-    rules : Rules, optional
-        What was forced.
-    radius : int
-        Frames on each side of a window.
-    advance : callable
-        Called after each frame.
-
-    Returns
-    -------
-    Plan
-        One decision for each of `STAGES`, with the figure of the window that calls for it most.
-    """
-    rules = rules or Rules()
-    frames = LoadedFrames(shot, rules)
-    plans = {}
-    for number in shot.numbers:
-        window = frames.around(number, radius)
-        frames.load(window)
-        plans[number] = rules.plan(*frames.facts_of(window))
-        advance()
-    return merge(plans)
-
-
-def merge(plans: dict[int, Plan]) -> Plan:
-    """Put the plans of several frames into one, which says where each stage runs.
+def merge(plans: Mapping[int, Plan]) -> Plan:
+    """Merge the plans of several frames into one, with the frames on which each stage runs.
 
     Parameters
     ----------
-    plans : dict of int to Plan
+    plans : mapping of int to Plan
         By frame number; at least one.
 
     Returns
@@ -306,13 +274,17 @@ def merge(plans: dict[int, Plan]) -> Plan:
         Of each stage the decision whose figure lies farthest on the side that was decided for.
     """
     merged = []
-    for stage, *decisions in zip(STAGES, *(plan.decisions for plan in plans.values()), strict=True):
-        on = tuple(number for number, decision in zip(plans, decisions, strict=True) if decision.on)
-        candidates = [d for d in decisions if d.on] or decisions
-        most = max(candidates, key=lambda d: -np.inf if d.figure is None else d.figure)
-        where = f"; frames {format_frames(on)} of {format_frames(plans)}" if 0 < len(on) < len(plans) else ""
-        assert stage == most.stage
-        merged.append(replace(most, reason=most.reason + where, frames=on))
+    for index, stage in enumerate(STAGES):
+        decisions = {number: plan.decisions[index] for number, plan in plans.items()}
+        on = tuple(number for number, decision in decisions.items() if decision.on)
+        most = max(on or decisions, key=lambda n: -np.inf if (figure := decisions[n].figure) is None else figure)
+        assert stage == decisions[most].stage
+        reason = decisions[most].reason
+        if stage in plans[most].shares:
+            reason += f"; it ran on {plans[most].shares[stage]:.0%} of the picture"
+        if 0 < len(on) < len(plans):
+            reason += f"; frames {format_frames(on)} of {format_frames(plans)}"
+        merged.append(replace(decisions[most], reason=reason, frames=on))
     cuts, repeats = ({pair for plan in plans.values() for pair in getattr(plan, name)} for name in ("cuts", "repeats"))
     return Plan(tuple(merged), tuple(sorted(cuts)), tuple(sorted(repeats)))
 
@@ -321,11 +293,8 @@ def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision
     return Decision(stage, figure > threshold, figure, threshold, words.format(figure))
 
 
-def _decide_demodulate(spreads: Sequence[float]) -> Decision:
-    if not spreads:
-        return Decision("demodulate", False, None, 0, "no albedo in the file")
-    # On frames of one albedo it changes nothing; that their neighbours have another is not for them to know.
-    return Decision("demodulate", True, max(spreads), 0, f"the albedo varies by {max(spreads):.3g}")
+def _switch(stage: str, on: bool, reason: str) -> Decision:
+    return Decision(stage, on, None, None, reason)
 
 
 def _decide_warp(pairs: Sequence[PairFacts], vectors: bool, moves: bool, speed: float, changed: float) -> Decision:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hybrid.files.shots import Shot
+from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames
+from hybrid.plan import STAGES, Rules
+from hybrid.runtime.timing import Timings
+from hybrid.stabilize import DenoiseWindow
+from hybrid.stream import FirstPass
 from tests.exr_files import write_layers
 
 
@@ -75,3 +82,24 @@ class Scene:
             kept = {name: layer for name, layer in layers.items() if name.partition(".")[2] not in without}
             write_layers(folder / f"shot.{self.first + index:04d}.exr", kept, half=False)
         return folder
+
+
+def only(stages: Collection[str]) -> Rules:
+    """Rules that run these stages and no others, whatever is measured."""
+    return Rules(on=frozenset(stages), off=frozenset(STAGES) - frozenset(stages))
+
+
+def denoise_view(
+    shot: Shot,
+    output: Path,
+    denoise: DenoiseWindow,
+    rules: Rules,
+    first_pass: FirstPass | None = None,
+    *,
+    radius: int = 2,
+    timings: Timings | None = None,
+    **settings: Any,
+) -> Iterator[Finished | Failed]:
+    """Denoise and write the frames of one view."""
+    views = [View(shot, first_pass)]
+    return denoise_frames(views, output, denoise, rules, RunSettings(**settings), radius=radius, timings=timings)

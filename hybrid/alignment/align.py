@@ -1,29 +1,22 @@
-"""Windows of frames, aligned to their centre.
+"""Align a window of frames to its centre, and denoised results of neighbouring frames to each other.
 
-`Aligner.align` is the hinge of the toolkit. It runs once per frame; the classical filters and the network
-both read the `AlignedWindow` that it returns, and nothing after it warps again.
+`align` runs once for each frame, or once for each band of rows. The classical filters and the networks both read the
+`AlignedWindow` that it returns; nothing else warps the frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Protocol
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.tvl1 import refine_flow
 from flow.warp import warp
-from hybrid.alignment.flows import Flows
-from hybrid.alignment.loading import Decide, LoadedFrames
 from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
-from hybrid.alignment.window import AlignedWindow, clean_guide, warp_layer, warp_residuals
-from hybrid.files.frame import Frame, Frames
-from hybrid.files.shots import Shot
+from hybrid.alignment.window import AlignedWindow, Trust, WarpSources, Window, clean_guide
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
@@ -32,456 +25,333 @@ from nlm.relight import relight
 from nlm.samples import average_sides
 
 Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
 # their mean difference (`nlm.relight`), where the light stands still as far as samples tell (`nlm.drift`). The second
 # alone is steadier by 0.2 dB, and averages moving shadows: 2.7 dB of such a shot.
 FINISHED = 0.1, 0.5
-# How much more finished pictures lose by a drift than estimates do, whose errors are several times as large: 20 and 100
-# differ by 0.05 dB, and by 0.25 dB where shadows move.
+# How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
+# 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
 DRIFTED = 100
 # Where the light of a frame drifts nearly everywhere, samples tell it only in places, and the rest drifts too: finished
 # pictures count in full where two fifths of the picture stand still, and not at all where less than a fifth does. Of
 # nine validation shots one has such light, and gains 0.1 dB; one loses 0.04, the others nothing.
 STANDING = 0.2, 0.4
-# Rows around a part of a frame that its result depends on: 23 for all filters of the classical chain together, or what
-# a trunk sees (112) of what drift is measured in (55) and the gate compares (11). The mean of `gathered` (72) reaches
+# Rows around a band that its result depends on: 23 for all filters of the classical chain together, or the receptive
+# field of a trunk (112), of the measure of drift (55) and of the gate (11). The mean of pooled samples (72) reaches
 # beyond, for 2e-7 of the light. Whole strips of the guided filter (64 rows): it then sums in the order it would in the
 # frame.
 MARGIN = 192
 
 
-class Estimates(Protocol):
-    """Where the estimates of single frames come from; `hybrid.estimates` has the three kinds.
+class _Warped(NamedTuple):
+    """Layers of all frames warped to the centre, and how far geometry trusts each."""
+
+    layers: dict[str, Array]  # (T, h, W, C) each
+    confidence: Array  # (T, h, W)
+    coverage: Array  # (T, h, W), an upper bound of the confidence: 0 where a frame shows nothing
+    trust: tuple[Trust | None, ...]
+
+
+class Stillness(NamedTuple):
+    """How far the light of a frame stands still.
 
     Attributes
     ----------
-    holds : int
-        Bytes that the denoiser takes for itself while it works.
-    files : Shot or None
-        The finished sequence that they are read from, if they are.
-    from_noisy : bool
-        Whether they are made from windows of noisy frames, for which the gate needs the light of each
-        (`PreparedFrame.light`); else the gate compares the estimates.
+    local : (H, W) array
+        In [0, 1].
+    whole : float32
+        Whether enough of the frame stands still, in [0, 1].
     """
 
-    @property
-    def holds(self) -> int:
-        """Bytes that the denoiser takes for itself."""
-
-    @property
-    def files(self) -> Shot | None:
-        """The finished sequence that they are read from, if they are."""
-
-    @property
-    def from_noisy(self) -> bool:
-        """Whether frames are prepared with their light."""
-
-    def reach(self, radius: int) -> int:
-        """How many frames on each side of the centre are read, for windows of `radius` frames on each side."""
-
-    def make(self, aligner: Aligner, numbers: Sequence[int]) -> None:
-        """Load these frames (`Aligner.load`), and put an estimate of each that is there into `Aligner.estimates`."""
+    local: Array
+    whole: np.float32
 
 
-class Aligner:
-    """Aligns the windows of one shot, keeping what neighbouring windows share while they slide.
+def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
+    """The rows of a frame that a band depends on, and the place of the band in them; the whole frame for None."""
+    rows = slice(0, height) if rows is None else rows
+    padded = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
+    return padded, slice(rows.start - padded.start, rows.stop - padded.start)
+
+
+def align(window: Window, rows: slice | None = None, *, timings: Timings | None = None) -> AlignedWindow:
+    """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
     Parameters
     ----------
-    shot : Frames
-        Read lazily.
-    stages : collection of str, or callable
-        Which stages run, on all frames; or what decides it for a window by what its frames show (`hybrid.plan.Rules`).
-    radius : int
-        Frames on each side of the centre; the window has 2 · radius + 1.
-    estimates : Estimates, optional
-        Where the estimates of single frames come from (`hybrid.estimates`); each is made once.
-    refine : callable
-        What corrects vectors, `flow.tvl1.refine_flow` with other settings perhaps.
+    window : Window
+        From `hybrid.stream.FrameStream.window`.
+    rows : slice, optional
+        Only these rows, and `MARGIN` around them; the whole frame without.
     timings : Timings, optional
-        Where to count the stages "read", "prepare", "estimate", "flow", "warp", "confidence" and "steady".
+        Counts the stages "warp" and "confidence".
 
-    Attributes
-    ----------
-    hold : collection of int
-        Frames that are not forgotten though the next window is without them.
+    Raises
+    ------
+    ValueError
+        If one frame has a layer that another one lacks, or the centre has no first pass and others do.
     """
-
-    def __init__(
-        self,
-        shot: Frames,
-        stages: Collection[str] | Decide,
-        *,
-        radius: int = 2,
-        estimates: Estimates | None = None,
-        refine: Callable[..., Array] = refine_flow,
-        timings: Timings | None = None,
-    ) -> None:
-        self.frames = LoadedFrames(shot, stages, timings)
-        self.flows = Flows(self.frames, refine)
-        self.shot = shot
-        self.source = estimates
-        self.radius = radius
-        self.timings = self.frames.timings
-        self.estimates: dict[int, Array | None] = {}
-        # Of neighbours, some rows of each: where one shows the other, and how far geometry trusts it. Their pictures
-        # are compared after both windows.
-        self._trusted: dict[tuple[int, int, int, int], tuple[Mask, Array]] = {}
-        # Of frames whose pictures are compared later: the weight that the next ones' estimates have by their drift.
-        self._drift: dict[int, Array] = {}
-        self.hold: Collection[int] = ()
-
-    def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
-        """Align the window around frame `number`.
-
-        Parameters
-        ----------
-        number : int
-            A frame of the shot.
-        rows : slice, optional
-            Only these rows, and `MARGIN` around them; the whole frame without.
-
-        Returns
-        -------
-        AlignedWindow
-            The first and the last frames of a shot have neighbours of confidence 0.
-        """
-        numbers = self.frames.around(number, self.radius)
-        if self.source is None:
-            self.load(numbers)
-        else:
-            self.source.make(self, numbers)
-        self.flows.forget_chains(numbers)
-        aligned = self._assemble(number, numbers, rows, given=self.source is not None)
-        if rows is None or rows.stop == self.shot.shape[0]:
-            # After the last rows: made again for the windows that they serve, and not kept while this one is denoised.
-            self.flows.forget_chains(())
-        return aligned
-
-    def align_noisy(self, number: int) -> AlignedWindow:
-        """Align the window around a frame without estimates; all of its frames are loaded already."""
-        return self._assemble(number, self.frames.around(number, self.radius), None, given=False)
-
-    def align_pictures(
-        self, number: int, pictures: Mapping[int, Array], rows: slice | None = None
-    ) -> tuple[Array, Array, slice]:
-        """Align finished pictures of a frame and of those beside it, which are loaded, and compare them.
-
-        Parameters
-        ----------
-        number : int
-            The centre.
-        pictures : mapping of int to (H, W, 3) array
-            Radiance, finite, by frame; the centre's among them.
-        rows : slice, optional
-            Only these rows, and `MARGIN` around them; the whole frame without.
-
-        Returns
-        -------
-        window : (3, h, W, 3) array
-            The pictures at the centre, in its light; its own where a frame shows or has none.
-        confidence : (3, h, W) array
-            As `AlignedWindow.confidence`, with the gate asked in any case.
-        inner : slice
-            The rows that were asked for.
-        """
-        numbers = self.frames.around(number, 1)
-        stages = self.frames.stages_of(numbers) | (self.frames.allowed & {"gate"})
-        outer, inner = self._around_rows(rows)
-        centre = self.frames[number]
-        guides = {name: layer[outer] for name, layer in layers_of(centre).items() if name in ("albedo", "normal")}
-        _, confidence, seen = self._gather(number, numbers, guides, outer, stages, passing=guides, again=True)
-        window = self._gather_estimates(number, numbers, seen, outer, pictures)
-        with self.timings.stage("steady"):
-            noisy = centre.irradiance[outer]
-            light = window / remodulate(np.ones_like(noisy), guides["albedo"]) if centre.demodulated else window
-            exposure = self._lit(number).as_rendered.exposure
-            # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
-            # bundled shot with its chrome that is worth 0.4 dB.
-            gates = color_gates(light, noisy, exposure, FINISHED)
-            alike, confidence = (trust_light(confidence, seen, gate, stages, agreeing=0.0) for gate in gates)
-            still, enough = self._stillness(number)
-            still = still[outer]
-            confidence = alike + still * (confidence - alike)
-            relight(window, alike, confidence, exposure, first_row=outer.start)
-            confidence[[0, 2]] *= enough * (1 + still) / 2
-        return window, confidence, inner
-
-    def comparable(self, number: int) -> list[int]:
-        """Numbers of a frame and those beside it that are there, and have an estimate where estimates are read."""
-        given = None if self.source is None else self.source.files
-        return [n for n in self.frames.around(number, 1) if self.shot.has(n) and (given is None or given.has(n))]
-
-    def load(self, numbers: Collection[int], seen: Callable[[Frame], None] = lambda frame: None) -> None:
-        """Read and prepare these frames, where they are there, and forget all others.
-
-        Parameters
-        ----------
-        numbers : collection of int
-            Of the frames.
-        seen : callable
-            Called with each frame as it is read.
-        """
-        kept = {*numbers, *self.hold}
-        self._trusted = {pair: known for pair, known in self._trusted.items() if pair[0] in kept}
-        self.estimates = {n: estimate for n, estimate in self.estimates.items() if n in kept}
-        self._drift = {n: weight for n, weight in self._drift.items() if n in kept}
-        self.flows.forget(kept)
-        self.frames.load(numbers, seen, self.hold)
-
-    def _assemble(self, number: int, numbers: list[int], rows: slice | None, *, given: bool) -> AlignedWindow:
-        self._expect_alike(number, numbers)
-        stages = self.frames.stages_of(numbers)
-        if given:
-            # Estimates are compared in any case, for outlines: that their light is alike costs nothing to ask.
-            stages |= self.frames.allowed & {"gate"}
-            stages -= {"outliers"}  # what samples show beyond estimates is held where it is averaged
-        if not given or self.radius < 2:
-            stages -= {"drift"}  # there is nothing to hold against the samples
-        centre, (outer, inner) = self.frames[number], self._around_rows(rows)
-        light = "gate" in stages and not given
-        layers = {name: layer[outer] for name, layer in layers_of(centre, light=light, alpha="alpha" in stages).items()}
-        guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
-        # Beside estimates the colors of all frames are asked for by few: they are warped when they are.
-        own = layers.pop("color") if given else layers["color"]
-        window, confidence, seen = self._gather(number, numbers, layers, outer, stages, passing=guides)
-        flows = [None if (link := self._link(number, n)) is None else link[0][0][outer] for n in numbers]
-        frames = [self.frames.get(n) for n in numbers]
-        window_of = partial(warp_layer, {**guides, "irradiance": own}, frames, flows, outer)
-        # Before the estimates, whose place in memory the guide of all frames has until then.
-        with self.timings.stage("confidence"):
-            clean = clean_guide("albedo", guides, window_of, confidence, stages) if "albedo" in guides else None
-        estimates, beyond = None, None
-        if given:
-            estimates = self._gather_estimates(number, numbers, seen, outer, self.estimates)
-            steps = [None if n == number else self.flows.between(number, n) for n in numbers]
-            flows = [None if step is None else step[0][outer] for step in steps]
-            there = [(self.frames.get(n), self.estimates.get(n)) for n in numbers]
-            beyond = partial(warp_residuals, there, flows, outer)
-        with self.timings.stage("confidence"):
-            aligned = self._finish(
-                centre, own, window, guides, clean, window_of, estimates, beyond, confidence, seen, inner, stages
-            )
-            sides = None
-            if "samples" in stages:
-                # Before the estimates are pulled to the centre's: the samples stay what they are.
-                if beyond is None or estimates is None:
-                    sides = average_sides(aligned.color, None, aligned.confidence, aligned.trust, aligned.modulation)
-                else:
-                    residual = beyond()
-                    aligned = replace(aligned, beyond=lambda: residual)
-                    sides = average_sides(estimates, residual, aligned.confidence, aligned.trust, aligned.modulation)
-            if estimates is not None and "drift" in stages:
-                confidence = aligned.confidence
-                weight = drift_weights(estimates, aligned.own, confidence, aligned.exposure, first_row=outer.start)
-                pull_to_centre(estimates, confidence, weight)
-                if "steady" in self.frames.allowed and self._shows_drift(number):
-                    whole = self._drift.setdefault(number, np.ones(self.shot.shape, np.float32))
-                    whole[outer][inner] = weight[aligned.centre + 1][inner]
-        pass_colors = {name: tint[outer] for name, tint in centre.pass_colors.items()}
-        return replace(aligned, pass_colors=pass_colors, passes=centre.passes, sides=sides)
-
-    def _around_rows(self, rows: slice | None) -> tuple[slice, slice]:
-        """The rows of a frame that these depend on, and where these are among them; all without."""
-        height = self.shot.shape[0]
-        rows = slice(0, height) if rows is None else rows
-        outer = slice(max(rows.start - MARGIN, 0), min(rows.stop + MARGIN, height))
-        return outer, slice(rows.start - outer.start, rows.stop - outer.start)
-
-    def _shows_drift(self, number: int) -> bool:
-        """Whether two frames on one side show what a frame shows: `nlm.drift` compares them."""
-        first, second, _, fourth, fifth = (self._link(number, n) for n in self.frames.around(number, 2))
-        return None not in (first, second) or None not in (fourth, fifth)
-
-    def _stillness(self, number: int) -> tuple[Array, np.float32]:
-        """How far the light of a frame stands still, (H, W) in [0, 1], and whether enough of it does, in [0, 1].
-
-        Where nothing can tell, 0 and 1.
-        """
-        if number not in self._drift:
-            return np.zeros(self.shot.shape, np.float32), np.float32(1)
-        still = np.reciprocal(self._drift[number])  # 1 / (1 + DRIFTED (1 / w − 1)), in place: frames are large
-        still *= np.float32(DRIFTED)
-        still += np.float32(1 - DRIFTED)
-        np.reciprocal(still, out=still)
-        least, enough = STANDING
-        t = min(max((float(still.mean()) - least) / (enough - least), 0.0), 1.0)
-        return still, np.float32(t * t * (3 - 2 * t))
-
-    def _lit(self, number: int) -> PreparedFrame:
-        """Of the window around a frame the nearest one to it that shows anything."""
-        there = [frame for n in self.frames.around(number, self.radius) if (frame := self.frames.get(n)) is not None]
-        return min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - number)))
-
-    def _expect_alike(self, number: int, numbers: Sequence[int]) -> None:
-        """Refuse a window of which one frame has a layer that another lacks: light divided by an albedo is no color."""
-        centre = self.frames[number]
-        for there in (frame for n in numbers if (frame := self.frames.get(n)) is not None):
-            if different := sorted(_names(centre) ^ _names(there)):
-                has, lacks = (there, centre) if different[0] in _names(there) else (centre, there)
-                raise ValueError(
-                    f"frame {lacks.number} has no {different[0]}, which frame {has.number} has, expected one in both"
-                )
-
-    def _gather(
-        self,
-        number: int,
-        numbers: Sequence[int],
-        layers: dict[str, Array],
-        rows: slice,
-        stages: frozenset[str],
-        passing: Collection[str],
-        again: bool = False,
-    ) -> tuple[dict[str, Array], Array, Array]:
-        """Warp the neighbours' layers to these rows of the centre, whose own are given.
-
-        Returns them but those that are `passing`, the confidence that geometry has in them, and what it could be at
-        most: where they show anything. That is kept of the frames beside the centre, for when it is asked for `again`.
-        """
-        shape = len(numbers), rows.stop - rows.start, self.shot.shape[1]
-        window = {
-            name: np.empty((*shape, layer.shape[-1]), np.float32)
-            for name, layer in layers.items()
-            if name not in passing
-        }
-        passed = {name: np.empty(layers[name].shape, np.float32) for name in passing}
-        confidence, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        for index, neighbour in enumerate(numbers):
-            there, links = self.frames.get(neighbour), self._link(number, neighbour)
-            if there is None or links is None:
-                # The centre itself, or a frame that is missing.
-                for name, kept in window.items():
-                    kept[index] = layers[name]
-                if neighbour == number:
-                    confidence[index] = seen[index] = self.frames[number].valid[rows]
-                continue
-            with self.timings.stage("warp"):
-                link, back = links
-                flow, pair = link[0][rows], (number, neighbour, rows.start, rows.stop)
-                known = self._trusted.pop(pair, None) if again else None
-                if known is None:
-                    warped = {name: kept[index] for name, kept in window.items()} | passed
-                    measured = link[1][rows] & warp_layers(there, flow, rows, warped)
-                    known = measured, trust_geometry(layers, warped, flow, measured, back[0], rows.start)
-                    if not again and "steady" in self.frames.allowed and abs(neighbour - number) == self.shot.step:
-                        self._trusted[pair] = known
-                nearer = neighbour + (self.shot.step if neighbour < number else -self.shot.step)
-                if self.frames.repeated(neighbour, nearer):  # its samples are there already
-                    novelty: Array | np.float32 = np.float32(0)
-                else:
-                    novelty = novelty_of(flow) if "fixed-noise" in stages else np.float32(1)
-                seen[index], confidence[index] = (novelty * part for part in known)
-        return window, confidence, seen
-
-    def _link(self, number: int, neighbour: int) -> tuple[tuple[Array, Mask], tuple[Array, Mask]] | None:
-        """Flows to a neighbour and back; None for the centre itself, and where one of them is missing."""
-        if neighbour == number:
-            return None
-        link, back = self.flows.between(number, neighbour), self.flows.between(neighbour, number)
-        return None if link is None or back is None else (link, back)
-
-    def _gather_estimates(
-        self, number: int, numbers: list[int], seen: Array, rows: slice, given: Mapping[int, Array | None]
-    ) -> Array:
-        """Warp the estimates of a window to these rows; the centre's where a frame shows or has none: not `seen`."""
-        alone = given[number]
-        if alone is None:
-            raise ValueError(f"frame {number} has no estimate, expected one like its neighbours")
-        estimates = np.empty((len(numbers), *alone[rows].shape), np.float32)
-        for index, neighbour in enumerate(numbers):
-            link = None if neighbour == number else self.flows.between(number, neighbour)
-            there = None if link is None else given.get(neighbour)
-            if link is None or there is None:
-                estimates[index] = alone[rows]
-                if link is not None:
-                    seen[index] = 0
-                continue
-            with self.timings.stage("warp"):
-                # Estimates have no noise that interpolation could average, only detail to lose: bicubic is worth up to
-                # 0.5 dB here.
-                if link[0].any():
-                    flow = link[0][rows]
-                    warp(there, flow, interpolation="bicubic", first_row=rows.start, out=estimates[index])
-                else:
-                    estimates[index] = there[rows]
-                np.copyto(estimates[index], alone[rows], where=seen[index, ..., None] == 0)
-        return estimates
-
-    def _finish(
-        self,
-        centre: PreparedFrame,
-        own: Array,
-        window: dict[str, Array],
-        guides: dict[str, Array],
-        clean: Array | None,
-        window_of: Callable[[str], Array],
-        estimates: Array | None,
-        beyond: Callable[[], Array] | None,
-        confidence: Array,
-        seen: Array,
-        inner: slice,
-        stages: frozenset[str],
-    ) -> AlignedWindow:
-        color = window.pop("color", None)
-        middle = len(confidence) // 2
-        gone = confidence[middle] == 0
-        if gone.any():
-            # What the neighbours in space made of it is good for a pixel, not for a block: first those in time.
-            own = own.copy()
-            own[gone] = average(window_of("irradiance") if color is None else color, confidence)[gone]
-            pictures = [layer for name, layer in window.items() if name == "light" or name.startswith("aov ")]
-            for layer in (*pictures, *([] if estimates is None else [estimates])):
-                layer[middle][gone] = average(layer, confidence)[gone]
-        if color is not None:
-            color[middle] = own
-        lit = self._lit(centre.number)
-        bright = lit.as_light if "light" in window else lit.as_rendered
-        outliers = 0
-        near = {*self.frames.around(centre.number, self.radius)}
-        refined = [share for pair, share in self.flows.refined.items() if {*pair} <= near]
+    timings = timings or Timings()
+    _expect_equal_layers(window)
+    centre, stages, given = window.centre, window.stages, window.first_pass is not None
+    padded, inner = _pad_rows(rows, len(centre.irradiance))
+    light = "gate" in stages and not given
+    layers = {name: layer[padded] for name, layer in layers_of(centre, light=light, alpha="alpha" in stages).items()}
+    guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
+    # With a first pass few denoisers read the colors of all frames: these are warped when they are read.
+    own = layers.pop("color") if given else layers["color"]
+    warped = _warp_neighbours(window, layers, guides, padded, timings)
+    flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
+    sources = WarpSources(window.frames, flows, window.first_pass or (), padded)
+    with timings.stage("confidence"):
+        # Before the first pass is warped, whose place in memory the guide of all frames has until then.
+        clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None
+    estimates = None
+    if window.first_pass is not None:
+        estimates = _warp_first_pass(window, window.first_pass, warped.coverage, padded, timings)
+    with timings.stage("confidence"):
+        color, own = _fill_centre(warped, own, estimates, sources)
+        bright = window.lit.as_light if "light" in warped.layers else window.lit.as_rendered
+        outliers, middle = 0, len(window.frames) // 2
         if color is not None and "outliers" in stages:
-            color, rejected = reject_outliers(color, confidence)
+            color, rejected = reject_outliers(color, warped.confidence)
             own, outliers = color[middle], int(np.count_nonzero(rejected[:, inner]))
-        trust = confidence
         modulation = np.ones_like(own)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
+        confidence = warped.confidence
         if estimates is not None:
-            # By the centre's albedo and not by each frame's own, which may be noisy as the estimate is not.
+            # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
             estimates /= modulation
-            confidence = trust_light(confidence, seen, color_gate(estimates, own, bright.exposure), stages)
+            gate = color_gate(estimates, own, bright.exposure)
+            confidence = trust_light(confidence, warped.coverage, gate, stages)
         elif "gate" in stages:
-            confidence = confidence * color_gate(window.pop("light"), own, bright.exposure)
-        return AlignedWindow(
-            number=centre.number,
-            own=own,
-            aligned_color=color,
-            guides=guides,
-            window_of=window_of,
-            confidence=confidence,
-            modulation=modulation,
-            clean_albedo=clean,
-            trust=trust,
-            rendered_variance=centre.variance,
-            estimate=estimates,
-            picture=self.estimates.get(centre.number),
-            beyond=beyond,
-            aovs={name.removeprefix("aov "): layer for name, layer in window.items() if name.startswith("aov ")},
-            repaired=centre.repaired,
-            outliers=outliers,
-            fireflies=centre.fireflies,
-            removed=centre.removed,
-            exposure=bright.exposure,
-            moments=bright.moments,
-            inner=inner,
-            stages=stages,
-            shares={"refine": float(np.mean(refined))} if refined else {},
-        )
+            confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
+        sides = None
+        if "samples" in stages:
+            # Before the first pass is pulled to the centre's: the samples stay as they are.
+            pictures, residual = (color, None) if estimates is None else (estimates, sources.residual)
+            assert pictures is not None
+            sides = average_sides(pictures, residual, confidence, warped.confidence, modulation)
+        weight = None
+        if estimates is not None and "drift" in stages:
+            weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)
+            pull_to_centre(estimates, confidence, weight)
+    return AlignedWindow(
+        number=centre.number,
+        own=own,
+        aligned_color=color,
+        guides=guides,
+        sources=sources,
+        confidence=confidence,
+        modulation=modulation,
+        clean_albedo=clean,
+        trust=warped.confidence,
+        rendered_variance=centre.variance,
+        estimate=estimates,
+        picture=None if window.first_pass is None else window.first_pass[middle],
+        aovs={name.removeprefix("aov "): layer for name, layer in warped.layers.items() if name.startswith("aov ")},
+        repaired=centre.repaired,
+        outliers=outliers,
+        fireflies=centre.fireflies,
+        exposure=bright.exposure,
+        moments=bright.moments,
+        inner=inner,
+        stages=stages,
+        shares={"refine": float(np.mean(window.refined))} if window.refined else {},
+        pass_colors={name: tint[padded] for name, tint in centre.pass_colors.items()},
+        sides=sides,
+        neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
+        drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1],
+        passes=centre.passes,
+    )
+
+
+def align_results(
+    window: Window,
+    trust: Sequence[Trust | None],
+    stillness: Stillness,
+    exposure: float,
+    rows: slice | None = None,
+    *,
+    timings: Timings | None = None,
+) -> tuple[Array, Array]:
+    """Align the results of a frame and its two neighbours, and measure how far they show the same.
+
+    Parameters
+    ----------
+    window : Window
+        Three frames, with their results in the place of a first pass.
+    trust : sequence of Trust or None
+        Of the two neighbours, at the padded rows (`AlignedWindow.neighbour_trust`).
+    stillness : Stillness
+        Of the centre (`measure_stillness`).
+    exposure : float
+        Of the centre's irradiance as rendered.
+    rows : slice, optional
+        As for `align`.
+    timings : Timings, optional
+        Counts the stages "warp" and "steady".
+
+    Returns
+    -------
+    results : (3, h, W, 3) array
+        Radiance at the centre's rows `rows`, in its light; its own where a frame shows or has none.
+    confidence : (3, h, W) array
+        In [0, 1].
+    """
+    timings = timings or Timings()
+    centre, stages = window.centre, window.stages
+    padded, inner = _pad_rows(rows, len(centre.irradiance))
+    noisy = centre.irradiance[padded]
+    shape = len(window.frames), *noisy.shape[:2]
+    confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    confidence[1] = coverage[1] = centre.valid[padded]
+    for index, known in zip((0, 2), trust, strict=True):
+        if known is not None and window.frames[index] is not None and window.links[index] is not None:
+            _set_trust(confidence, coverage, window, index, known, padded)
+    assert window.first_pass is not None
+    results = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+    with timings.stage("steady"):
+        divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
+        light = results if divisor is None else results / remodulate(np.ones_like(noisy), divisor)
+        # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
+        # bundled shot with its chrome that is worth 0.4 dB.
+        gates = color_gates(light, noisy, exposure, FINISHED)
+        alike, confidence = (trust_light(confidence, coverage, gate, stages, agreeing=0.0) for gate in gates)
+        local = stillness.local[padded]
+        confidence = alike + local * (confidence - alike)
+        relight(results, alike, confidence, exposure, first_row=padded.start)
+        confidence[[0, 2]] *= stillness.whole * (1 + local) / 2
+    return results[:, inner], confidence[:, inner]
+
+
+def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:
+    """Measure how far the light of a frame stands still, by the weight of the next frame.
+
+    Parameters
+    ----------
+    drift_weight : (H, W) array or None
+        `AlignedWindow.drift_weight`. Without one nothing is known: 0 everywhere, and 1 for the whole.
+    shape : (int, int)
+        H and W.
+    """
+    if drift_weight is None:
+        return Stillness(np.zeros(shape, np.float32), np.float32(1))
+    still = np.reciprocal(drift_weight)  # 1 / (1 + DRIFTED (1 / w − 1)), in place: frames are large
+    still *= np.float32(DRIFTED)
+    still += np.float32(1 - DRIFTED)
+    np.reciprocal(still, out=still)
+    least, enough = STANDING
+    t = min(max((float(still.mean()) - least) / (enough - least), 0.0), 1.0)
+    return Stillness(still, np.float32(t * t * (3 - 2 * t)))
+
+
+def _expect_equal_layers(window: Window) -> None:
+    """Refuse a window whose frames differ in layers: light divided by an albedo is no color."""
+    centre = window.centre
+    for there in (frame for frame in window.frames if frame is not None):
+        if different := sorted(_names(centre) ^ _names(there)):
+            has, lacks = (there, centre) if different[0] in _names(there) else (centre, there)
+            raise ValueError(
+                f"frame {lacks.number} has no {different[0]}, which frame {has.number} has, expected one in both"
+            )
 
 
 def _names(frame: PreparedFrame) -> set[str]:
     """The layers that all frames of a window have, or none."""
     given = {"albedo": frame.albedo, "normal": frame.normal, ALPHA: frame.alpha, **frame.aovs}
     return {name for name, layer in given.items() if layer is not None}
+
+
+def _warp_neighbours(
+    window: Window, layers: dict[str, Array], guides: Collection[str], rows: slice, timings: Timings
+) -> _Warped:
+    """Warp the neighbours' layers to these rows of the centre. Guides serve the confidence alone and are not kept."""
+    centre, count = window.centre, len(window.frames)
+    shape = count, rows.stop - rows.start, centre.irradiance.shape[1]
+    kept = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n not in guides}
+    passing = {name: np.empty(layers[name].shape, np.float32) for name in guides}
+    confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    trusts: list[Trust | None] = [None] * count
+    for index, (there, link) in enumerate(zip(window.frames, window.links, strict=True)):
+        if there is None or link is None:
+            # The centre itself, or a frame that is missing.
+            for name, layer in kept.items():
+                layer[index] = layers[name]
+            if index == count // 2:
+                confidence[index] = coverage[index] = centre.valid[rows]
+            continue
+        with timings.stage("warp"):
+            flow = link.forward.vectors[rows]
+            warped = {name: layer[index] for name, layer in kept.items()} | passing
+            covered = link.forward.valid[rows] & warp_layers(there, flow, rows, warped)
+            geometry = trust_geometry(layers, warped, flow, covered, link.backward.vectors, rows.start)
+            trusts[index] = Trust(covered, geometry)
+            _set_trust(confidence, coverage, window, index, Trust(covered, geometry), rows)
+    return _Warped(kept, confidence, coverage, tuple(trusts))
+
+
+def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, trust: Trust, rows: slice) -> None:
+    """Write a neighbour's confidence and coverage, as far as its noise is its own."""
+    novelty: Array | np.float32 = np.float32(1)
+    if window.repeated[index]:  # a frame nearer to the centre has the same samples
+        novelty = np.float32(0)
+    elif "fixed-noise" in window.stages and (link := window.links[index]) is not None:
+        novelty = novelty_of(link.forward.vectors[rows])
+    coverage[index], confidence[index] = novelty * trust.coverage, novelty * trust.confidence
+
+
+def _warp_first_pass(
+    window: Window, first_pass: Sequence[Array | None], coverage: Array, rows: slice, timings: Timings
+) -> Array:
+    """Warp denoised frames to these rows of the centre, (T, h, W, 3); its own where a frame shows or has none.
+
+    Where a neighbour has none its coverage becomes 0.
+    """
+    middle = first_pass[len(first_pass) // 2]
+    if middle is None:
+        raise ValueError(f"frame {window.centre.number} has no estimate, expected one like its neighbours")
+    warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
+    for index, (there, link) in enumerate(zip(first_pass, window.links, strict=True)):
+        if link is None or there is None:
+            warped[index] = middle[rows]
+            if link is not None:
+                coverage[index] = 0
+            continue
+        with timings.stage("warp"):
+            # Denoised frames have no noise that interpolation could average, only detail to lose: bicubic is worth up
+            # to 0.5 dB here.
+            flow = link.forward.vectors
+            if flow.any():
+                warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
+            else:
+                warped[index] = there[rows]
+            np.copyto(warped[index], middle[rows], where=coverage[index, ..., None] == 0)
+    return warped
+
+
+def _fill_centre(
+    warped: _Warped, own: Array, estimates: Array | None, sources: WarpSources
+) -> tuple[Array | None, Array]:
+    """Fill pixels of the centre without a finite color from the neighbours in time; the colors and the centre's."""
+    color, middle = warped.layers.pop("color", None), len(warped.confidence) // 2
+    gone = warped.confidence[middle] == 0
+    if gone.any():
+        # The neighbours in space fill a single pixel well, a block badly: those in time come first.
+        own = own.copy()
+        own[gone] = average(sources.warp("irradiance", own) if color is None else color, warped.confidence)[gone]
+        pictures = [layer for name, layer in warped.layers.items() if name == "light" or name.startswith("aov ")]
+        for layer in (*pictures, *([] if estimates is None else [estimates])):
+            layer[middle][gone] = average(layer, warped.confidence)[gone]
+    if color is not None:
+        color[middle] = own
+    return color, own
+
+
+def _shows_drift(window: Window) -> bool:
+    """Whether two frames on one side of the centre have flows: `nlm.drift` compares them."""
+    middle = len(window.links) // 2
+    before, after = window.links[middle - 2 : middle], window.links[middle + 1 : middle + 3]
+    return None not in before or None not in after

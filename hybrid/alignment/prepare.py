@@ -173,11 +173,6 @@ class PreparedFrame:
         """Mean radiance of all pixels and channels, highlights included."""
         return float(self.with_highlights.mean(dtype=np.float64))
 
-    @property
-    def removed(self) -> float:
-        """Share of the light that went with the fireflies, in [0, 1]."""
-        return self.removed_radiance / (self.mean + self.removed_radiance) if self.removed_radiance else 0.0
-
 
 def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     """Make one frame safe to filter, and divide it by its albedo.

@@ -171,6 +171,7 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
             mirrored[name][outer] = layer[region][y][:, x]
     return replace(frame, **mirrored)
 
+
 def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
     """Divide a frame's color into what is denoised and what is unfiltered.
 

@@ -132,8 +132,8 @@ def compare(
     from hybrid.comparison.samples import samples_of
     from hybrid.comparison.store import FrameStore
     from hybrid.comparison.tables import markdown_table, result_table
-    from hybrid.plan import plan_shot
     from hybrid.runtime.allocator import reuse_freed_memory
+    from hybrid.stream import plan_shot
 
     costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
     cost = costs[clock]

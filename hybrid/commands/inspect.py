@@ -29,7 +29,8 @@ from hybrid.commands.options import (
 from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_findings, rules_of, say_cuts, views_of
 from hybrid.files.layers import Layers, describe_layers
 from hybrid.job import judge_views
-from hybrid.plan import STAGES, Decision, Rules, plan_shot
+from hybrid.plan import STAGES, Decision, Rules
+from hybrid.stream import plan_shot
 
 
 def inspect(
@@ -134,7 +135,7 @@ def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> N
 
 def _measured(decision: Decision) -> str:
     """A figure beside the threshold that it was held against."""
-    if decision.figure is None:
+    if decision.figure is None or decision.threshold is None:
         return "–"
     sign = ">" if decision.figure > decision.threshold else "≤"
     return f"{decision.figure:.3g} {sign} {decision.threshold:.3g}"

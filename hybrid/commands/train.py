@@ -172,8 +172,9 @@ def make_clips(
     Shots that have clips already are left alone, so that the same command goes on where it was.
     """
     from hybrid.files.shots import open_shot
-    from hybrid.plan import plan_shot
+    from hybrid.plan import Context
     from hybrid.runtime.allocator import reuse_freed_memory
+    from hybrid.stream import plan_shot
 
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -214,7 +215,7 @@ def make_clips(
         levels_of, _ = judge_alike(shot, strict=strict)
         towards = None if target is None else levels_of.pop(target)
         inputs = [count for level, count in zip(shot, counts, strict=True) if level != target]
-        plan = plan_shot(next(iter(levels_of.values())), radius=window // 2)
+        plan = plan_shot(next(iter(levels_of.values())), context=Context(True, window // 2))
         say_cuts(plan, (), strict=strict, name=name if len(found) > 1 else "")
         write_clips(
             levels_of,

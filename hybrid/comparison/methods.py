@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from skimage.restoration import denoise_nl_means, estimate_sigma
 
 from flow.tvl1 import refine_flow
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn, read_denoised
@@ -27,7 +26,8 @@ from hybrid.files.shots import Shot
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise
-from hybrid.steady import Pictures
+from hybrid.stabilize import FrameDenoiser
+from hybrid.stream import FrameStream
 from nlm.average import average, replace_nonfinite, robust_average
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _aligner(
     rules: Rules | None = None,
     vectors: bool = True,
     solver: Mapping[str, Any] | None = None,
-) -> Aligner:
+) -> FrameStream:
     """What aligns windows with the stages that they call for.
 
     `source` is that of the estimates (`hybrid.estimates`), `rules` have stages forced; without `vectors` those of the
@@ -138,7 +138,7 @@ def _aligner(
     refine = partial(refine_flow, **(solver or {}))
     bundled = _small_network() if source == "bundled" else None
     chosen = choose_estimate(source, shot, mode=MODE_OF["fast"], bundled=bundled)
-    return Aligner(seen, rules, radius=radius, estimates=chosen.estimates, refine=refine)
+    return FrameStream(seen, rules, chosen.estimates, radius=radius, refine=refine)
 
 
 def _windows(shot: Shot, numbers: Sequence[int], **window: Any) -> Iterator[AlignedWindow]:
@@ -225,9 +225,9 @@ def network(
         Number and linear radiance of each frame.
     """
     denoiser = _denoiser(preset, tile, precision, threshold)
-    pictures = Pictures(_aligner(shot, radius=denoiser.radius, **window), denoiser)
+    frames = FrameDenoiser(_aligner(shot, radius=denoiser.radius, **window), denoiser)
     for number in shot.numbers:
-        yield number, pictures.make(number)[0].color
+        yield number, frames.make(number).denoised.color
 
 
 def classical_maps(
@@ -343,7 +343,7 @@ def oidn(shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = N
 
 def oidn_then_average(shot: Shot) -> Iterator[tuple[int, Array]]:
     """OIDN's best mode on each frame, then the aligned robust average of what it gave."""
-    aligner = Aligner(MappedShot(shot, _denoised), Rules())
+    aligner = FrameStream(MappedShot(shot, _denoised), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(aligner.align(number))
 

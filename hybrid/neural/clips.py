@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.shots import Shot
@@ -18,6 +17,7 @@ from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average, gather_and_denoise
+from hybrid.stream import FrameStream
 from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
 
@@ -92,7 +92,7 @@ def write_clips(
         raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
     sources = [choose_estimate(estimate, shot) for shot in every if shot is not reference]
     aligners = [
-        Aligner(shot, Rules(), radius=radius, estimates=source.estimates)
+        FrameStream(shot, Rules(), source.estimates, radius=radius)
         for shot, source in zip((*shots, *([] if target is None else [target])), sources, strict=True)
     ]
     # Beside estimates by OIDN it is there for a second look as well.
@@ -140,7 +140,7 @@ def write_clips(
 
 def _level(
     shot: Shot,
-    aligner: Aligner,
+    aligner: FrameStream,
     number: int,
     after: int,
     make_target: Callable[[AlignedWindow], NDArray[np.float32]] | None,
@@ -155,8 +155,10 @@ def _level(
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
     clean = clean_guides(aligned)
-    motion = None if aligner.radius == 0 else aligner.flows.between(number, after)
-    to_next = np.zeros((*noisy.shape[:2], 2), np.float32) if motion is None else motion[0] * motion[1][..., None]
+    motion = None if aligner.radius == 0 else aligner.flow(number, after)
+    to_next = (
+        np.zeros((*noisy.shape[:2], 2), np.float32) if motion is None else motion.vectors * motion.valid[..., None]
+    )
     targets = {} if make_target is None else {"pseudo_reference": tensor_of(make_target(aligned)[None])[:, 0]}
     return targets | {
         "color": tensor_of(color),

@@ -23,7 +23,7 @@ from hybrid.neural.tiling import Block, image_of, pad, tensor_of, tiles
 from hybrid.neural.unet import HALO as HALO_OF_TRUNK
 from hybrid.neural.unet import denoise_bundled, denoise_unet, has_unet, prefilter_guides
 from hybrid.runtime.timing import Timings
-from hybrid.steady import Denoised
+from hybrid.stabilize import Denoised
 from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length

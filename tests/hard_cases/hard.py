@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from flow.motion import CYCLES
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Frame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
-from tests.scenes import Scene
+from hybrid.stream import FrameStream
+from tests.scenes import Scene, only
 
 STAGES = frozenset({"demodulate", "outliers", "warp", "gate", "prefilter"})
 SCENE = Scene(frames=5)
@@ -26,7 +26,7 @@ SUPPORT = 1 + 7 + 6 + 2 + REACH
 
 
 class Reel:
-    """Frames in memory, for an `Aligner`."""
+    """Frames in memory, for an `FrameStream`."""
 
     step = 1
 
@@ -89,7 +89,7 @@ def spoil(one: Frame, **layers: np.ndarray | None) -> Frame:
 def align(
     frames: Iterable[Frame], number: int = MIDDLE, stages: Collection[str] = STAGES, **options: object
 ) -> AlignedWindow:
-    return Aligner(Reel(frames), stages, **options).align(number)  # type: ignore[arg-type]
+    return FrameStream(Reel(frames), only(stages), **options).align(number)  # type: ignore[arg-type]
 
 
 def denoise(frames: Iterable[Frame], preset: str = "standard", number: int = MIDDLE, stages: Collection[str] = STAGES):

@@ -5,7 +5,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OfFrames
+from hybrid.estimates import PerFrame
 from hybrid.pseudo_reference import FINAL, STANDARD, filter_window
 from tests.hard_cases.hard import (
     MIDDLE,
@@ -77,7 +77,9 @@ def test_the_network_is_finite(value, precision, record_property):
     for place in PLACES.values():
         for which in WHICH.values():
             for layer in ("color", "together"):
-                image = denoiser(align(corrupted(frames, layer, value, place, which), estimates=OfFrames(itself))).color
+                image = denoiser(
+                    align(corrupted(frames, layer, value, place, which), first_pass=PerFrame(itself))
+                ).color
                 assert np.isfinite(image).all()
                 assert (image >= 0).all()
     record_property("cases", 2 * len(PLACES) * len(WHICH))

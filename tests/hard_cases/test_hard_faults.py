@@ -16,9 +16,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.cli import main
-from hybrid.estimates import OfFrames, OfWindows
+from hybrid.estimates import Classical, PerFrame
 from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.files.shots import open_shot
@@ -27,8 +26,9 @@ from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.plan import STAGES, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from hybrid.runtime.interrupt import interruptible
+from hybrid.stream import FrameStream
 from tests.hard_cases.test_hard_files import ROOT, run_alone
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 
 def draft(folder, out, *more):
@@ -368,9 +368,9 @@ def test_a_frame_made_in_parts_is_the_frame(tall, stages, record_property):
     """The promise is 1e-5; the classical chain keeps every bit."""
     shot, number = open_shot(tall), TALL.first + 2
     for preset in CLASSICAL_PRESETS.values():
-        whole = filter_window(Aligner(shot, stages).align(number), preset)
+        whole = filter_window(FrameStream(shot, only(stages)).align(number), preset)
         for rows in (64, 128, 320):
-            aligner = Aligner(shot, stages)
+            aligner = FrameStream(shot, only(stages))
             parts = []
             for top in range(0, TALL.height, rows):
                 aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
@@ -402,8 +402,10 @@ def test_the_network_in_parts_is_the_network(tall, rows):
     shot, number = open_shot(tall), TALL.first + 2
     denoiser = Denoiser(shipped_weights("fast"), precision="float32")
     stages = {"demodulate", "outliers", "warp"}
-    whole = denoiser(Aligner(shot, stages, estimates=OfWindows(CLASSICAL_PRESETS["draft"])).align(number)).color
-    aligner = Aligner(shot, stages, estimates=OfWindows(CLASSICAL_PRESETS["draft"]))
+    whole = denoiser(
+        FrameStream(shot, only(stages), first_pass=Classical(CLASSICAL_PRESETS["draft"])).align(number)
+    ).color
+    aligner = FrameStream(shot, only(stages), first_pass=Classical(CLASSICAL_PRESETS["draft"]))
     parts = []
     for top in range(0, TALL.height, rows):
         aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
@@ -445,7 +447,7 @@ def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size
     monkeypatch.setattr(type(shot), "shape", size)
     side = min(size[0], 608), min(size[1], 608)
     network = None if scratch is None else scratch * side[0] * side[1]
-    estimates = OfFrames(lambda frame: frame.color, holds)
+    estimates = PerFrame(lambda frame: frame.color, holds)
 
     def plan(gibibytes):
         return plan_rows(round(gibibytes * 2**30), shot, Rules().allowed, estimates, network=network)

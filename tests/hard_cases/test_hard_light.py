@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OfWindows
+from hybrid.estimates import Classical
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
 from tests.hard_cases.hard import (
     MIDDLE,
@@ -46,9 +46,9 @@ def test_the_estimate_scales_with_the_light(preset, record_property):
 
 @pytest.mark.neural
 def test_the_network_scales_with_the_light(network, record_property):
-    plain = network["float32"](align(shot(), estimates=OfWindows(STANDARD))).color
+    plain = network["float32"](align(shot(), first_pass=Classical(STANDARD))).color
     for scale in SCALES:
-        image = network["float32"](align(shot(scale=scale), estimates=OfWindows(STANDARD))).color
+        image = network["float32"](align(shot(scale=scale), first_pass=Classical(STANDARD))).color
         assert np.abs(image / np.float32(scale) - plain).max() < 1e-3 * plain.mean()
     record_property("cases", len(SCALES))
 
@@ -59,7 +59,7 @@ def test_the_network_scales_with_the_light(network, record_property):
 def test_next_to_no_light_is_finite(network, precision, scale):
     """The reciprocal of a denormal exposure was infinite, and the picture NaN."""
     frames = shot(scale=scale)
-    for image in (denoise(frames)[1], network[precision](align(frames, estimates=OfWindows(STANDARD))).color):
+    for image in (denoise(frames)[1], network[precision](align(frames, first_pass=Classical(STANDARD))).color):
         assert np.isfinite(image).all()
         assert (image >= 0).all()
         assert image.max() <= 10 * max(f.color.max() for f in frames)
@@ -87,7 +87,7 @@ def test_a_constant_picture_is_kept(preset, value):
 @pytest.mark.neural
 def test_the_network_keeps_a_constant_picture(network):
     for precision, model in network.items():
-        image = model(align(constant(0.7), estimates=OfWindows(STANDARD))).color
+        image = model(align(constant(0.7), first_pass=Classical(STANDARD))).color
         # A trunk makes it anew. Before pictures were mirrored beyond their borders it was 28 % off there.
         np.testing.assert_allclose(image, 0.7, rtol=0.02, err_msg=precision)
 
@@ -198,7 +198,7 @@ def test_the_network_survives_fireflies(network, precision, record_property):
     for value in (6.5e4, 1e6):
         for size in (1, 2, 3):
             frames = burn(shot(), value, size, (MIDDLE - 1, MIDDLE))
-            image = network[precision](align(frames, estimates=OfWindows(STANDARD))).color
+            image = network[precision](align(frames, first_pass=Classical(STANDARD))).color
             assert np.isfinite(image).all()
             assert (image >= 0).all()
     record_property("cases", 6)
@@ -261,7 +261,7 @@ def test_guides_that_tell_nothing_do_no_harm(changes, preset):
 @pytest.mark.neural
 def test_alpha_of_nought_stays_nought(network):
     frames = [spoil(f, alpha=np.zeros(f.color.shape[:2], np.float32)) for f in shot()]
-    window = align(frames, stages=STAGES | {"alpha"}, estimates=OfWindows(STANDARD))
+    window = align(frames, stages=STAGES | {"alpha"}, first_pass=Classical(STANDARD))
     done = network["float32"](window)
     assert (done.aovs["alpha"] == 0).all()
     assert np.isfinite(done.color).all()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
-from hybrid.estimates import OfFrames
-from hybrid.plan import plan_shot
+from hybrid.estimates import PerFrame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
+from hybrid.stream import plan_shot
 from tests.flow.scenes import plain
 from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 
@@ -43,7 +43,7 @@ def test_the_network_takes_any_size(size):
     from hybrid.neural.denoiser import Denoiser
     from network.checkpoint import shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy(size), estimates=OfFrames(itself))).color
+    image = Denoiser(shipped_weights("fast"))(align(noisy(size), first_pass=PerFrame(itself))).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
 
@@ -70,7 +70,7 @@ def test_more_than_32767_pixels_through_the_network():
     from hybrid.neural.denoiser import Denoiser
     from network.checkpoint import shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, estimates=OfFrames(itself))).color
+    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, first_pass=PerFrame(itself))).color
     assert image.shape == (3, 33_000, 3)
     assert np.isfinite(image).all()
 
@@ -93,7 +93,7 @@ def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
     from network.checkpoint import shipped_weights
 
     height, width = 40, 448
-    window = align(noisy((height, width)), estimates=OfFrames(itself))
+    window = align(noisy((height, width)), first_pass=PerFrame(itself))
 
     def denoiser(tile):
         return Denoiser(shipped_weights("fast"), tile=tile, precision=precision)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import stage_layers
-from hybrid.estimates import OfFrames
+from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
+from hybrid.stream import FrameStream
 from nlm.average import average
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 
 def align(folder, frames: int = 3) -> AlignedWindow:
@@ -22,7 +22,7 @@ def align(folder, frames: int = 3) -> AlignedWindow:
     scene = Scene(frames=frames, step=(0, 0), height=48, width=64, noise=1e-3)
     shot = open_shot(scene.write(folder, edit=brighter))
     stages = {"gate", "demodulate"}
-    return Aligner(shot, stages, radius=1, estimates=OfFrames(lambda frame: frame.color)).align(
+    return FrameStream(shot, only(stages), radius=1, first_pass=PerFrame(lambda frame: frame.color)).align(
         shot.numbers[frames // 2]
     )
 

@@ -12,7 +12,7 @@ from hybrid.estimates import choose_estimate
 from hybrid.files.shots import open_shot
 from hybrid.job import MEASURED, DenoiseOptions
 from hybrid.plan import Rules
-from hybrid.steady import Denoised
+from hybrid.stabilize import Denoised
 from tests.scenes import Scene
 
 SCENE = Scene(height=40, width=56, frames=5)

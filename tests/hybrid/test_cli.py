@@ -497,8 +497,8 @@ def test_a_lack_of_memory_is_one_line_whoever_says_so(shot_folder, capsys, monke
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("hybrid.commands.inspect.plan_shot", fail)
+    monkeypatch.setattr("hybrid.stream.plan_shot", fail)
     assert "not enough memory" in one_line_error(capsys, "inspect", shot_folder)
-    error = RuntimeError("a bug")
+    monkeypatch.setattr("hybrid.stream.plan_shot", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
         main(["inspect", str(shot_folder)])

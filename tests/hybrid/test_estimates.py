@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 
 from hybrid import estimates
-from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OfFrames, OfGuidedFrames, OfWindows, choose_estimate
+from hybrid.estimates import Classical, GuideAware, PerFrame, choose_estimate
 from hybrid.files import sources
 from hybrid.files.reader import ShotReader
 from hybrid.files.shots import open_shot
-from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
 from hybrid.records import read_records
+from hybrid.stream import FrameStream, plan_shot
 from tests.exr_files import write_layers
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp", "gate"}
 SCENE = Scene(frames=5, height=48, width=64)
@@ -42,7 +41,7 @@ def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
         asked.append(frame.number)
         return frame.color
 
-    aligner = Aligner(open_shot(SCENE.write(tmp_path)), STAGES, estimates=OfFrames(estimate))
+    aligner = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(estimate))
     for number in aligner.shot.numbers:
         assert aligner.align(number).estimate.shape == (5, SCENE.height, SCENE.width, 3)
     assert sorted(asked) == list(aligner.shot.numbers)
@@ -50,9 +49,9 @@ def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
 
 def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_from(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
-    sliding = Aligner(shot, STAGES, estimates=OfWindows(DRAFT))
+    sliding = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT))
     windows = [sliding.align(number) for number in shot.numbers]
-    alone = Aligner(shot, STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE)
+    alone = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE)
     np.testing.assert_array_equal(windows[2].estimate, alone.estimate)
     np.testing.assert_array_equal(gated_average(windows[2]), gated_average(alone))
 
@@ -76,7 +75,7 @@ def test_a_denoiser_is_told_whether_guides_hold_noise(tmp_path, stages):
         seen[frame.number] = frame
         return frame.color
 
-    aligner = Aligner(shot, stages, estimates=OfGuidedFrames(denoise))
+    aligner = FrameStream(shot, only(stages), first_pass=GuideAware(denoise))
     for number in shot.numbers:
         aligner.align(number)
     assert sorted(seen) == list(shot.numbers)
@@ -102,7 +101,7 @@ def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
     ):
         for stages, expected in ((STAGES | {"prefilter"}, noisy), (STAGES, clean)):
             calls.clear()
-            Aligner(shot, stages, radius=0, estimates=choose_estimate(mode, shot).estimates).align(MIDDLE)
+            FrameStream(shot, only(stages), radius=0, first_pass=choose_estimate(mode, shot).estimates).align(MIDDLE)
             assert calls == [{**expected, "device": "cpu"}]
 
 
@@ -114,8 +113,8 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
     def same(frame):
         return frame.color
 
-    for source in (None, OfFrames(same), OfGuidedFrames(lambda frame, _: frame.color), OfWindows(DRAFT)):
-        aligner, read = Aligner(shot, stages, estimates=source), []
+    for source in (None, PerFrame(same), GuideAware(lambda frame, _: frame.color), Classical(DRAFT)):
+        aligner, read = FrameStream(shot, only(stages), first_pass=source), []
         aligner.shot.reader.read = lambda number, read=read: read.append(number) or ShotReader.read(shot.reader, number)
         aligner.align(scene.first + 7)
         reach = 2 if source is None else source.reach(2)
@@ -123,7 +122,7 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
 
 
 def test_the_centres_estimate_comes_through_unchanged(tmp_path):
-    window = Aligner(open_shot(SCENE.write(tmp_path)), STAGES, estimates=OfFrames(flickering)).align(MIDDLE)
+    window = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(flickering)).align(MIDDLE)
     given = flickering(open_shot(tmp_path).read(MIDDLE))
     np.testing.assert_allclose(window.estimate[2] * window.modulation, given, rtol=1e-6)
 
@@ -140,12 +139,12 @@ def test_where_colors_agree_geometry_cannot_take_all_trust_away(tmp_path):
     def truth(frame):
         return SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
 
-    window = Aligner(shot, STAGES - {"demodulate"}, estimates=OfFrames(truth)).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES - {"demodulate"}), first_pass=PerFrame(truth)).align(MIDDLE)
     # The wall passes by whole pixels: warped, the next frame is this one but for the light, which follows the camera.
     inside = np.s_[4:-4, 4:-4]
     assert np.median(window.confidence[3][inside]) == pytest.approx(0.3, abs=0.01)
-    other = Aligner(
-        shot, STAGES - {"demodulate"}, estimates=OfFrames(lambda f: truth(f) * (1 + (f.number == MIDDLE + 1)))
+    other = FrameStream(
+        shot, only(STAGES - {"demodulate"}), first_pass=PerFrame(lambda f: truth(f) * (1 + (f.number == MIDDLE + 1)))
     )
     assert other.align(MIDDLE).confidence[3].max() < 0.05
 
@@ -155,7 +154,7 @@ def test_flicker_is_averaged_away(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
     gain = []
     for seed in range(4):
-        aligner = Aligner(shot, STAGES, estimates=OfFrames(lambda frame, seed=seed: flickering(frame, seed)))
+        aligner = FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame, seed=seed: flickering(frame, seed)))
         # Errors of one factor per frame are all that differs; the gate is wide, as the frames are noisy.
         window = aligner.align(MIDDLE)
         truth = SCENE.clean(2)["ViewLayer.Combined"]
@@ -181,7 +180,7 @@ def test_light_that_changes_is_not_averaged(tmp_path):
     truth = estimate(shot.read(MIDDLE))
     errors = []
     for stages in (STAGES, STAGES - {"gate"}):
-        result = gated_average(Aligner(shot, stages, estimates=OfFrames(estimate)).align(MIDDLE))
+        result = gated_average(FrameStream(shot, only(stages), first_pass=PerFrame(estimate)).align(MIDDLE))
         errors.append(np.abs(result - truth)[:, :28].mean() / truth[:, :28].mean())
     assert errors[0] < 0.02  # of the shadow's light
     assert errors[1] > 1  # dragged in from the bright frames
@@ -190,10 +189,10 @@ def test_light_that_changes_is_not_averaged(tmp_path):
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
 def test_the_average_scales_with_the_radiance(tmp_path, scale):
     plain = gated_average(
-        Aligner(open_shot(SCENE.write(tmp_path / "a")), STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE)
+        FrameStream(open_shot(SCENE.write(tmp_path / "a")), only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE)
     )
     shot = open_shot(SCENE.write(tmp_path / "b", scale=scale))
-    scaled = gated_average(Aligner(shot, STAGES, estimates=OfWindows(DRAFT)).align(MIDDLE))
+    scaled = gated_average(FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE))
     np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3)
 
 
@@ -204,21 +203,21 @@ def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path)
         return image
 
     shot = open_shot(SCENE.write(tmp_path))
-    result = gated_average(Aligner(shot, STAGES, estimates=OfFrames(broken)).align(MIDDLE))
+    result = gated_average(FrameStream(shot, only(STAGES), first_pass=PerFrame(broken)).align(MIDDLE))
     assert np.isfinite(result).all()
     assert result.min() >= 0
     with pytest.raises(ValueError, match=r"estimate of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
-        Aligner(shot, STAGES, estimates=OfFrames(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
+        FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
     with pytest.raises(ValueError, match=f"frame {MIDDLE} has no estimate"):
-        Aligner(shot, STAGES, estimates=OfFrames(lambda frame: None)).align(MIDDLE)
+        FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: None)).align(MIDDLE)
     with pytest.raises(ValueError, match="expected a window with estimates"):
-        gated_average(Aligner(shot, STAGES).align(MIDDLE))
+        gated_average(FrameStream(shot, only(STAGES)).align(MIDDLE))
 
 
 def test_a_neighbour_without_an_estimate_counts_for_nothing(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
-    window = Aligner(
-        shot, STAGES, estimates=OfFrames(lambda f: None if f.number == MIDDLE + 1 else flickering(f))
+    window = FrameStream(
+        shot, only(STAGES), first_pass=PerFrame(lambda f: None if f.number == MIDDLE + 1 else flickering(f))
     ).align(MIDDLE)
     assert (window.confidence[3] == 0).all()
     assert window.confidence[1].max() > 0
@@ -238,7 +237,7 @@ def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeyp
     assert choose_estimate("auto", plain).name == "oidn-clean"
     monkeypatch.setattr(estimates, "why_no_oidn", lambda: "pyoidn is not installed")
     source = choose_estimate("auto", plain, own=STANDARD)
-    assert (source.name, source.estimates) == ("nlm", OfWindows(STANDARD))
+    assert (source.name, source.estimates) == ("nlm", Classical(STANDARD))
     assert choose_estimate("none", plain).estimates is None
     with pytest.raises(ImportError, match="pyoidn is not installed"):
         choose_estimate("oidn-fast", plain)
@@ -246,7 +245,7 @@ def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeyp
 
 def test_what_cycles_has_denoised_is_taken_and_stays_what_it_is_at_the_centre(tmp_path):
     shot = open_shot(SCENE.write(tmp_path, edit=denoised))
-    window = Aligner(shot, STAGES, estimates=choose_estimate("auto", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES), first_pass=choose_estimate("auto", shot).estimates).align(MIDDLE)
     truth = SCENE.clean(2)["ViewLayer.Combined"]
     np.testing.assert_allclose(window.estimate[2] * window.modulation, truth, rtol=1e-5)
 
@@ -255,7 +254,7 @@ def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     SCENE.write(tmp_path / "clean", clean=True, without={"Vector", "Depth"})
     source = choose_estimate(str(tmp_path / "clean" / "shot.####.exr"), shot)
-    window = Aligner(shot, STAGES, estimates=source.estimates).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES), first_pass=source.estimates).align(MIDDLE)
     assert psnr(gated_average(window), SCENE.clean(2)["ViewLayer.Combined"]) > 50
     replace(SCENE, frames=2).write(tmp_path / "short", clean=True)
     with pytest.raises(ValueError, match=f"expected frame {MIDDLE}, which the shot has"):
@@ -350,7 +349,7 @@ def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_estimates_come_out_stable(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
-    window = Aligner(shot, STAGES, estimates=choose_estimate("oidn", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn", shot).estimates).align(MIDDLE)
     truth = SCENE.clean(2)["ViewLayer.Combined"]
     alone, stable = psnr(window.estimate[2] * window.modulation, truth), psnr(gated_average(window), truth)
     assert stable > alone > psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)

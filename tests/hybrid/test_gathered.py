@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from hybrid import pseudo_reference
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import demodulate, measure_gain
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OfFrames, choose_estimate
+from hybrid.estimates import PerFrame, choose_estimate
 from hybrid.files.shots import open_shot
 from hybrid.oidn import _device
 from hybrid.pseudo_reference import SECOND_LOOK, gated_average, gather_and_denoise
-from hybrid.steady import Denoised, Pictures
+from hybrid.stabilize import Denoised, FrameDenoiser
+from hybrid.stream import FrameStream
 from nlm.gather import gather
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "warp", "gate"}
 SCENE = Scene(frames=5, height=48, width=64)
@@ -37,7 +37,7 @@ def truth(frame) -> np.ndarray:
 
 def test_residuals_are_taken_in_their_own_place_and_moved_by_whole_pixels(tmp_path) -> None:
     shot = open_shot(SCENE.write(tmp_path))
-    aligner = Aligner(shot, STAGES, estimates=OfFrames(truth))
+    aligner = FrameStream(shot, only(STAGES), first_pass=PerFrame(truth))
     residual = aligner.align(MIDDLE).residual
     x, y = SCENE.step
     for index, number in enumerate(shot.numbers):
@@ -59,7 +59,7 @@ def test_the_gathered_picture_is_denoised_with_the_scale_of_the_whole_frame(tmp_
     monkeypatch.setattr(pseudo_reference, "denoise_oidn", denoise)
     shot = open_shot(SCENE.write(tmp_path))
     for stages, guides in ((STAGES, (None, True)), (STAGES | {"prefilter"}, ("balanced", False))):
-        aligned = Aligner(shot, stages, estimates=OfFrames(truth)).align(MIDDLE)
+        aligned = FrameStream(shot, only(stages), first_pass=PerFrame(truth)).align(MIDDLE)
         result = gather_and_denoise(aligned)
         gathered = gather(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
         image, average = (layer * aligned.modulation for layer in (gathered.image, gathered.average))
@@ -73,7 +73,7 @@ def test_the_gathered_picture_is_denoised_with_the_scale_of_the_whole_frame(tmp_
 
 
 def test_five_frames_bring_the_samples_of_nearly_five(tmp_path) -> None:
-    aligned = Aligner(open_shot(SCENE.write(tmp_path)), STAGES, estimates=OfFrames(truth)).align(MIDDLE)
+    aligned = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(truth)).align(MIDDLE)
     gathered = gather(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
     inner = np.s_[6:-6, 12:-12]
     assert gathered.samples[inner].mean() > 4.5
@@ -89,24 +89,28 @@ def test_with_one_seed_for_all_frames_nothing_is_gathered_where_nothing_moves(tm
     still = Scene(frames=5, height=48, width=64, step=(0, 0))
     shot = open_shot(still.write(tmp_path))
     for stages, samples in ((STAGES, 5), (STAGES | {"fixed-noise"}, 1)):
-        aligned = Aligner(shot, stages, estimates=OfFrames(lambda f: still.clean(0)["ViewLayer.Combined"])).align(1003)
+        aligned = FrameStream(
+            shot, only(stages), first_pass=PerFrame(lambda f: still.clean(0)["ViewLayer.Combined"])
+        ).align(1003)
         gathered = gather(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
         np.testing.assert_allclose(gathered.samples, samples, rtol=1e-3)
 
 
 def test_missing_neighbours_bring_nothing(tmp_path) -> None:
     shot = open_shot(SCENE.write(tmp_path))
-    first = Aligner(shot, STAGES, estimates=OfFrames(truth)).align(SCENE.first)
+    first = FrameStream(shot, only(STAGES), first_pass=PerFrame(truth)).align(SCENE.first)
     np.testing.assert_array_equal(first.residual[:2], 0)
     assert np.isfinite(first.residual).all()
     assert gather(first.estimate, first.residual, first.confidence, first.exposure).samples.max() <= 3.001
-    without = Aligner(shot, STAGES, estimates=OfFrames(lambda f: None if f.number == MIDDLE + 1 else truth(f)))
+    without = FrameStream(
+        shot, only(STAGES), first_pass=PerFrame(lambda f: None if f.number == MIDDLE + 1 else truth(f))
+    )
     np.testing.assert_array_equal(without.align(MIDDLE).residual[3], 0)
 
 
 def test_a_window_without_estimates_is_an_error(tmp_path) -> None:
     shot = open_shot(SCENE.write(tmp_path))
-    aligned = Aligner(shot, STAGES).align(MIDDLE)
+    aligned = FrameStream(shot, only(STAGES)).align(MIDDLE)
     assert aligned.residual is None
     with pytest.raises(ValueError, match="expected a window with estimates"):
         gather_and_denoise(aligned)
@@ -128,8 +132,8 @@ class TestWithOidn:
     def test_is_better_than_the_gated_average_and_than_oidn(self, tmp_path) -> None:
         shot = open_shot(SCENE.write(tmp_path))
         clean = truth(shot.read(MIDDLE))
-        fast = Aligner(shot, STAGES, estimates=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
-        best = Aligner(shot, STAGES, estimates=choose_estimate("oidn-best", shot).estimates).align(MIDDLE)
+        fast = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
+        best = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn-best", shot).estimates).align(MIDDLE)
         gathered = psnr(gather_and_denoise(fast), clean)
         # Measured: 1.4 and 0.9 dB.
         assert gathered > psnr(gated_average(fast), clean) + 0.5
@@ -139,13 +143,13 @@ class TestWithOidn:
         scene = Scene(frames=3, height=448, width=48)
         shot = open_shot(scene.write(tmp_path))
         parts = [
-            Pictures(
-                Aligner(shot, STAGES, radius=1, estimates=choose_estimate("oidn-fast", shot).estimates),
+            FrameDenoiser(
+                FrameStream(shot, only(STAGES), radius=1, first_pass=choose_estimate("oidn-fast", shot).estimates),
                 lambda aligned: Denoised(gather_and_denoise(aligned)),
                 rows=rows,
             )
-            .make(1002)[0]
-            .color
+            .make(1002)
+            .denoised.color
             for rows in (64, 448)
         ]
         # Two networks, one after the other, see 192 rows far, and a part has 128 around it.

@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.cli import main
-from hybrid.estimates import OfWindows
+from hybrid.estimates import Classical
 from hybrid.files.shots import open_shot
 from hybrid.passes import classify_passes, sample_rows
 from hybrid.pseudo_reference import DRAFT
+from hybrid.stream import FrameStream
 from hybrid.validation import validate_layers
 from tests.exr_files import write_layers
+from tests.scenes import only
 
 Layers = dict[str, np.ndarray]
 
@@ -128,7 +129,7 @@ def denoised(folder, names, preset="fast"):
     from network.checkpoint import shipped_weights
 
     shot = judged(folder, names)
-    window = Aligner(shot, {"demodulate", "warp"}, estimates=OfWindows(DRAFT)).align(2)
+    window = FrameStream(shot, only({"demodulate", "warp"}), first_pass=Classical(DRAFT)).align(2)
     return Denoiser(shipped_weights(preset), precision="float32")(window), open_shot(folder, aovs=names).read(2)
 
 

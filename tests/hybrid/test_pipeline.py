@@ -7,11 +7,11 @@ import pytest
 
 from hybrid import pipeline
 from hybrid.files.shots import Shot, open_shot
-from hybrid.pipeline import Finished, denoise_frames
+from hybrid.pipeline import Finished
 from hybrid.plan import Rules
 from hybrid.runtime.timing import Timings
-from hybrid.steady import Denoised
-from tests.scenes import Scene
+from hybrid.stabilize import Denoised
+from tests.scenes import Scene, denoise_view
 
 SCENE = Scene(frames=4, noise=0.1)
 FIRST = SCENE.first
@@ -48,7 +48,7 @@ def test_a_frame_is_written_while_the_next_one_is_made(tmp_path, shot, monkeypat
 
     monkeypatch.setattr(Shot, "write", write_late)
     timings = Timings()
-    made = list(denoise_frames(shot, tmp_path / "out", make, ALONE, timings=timings))
+    made = list(denoise_view(shot, tmp_path / "out", make, ALONE, timings=timings))
     assert outcomes(made) == [("Finished", number) for number in shot.numbers]
     assert all(frame.path.is_file() and frame.seconds > 0 for frame in made)
     assert threading.main_thread() not in threads
@@ -70,7 +70,7 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
         begun.append(aligned.number)
         return picture(aligned)
 
-    for frame in denoise_frames(shot, tmp_path / "out", make, ALONE, radius=1, beside=False):
+    for frame in denoise_view(shot, tmp_path / "out", make, ALONE, radius=1, background=False):
         assert frame.path.is_file()
         assert begun[-1] == frame.number
         # Its window, and perhaps one beyond for what shines in a frame alone.
@@ -81,7 +81,7 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
 def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, shot, monkeypatch):
     """While one is denoised, memory is at its fullest."""
     begun, read = [], {number: threading.Event() for number in shot.numbers}
-    whole, check = Shot.read, pipeline._check_finite
+    whole, check = Shot.read, pipeline.find_nonfinite
 
     def told(self, number):
         begun.append(number)
@@ -93,14 +93,13 @@ def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, sho
         assert max(begun) <= aligned.number + 1
         return picture(aligned)
 
-    def check_late(images, number):
-        if number == FIRST:
-            assert read[FIRST + 2].wait(60)  # of the next window
-        check(images, number)
+    def check_late(layer):
+        assert read[min(max(begun), FIRST + 2)].wait(60)  # of the next window
+        return check(layer)
 
     monkeypatch.setattr(Shot, "read", told)
-    monkeypatch.setattr(pipeline, "_check_finite", check_late)
-    assert len(list(denoise_frames(shot, tmp_path / "out", make, ALONE, radius=1))) == 4
+    monkeypatch.setattr(pipeline, "find_nonfinite", check_late)
+    assert len(list(denoise_view(shot, tmp_path / "out", make, ALONE, radius=1))) == 4
 
 
 def fail_to_write(monkeypatch, bad):
@@ -116,7 +115,7 @@ def fail_to_write(monkeypatch, bad):
 
 def test_a_frame_that_cannot_be_written_ends_the_run_and_those_before_it_are_there(tmp_path, shot, monkeypatch):
     fail_to_write(monkeypatch, FIRST + 1)
-    frames = denoise_frames(shot, tmp_path / "out", picture, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", picture, ALONE)
     assert next(frames).number == FIRST
     with pytest.raises(OSError, match="no space"):
         next(frames)
@@ -131,7 +130,7 @@ def test_all_others_are_made_in_order_with_keep_going(tmp_path, shot, monkeypatc
             raise ValueError("no picture")
         return picture(aligned)
 
-    frames = list(denoise_frames(shot, tmp_path / "out", make, ALONE, keep_going=True))
+    frames = list(denoise_view(shot, tmp_path / "out", make, ALONE, keep_going=True))
     assert outcomes(frames) == list(zip(("Finished", "Failed", "Failed", "Finished"), shot.numbers, strict=True))
     assert "no space" in str(frames[1].error)
     assert "no picture" in str(frames[2].error)
@@ -144,7 +143,7 @@ def test_the_frame_before_the_one_that_ends_the_run_is_told_first(tmp_path, shot
             raise error
         return picture(aligned)
 
-    frames = denoise_frames(shot, tmp_path / "out", make, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", make, ALONE)
     told = [next(frames), next(frames)]
     with pytest.raises(type(error)):
         next(frames)
@@ -153,23 +152,23 @@ def test_the_frame_before_the_one_that_ends_the_run_is_told_first(tmp_path, shot
 
 
 def test_whoever_stops_listening_finds_whole_frames(tmp_path, shot):
-    frames = denoise_frames(shot, tmp_path / "out", picture, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", picture, ALONE)
     next(frames)
     frames.close()
     there = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in there] == [shot.path(number).name for number in (FIRST, FIRST + 1)]
-    for frame in denoise_frames(shot, tmp_path / "out", picture, ALONE, resume=True):
+    for frame in denoise_view(shot, tmp_path / "out", picture, ALONE, resume=True):
         assert isinstance(frame, Finished)
         assert frame.resumed == (frame.number <= FIRST + 1)
 
 
 def test_it_makes_no_difference_to_the_pictures(tmp_path, shot):
     for name, beside in (("one", True), ("other", False)):
-        list(denoise_frames(shot, tmp_path / name, picture, ALONE, beside=beside))
+        list(denoise_view(shot, tmp_path / name, picture, ALONE, background=beside))
     for path in sorted((tmp_path / "one").iterdir()):
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
     wider = replace(SCENE, frames=6).write(tmp_path / "wider")
     assert (
-        len(list(denoise_frames(open_shot(wider, frames=f"{FIRST}-{FIRST + 4}x2"), tmp_path / "steps", picture, ALONE)))
+        len(list(denoise_view(open_shot(wider, frames=f"{FIRST}-{FIRST + 4}x2"), tmp_path / "steps", picture, ALONE)))
         == 3
     )

@@ -1,14 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.files.shots import open_shot
-from hybrid.plan import STAGES, Rules, as_run, plan_shot
-from tests.scenes import Scene
+from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
+from hybrid.stream import FrameStream, plan_shot
+from tests.scenes import Scene, only
 
 
 def decisions(folder):
-    plan = plan_shot(open_shot(folder))
+    plan = plan_shot(open_shot(folder), context=NOISY)
     return {decision.stage: decision for decision in plan.decisions}
 
 
@@ -54,26 +56,40 @@ def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gat
 
 
 def test_what_ran_on_a_part_of_the_picture_says_on_how_much(shot_folder):
-    plan = plan_shot(open_shot(shot_folder))
-    ran = {d.stage: d for d in as_run(plan, {"refine", "warp"}, {"refine": 0.19}).decisions}
-    before = {d.stage: d for d in plan.decisions}
-    assert ran["refine"].on
-    assert ran["refine"].reason.endswith("; it ran on 19% of it")
+    plan = plan_shot(open_shot(shot_folder), Rules(on=frozenset({"refine"})))
+    before = {d.stage: d for d in merge({1: plan}).decisions}
+    ran = {d.stage: d for d in merge({1: replace(plan, shares={"refine": 0.19})}).decisions}
+    assert ran["refine"].reason == f"{before['refine'].reason}; it ran on 19% of the picture"
     assert ran["warp"] == before["warp"]
 
 
 def test_samples_that_are_not_rejected_are_not_said_to_be(tmp_path):
-    plan = plan_shot(open_shot(Scene().write(tmp_path)), Rules(on=frozenset({"outliers"})))
-    ran = {d.stage: d for d in as_run(plan, {"warp"}).decisions}["outliers"]
-    assert not ran.on
-    assert ran.reason.startswith("beside estimates")
+    shot, rules = open_shot(Scene().write(tmp_path)), Rules(on=frozenset({"outliers"}))
+    noisy, denoised = (decision_of("outliers", plan_shot(shot, rules, context=c)) for c in (NOISY, DENOISED))
+    assert noisy.on
+    assert not denoised.on
+    assert denoised.reason.startswith("the averaging of denoised frames bounds")
+
+
+def test_denoised_frames_are_compared_in_any_case_unless_the_gate_is_off(shot_folder):
+    shot = open_shot(shot_folder)
+    gates = [decision_of("gate", plan_shot(shot, context=c)) for c in (NOISY, DENOISED)]
+    assert [gate.on for gate in gates] == [False, True]
+    assert gates[1].reason == f"denoised frames are compared in any case; measured: {gates[0].reason}"
+    assert not decision_of("gate", plan_shot(shot, Rules(off=frozenset({"gate"})), context=DENOISED)).on
+
+
+def decision_of(stage, plan):
+    return next(decision for decision in plan.decisions if decision.stage == stage)
 
 
 def test_drift_that_cannot_be_told_is_not_said_to_run(shot_folder):
-    plan = plan_shot(open_shot(shot_folder)).force({"drift"})
-    ran = {d.stage: d for d in as_run(plan, {"warp"}).decisions}["drift"]
-    assert not ran.on
-    assert ran.reason.startswith("needs estimates of five frames or more; forced")
+    shot, rules = open_shot(shot_folder), Rules(on=frozenset({"drift"}))
+    assert decision_of("drift", plan_shot(shot, rules, context=DENOISED)).on
+    for context in (NOISY, Context(first_pass=True, radius=1)):
+        decision = decision_of("drift", plan_shot(shot, rules, context=context))
+        assert not decision.on
+        assert decision.reason.startswith("needs denoised frames, and windows of five or more; forced")
 
 
 def test_fireflies_call_for_rejection(tmp_path):
@@ -135,7 +151,7 @@ def test_noise_that_stands_still_on_the_screen_is_found(tmp_path, moving, fixed)
     assert ("Animate Seed" in decision.reason) == fixed
 
 
-def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_path):
+def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_path, monkeypatch):
     scene = Scene(height=48, width=64, frames=5, step=(0, 0))
 
     def one_seed(index, layers):
@@ -143,10 +159,11 @@ def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_
         layers["ViewLayer.Combined"] = scene.clean(index)["ViewLayer.Combined"] * grain
 
     shot = open_shot(scene.write(tmp_path, edit=one_seed))
+    monkeypatch.setattr(FrameStream, "_repeats", lambda *_: False)  # equal frames, which this scene has as well
     stages = {"demodulate", "warp", "fixed-noise"}
-    window = Aligner(shot, stages).align(scene.first + 2)
+    window = FrameStream(shot, only(stages)).align(scene.first + 2)
     assert (window.confidence[[0, 1, 3, 4]] == 0).all()
-    trusting = Aligner(shot, stages - {"fixed-noise"}).align(scene.first + 2)
+    trusting = FrameStream(shot, only(stages - {"fixed-noise"})).align(scene.first + 2)
     assert trusting.variance.max() < 1e-10  # five times the same picture
     # Grain of a standard deviation of 0.3: what is left of it says so, within what a 5×5 box of it varies.
     truth = (0.3 * scene.clean(2)["ViewLayer.Combined"] / window.modulation) ** 2

@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.comparison.metrics import psnr
 from hybrid.files.shots import open_shot
 from hybrid.plan import STAGES
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, DRAFT, FINAL, STANDARD, filter_window
+from hybrid.stream import FrameStream
 from nlm.average import robust_average
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 MOVING = {"demodulate", "outliers", "warp"}
 SCENE = Scene(frames=5)
@@ -17,7 +17,7 @@ MIDDLE = SCENE.first + 2
 
 
 def align(folder, stages=MOVING, number=MIDDLE, **options):
-    return Aligner(open_shot(folder), stages, **options).align(number)
+    return FrameStream(open_shot(folder), only(stages), **options).align(number)
 
 
 def test_exact_vectors_bring_every_frame_onto_the_centre(tmp_path):
@@ -54,8 +54,8 @@ def test_a_hole_in_the_sequence_is_a_narrower_window(tmp_path):
 def test_frames_are_read_once_while_the_window_slides(tmp_path, monkeypatch):
     shot = open_shot(SCENE.write(tmp_path))
     read = []
-    monkeypatch.setattr("hybrid.files.reader.read_exr", _counting(read))
-    aligner = Aligner(shot, MOVING)
+    monkeypatch.setattr("hybrid.files.frames.read_exr", _counting(read))
+    aligner = FrameStream(shot, only(MOVING))
     for number in shot.numbers:
         aligner.align(number)
     pixels = [path for path, whole in read if whole]
@@ -142,19 +142,19 @@ def test_a_firefly_leaves_neither_a_bright_spot_nor_a_dark_hole(tmp_path):
 
 def test_a_still_shot_is_not_warped(tmp_path):
     scene = Scene(frames=3, step=(0, 0))
-    aligner = Aligner(open_shot(scene.write(tmp_path)), {"demodulate"})
+    aligner = FrameStream(open_shot(scene.write(tmp_path)), only({"demodulate"}))
     window = aligner.align(scene.first + 1)
     noisy = scene.noisy(0)["ViewLayer.Combined"]
     np.testing.assert_allclose(window.color[1] * window.modulation, noisy, rtol=1e-5)
-    assert (aligner.flows.between(scene.first + 1, scene.first)[0] == 0).all()
+    assert (aligner.flow(scene.first + 1, scene.first)[0] == 0).all()
 
 
 def test_without_vectors_the_motion_is_found(tmp_path):
     scene = Scene(height=64, width=96, noise=0.05)
     folder = scene.write(tmp_path, without={"Vector"})
-    aligner = Aligner(open_shot(folder), MOVING | {"dense-flow"})
+    aligner = FrameStream(open_shot(folder), only(MOVING | {"dense-flow"}))
     aligner.align(scene.first + 1)
-    inner = aligner.flows.between(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
+    inner = aligner.flow(scene.first + 1, scene.first + 2)[0][16:-16, 16:-16]
     # The wall's 4 px squares have straight edges; most of the picture must be found to half a pixel.
     error = np.hypot(inner[..., 0] - scene.step[0], inner[..., 1] - scene.step[1])
     assert np.median(error) < 0.5
@@ -166,7 +166,7 @@ def test_aovs_travel_along_and_sum_to_the_beauty(tmp_path):
         layers["indirect"] = 0.75 * layers["ViewLayer.Combined"]
 
     shot = open_shot(SCENE.write(tmp_path, edit=split), aovs=("direct", "indirect"))
-    window = Aligner(shot, {"warp"}).align(MIDDLE)
+    window = FrameStream(shot, only({"warp"})).align(MIDDLE)
     np.testing.assert_allclose(window.aovs["direct"] + window.aovs["indirect"], window.color, rtol=1e-5)
 
 

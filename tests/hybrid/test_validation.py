@@ -17,7 +17,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import Shot, open_shot
-from hybrid.plan import plan_shot
+from hybrid.stream import plan_shot
 from hybrid.validation import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.transfer import ALBEDO_FLOOR
-from hybrid.estimates import OfFrames
+from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
-from tests.scenes import Scene
+from hybrid.stream import FrameStream
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(frames=5)
@@ -16,14 +16,14 @@ MIDDLE = SCENE.first + 2
 
 
 def window(folder, **options):
-    return Aligner(open_shot(folder), STAGES, **options).align(MIDDLE)
+    return FrameStream(open_shot(folder), only(STAGES), **options).align(MIDDLE)
 
 
 def test_estimates_are_aligned_as_the_frames_are(tmp_path):
     """An estimate that is the clean frame itself becomes the clean centre wherever a frame shows it."""
     clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
-    source = OfFrames(lambda frame: clean.read(frame.number).color)
-    aligned = window(SCENE.write(tmp_path / "noisy"), estimates=source)
+    source = PerFrame(lambda frame: clean.read(frame.number).color)
+    aligned = window(SCENE.write(tmp_path / "noisy"), first_pass=source)
     layers = SCENE.clean(2)
     light = layers["ViewLayer.Combined"] / (layers["ViewLayer.Denoising Albedo"] + ALBEDO_FLOOR)
     for estimate, confidence in zip(aligned.estimate, aligned.confidence, strict=True):
@@ -36,7 +36,9 @@ def test_estimates_are_aligned_as_the_frames_are(tmp_path):
 def test_a_part_of_a_frame_is_that_part_of_the_whole(tmp_path):
     folder = Scene(height=448, width=40, frames=3).write(tmp_path)
     number = SCENE.first + 1
-    whole, part = (Aligner(open_shot(folder), STAGES, radius=1).align(number, rows) for rows in (None, slice(64, 128)))
+    whole, part = (
+        FrameStream(open_shot(folder), only(STAGES), radius=1).align(number, rows) for rows in (None, slice(64, 128))
+    )
     assert part.color.shape[1] < 448
     for name in ("color", "albedo", "normal", "confidence"):
         np.testing.assert_array_equal(getattr(part, name)[:, part.inner], getattr(whole, name)[:, 64:128])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.files.shots import open_shot
-from tests.scenes import Scene
+from hybrid.stream import FrameStream
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}
 # Two frames' worth of a fast wall: 14 pixels to the right and 9 down are beyond what TV-L1 finds by itself.
@@ -22,9 +22,8 @@ def wrong_by_a_pixel(index, layers):
 
 def flow_error(folder, stages, **options) -> float:
     """Mean length, pixels, of what the flow to the next frame is off by, away from the border."""
-    aligner = Aligner(open_shot(folder), stages, radius=1, **options)
-    aligner.align(FAST.first + 1)
-    flow, _ = aligner.flows.between(FAST.first + 1, FAST.first + 2)
+    aligner = FrameStream(open_shot(folder), only(stages), radius=1, **options)
+    flow, _ = aligner.flow(FAST.first + 1, FAST.first + 2)
     return float(np.hypot(*np.moveaxis(flow - np.float32(FAST.step), -1, 0))[INNER].mean())
 
 
@@ -33,13 +32,14 @@ def fast_folder(tmp_path_factory):
     return FAST.write(tmp_path_factory.mktemp("fast"), edit=wrong_by_a_pixel)
 
 
-def test_flows_over_several_frames_are_kept_for_a_window_and_no_longer(tmp_path):
-    """They are a fifth of what a window of seven frames holds while it is denoised."""
+def test_flows_over_several_frames_are_not_kept_beyond_their_window(tmp_path):
+    """They are a fifth of the memory of a window of seven frames while it is denoised."""
     scene = Scene(frames=5, height=48)
-    aligner = Aligner(open_shot(scene.write(tmp_path)), STAGES)
-    for rows, kept in ((slice(0, 24), 4), (slice(24, 48), 0), (slice(0, 48), 0), (None, 0)):
-        aligner.align(scene.first + 2, rows)
-        assert len(aligner.flows._chains) == kept
+    stream = FrameStream(open_shot(scene.write(tmp_path)), only(STAGES))
+    window = stream.window(scene.first + 2)
+    np.testing.assert_array_equal(window.links[0].forward.vectors[24, 30], [-4, -2])
+    kept = {frames for kind, frames in stream._cache if kind == "flows"}
+    assert kept == {(n, n + 1) for n in range(scene.first, scene.first + 4)}
 
 
 def test_refinement_starts_from_the_vectors_and_its_result_is_used(fast_folder):
@@ -68,9 +68,9 @@ def test_the_window_says_on_what_share_of_the_picture_vectors_were_solved_for(fa
         solved[: round(part * len(start))] += 1
         return solved
 
-    aligner = Aligner(open_shot(fast_folder), STAGES | {"refine"}, radius=1, refine=solve)
+    aligner = FrameStream(open_shot(fast_folder), only(STAGES | {"refine"}), radius=1, refine=solve)
     assert aligner.align(FAST.first + 1).shares == {"refine": pytest.approx(part)}
-    assert Aligner(open_shot(fast_folder), STAGES, radius=1).align(FAST.first + 1).shares == {}
+    assert FrameStream(open_shot(fast_folder), only(STAGES), radius=1).align(FAST.first + 1).shares == {}
 
 
 def test_without_refinement_nothing_is_refined(fast_folder):

@@ -10,17 +10,17 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.alignment.prepare import prepare
 from hybrid.alignment.unfiltered import find_region, mirror_region, split_unfiltered
 from hybrid.cli import main
-from hybrid.estimates import OfFrames
+from hybrid.estimates import PerFrame
 from hybrid.files.exr import HALF_MAX, read_exr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average
-from hybrid.steady import Denoised, Pictures
+from hybrid.stabilize import Denoised, FrameDenoiser
+from hybrid.stream import FrameStream
 from tests.exr_files import write_layers
 from tests.scenes import Scene
 
@@ -223,12 +223,12 @@ class TestRegion:
                 layers[f"ViewLayer.{name}"] = self.cut(layers[f"ViewLayer.{name}"], slice(12, 36), slice(16, 48))
 
         shot = open_shot(scene.write(tmp_path, edit=crop))
-        blur = OfFrames(lambda frame: cv2.blur(frame.color, (7, 7)))
-        maker = Pictures(
-            Aligner(shot, Rules(off=frozenset({"mean", "samples"})), estimates=blur),
+        blur = PerFrame(lambda frame: cv2.blur(frame.color, (7, 7)))
+        maker = FrameDenoiser(
+            FrameStream(shot, Rules(off=frozenset({"mean", "samples"})), first_pass=blur),
             lambda aligned: Denoised(gated_average(aligned)),
         )
-        color = maker.make(scene.first + 1)[0].color
+        color = maker.make(scene.first + 1).denoised.color
         truth = scene.clean(1)["ViewLayer.Combined"]
         mirrored = np.pad(truth[12:36, 16:48], ((3, 3), (3, 3), (0, 0)), mode="symmetric")
         wanted = cv2.blur(mirrored, (7, 7))[3:-3, 3:-3]

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid.alignment.align import Aligner
-from hybrid.estimates import OfFrames
+from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
+from hybrid.stream import FrameStream
 from nlm.average import replace_nonfinite
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(frames=5)
@@ -18,7 +18,7 @@ MIDDLE = SCENE.first + 2
 
 
 def window(folder):
-    return Aligner(open_shot(folder), STAGES).align(MIDDLE)
+    return FrameStream(open_shot(folder), only(STAGES)).align(MIDDLE)
 
 
 def test_the_centre_takes_the_place_of_what_is_not_trusted(tmp_path):
@@ -45,8 +45,10 @@ def test_colors_beside_estimates_are_those_without(tmp_path):
 
     shot = open_shot(SCENE.write(tmp_path, edit=lose))
     stages = {"demodulate", "outliers", "warp"}
-    beside = Aligner(shot, stages, estimates=OfFrames(lambda frame: replace_nonfinite(frame.color)[0])).align(MIDDLE)
-    without = Aligner(shot, stages - {"outliers"}).align(MIDDLE)
+    beside = FrameStream(
+        shot, only(stages), first_pass=PerFrame(lambda frame: replace_nonfinite(frame.color)[0])
+    ).align(MIDDLE)
+    without = FrameStream(shot, only(stages - {"outliers"})).align(MIDDLE)
     assert beside.aligned_color is None
     assert "outliers" not in beside.stages
     assert (beside.confidence[2, 10:14, 20:24] == 0).all()
@@ -68,5 +70,5 @@ def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
         assert sure.mean() > 0.5
         # Whole-pixel vectors: nothing is interpolated.
         np.testing.assert_allclose(layer[1][sure], own[sure], atol=1e-5)
-    still = Aligner(open_shot(folder), set()).align(MIDDLE)
+    still = FrameStream(open_shot(folder), only(set())).align(MIDDLE)
     assert not np.allclose(still.albedo[1][sure], still.albedo[2][sure], atol=0.01)  # something has moved

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
@@ -17,9 +16,10 @@ from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import filter_window
+from hybrid.stream import FrameStream
 from nlm.average import average
 from tests.exr_files import write_layers
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 SCENE = Scene(frames=3, height=32, width=40)
 NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch", "scikit-image": "pywt", "OpenCV": "pywt"}
@@ -75,7 +75,7 @@ def test_noise_of_a_tone_mapped_frame_is_found() -> None:
 
 class TestMaps:
     def aligned(self, shot: Shot, confidence: float) -> methods.AlignedWindow:
-        window = Aligner(shot, {"demodulate", "warp"}, radius=1).align(SCENE.first + 1)
+        window = FrameStream(shot, only({"demodulate", "warp"}), radius=1).align(SCENE.first + 1)
         trust = np.full_like(window.confidence, confidence)
         trust[window.centre] = 1
         return replace(window, confidence=trust)
@@ -101,7 +101,7 @@ class TestMaps:
 
 
 def test_estimators_of_methods_are_those_of_the_library(shot: Shot) -> None:
-    aligned = Aligner(shot, Rules()).align(SCENE.first)
+    aligned = FrameStream(shot, Rules()).align(SCENE.first)
     np.testing.assert_array_equal(next(METHODS["standard"].run(shot))[1], filter_window(aligned))
 
 

@@ -7,16 +7,17 @@ import OpenEXR
 import pytest
 
 from flow.motion import CYCLES
-from hybrid.alignment.loading import LoadedFrames
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.shots import Shot, open_shot, output_path
+from hybrid.plan import Rules
+from hybrid.stream import FrameStream
 from tests.exr_files import SIZE, flat_image, save_frames, write_layers
 from tests.renderers import layer
 
 
 def neighbours(shot: Shot, number: int, radius: int) -> list[int | None]:
     """Numbers of a frame and what there is around it."""
-    around = LoadedFrames(shot, ()).around(number, radius)
+    around = FrameStream(shot, Rules()).around(number, radius)
     return [n if shot.has(n) else None for n in around]
 
 

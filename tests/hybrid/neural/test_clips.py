@@ -10,14 +10,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from hybrid import estimates, pseudo_reference
-from hybrid.alignment.align import Aligner
-from hybrid.estimates import OfWindows, choose_estimate
+from hybrid.estimates import Classical, choose_estimate
 from hybrid.files.shots import open_shot
 from hybrid.neural import clips as module
 from hybrid.neural import denoiser
 from hybrid.neural.clips import write_clips
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, gated_average, gather_and_denoise
+from hybrid.stream import FrameStream
 from network.checkpoint import save_model
 from network.models import centre_of, fast
 from network.training.clips import Clip, open_clips
@@ -60,7 +60,7 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     monkeypatch.setattr(denoiser, "denoise_tile", spy)
     save_model(tmp_path / "w.safetensors", fast())
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
-    window = Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     with pytest.raises(StopIteration):
         denoiser.Denoiser(tmp_path / "w.safetensors", tile=128, precision="float32")(window)
     assert set(given) == {
@@ -76,7 +76,7 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
 def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_path, monkeypatch):
     (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
-    window = Aligner(shot, Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     image = clip.pseudo_reference[0].permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(image, gated_average(window))
     layers = SCENE.clean(2)
@@ -93,7 +93,7 @@ def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path
     monkeypatch.setattr(pseudo_reference, "denoise_oidn", lambda color, *_, **__: 0.25 * color)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
     write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="oidn-fast")
-    window = Aligner(shot, Rules(), estimates=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, Rules(), first_pass=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
     image = found[0].pseudo_reference[0].permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(image, gather_and_denoise(window))
     assert np.abs(image - gated_average(window)).max() > 0.01 * image.mean()
@@ -131,7 +131,7 @@ def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, 
     other = SCENE.write(tmp_path / "other", clean=True, edit=bright_window)
     shot, target = open_shot(tmp_path / "dim", frames=only), open_shot(other, frames=only)
     (clip,) = prepare(shot, monkeypatch, tmp_path, target=target)
-    window = Aligner(open_shot(other, frames=only), Rules(), estimates=OfWindows(FINAL)).align(MIDDLE)
+    window = FrameStream(open_shot(other, frames=only), Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     assert clip.pseudo_reference is None
     assert len(clip.reference) == len(clip.noisy) == 1
     np.testing.assert_array_equal(clip.reference[0].permute(1, 2, 0).numpy(), gated_average(window))
@@ -144,9 +144,9 @@ def test_clips_of_whole_frames_know_the_way_to_the_next(tmp_path, monkeypatch):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     found = prepare(shot, monkeypatch, tmp_path)
     assert [float(clip.linked) for clip in found] == [1, 1, 1, 1, 0]
-    aligner = Aligner(shot, Rules(), estimates=OfWindows(FINAL))
+    aligner = FrameStream(shot, Rules(), first_pass=Classical(FINAL))
     aligner.align(MIDDLE)
-    flow, valid = aligner.flows.between(MIDDLE, MIDDLE + 1)
+    flow, valid = aligner.flow(MIDDLE, MIDDLE + 1)
     np.testing.assert_array_equal(found[2].to_next[0].permute(1, 2, 0).numpy(), flow * valid[..., None])
     assert float(np.abs(flow[valid]).max()) > 0.5
     assert not bool(found[4].to_next.any())

@@ -5,16 +5,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 torch = pytest.importorskip("torch")
 
-from hybrid.alignment.align import Aligner  # noqa: E402
 from hybrid.breakdown import Breakdown  # noqa: E402
-from hybrid.estimates import OfWindows  # noqa: E402
+from hybrid.estimates import Classical  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.neural.denoiser import Denoiser  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.stream import FrameStream  # noqa: E402
 from hybrid.validation import validate_layers  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
 from network.models import unet  # noqa: E402
@@ -46,14 +46,16 @@ def folder(tmp_path_factory):
 
 def align(folder, **options):
     shot = open_shot(folder, **options)
-    return Aligner(validate_layers(shot).apply(shot), STAGES, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
+    return FrameStream(validate_layers(shot).apply(shot), only(STAGES), first_pass=Classical(DRAFT)).align(
+        SCENE.first + 2
+    )
 
 
 def test_tiles_give_what_the_whole_image_gives(tmp_path, weights):
     """In a picture that is wider than a tile with its halo: tiles in the middle see neither of its ends."""
     scene = Scene(height=40, width=420, frames=5)
     shot = open_shot(scene.write(tmp_path))
-    window = Aligner(shot, STAGES, estimates=OfWindows(DRAFT)).align(scene.first + 2)
+    window = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(scene.first + 2)
     whole = Denoiser(weights, tile=512, precision="float32")(window).color
     denoiser = Denoiser(weights, tile=32, precision="float32")
     assert 2 * denoiser.halo + 32 < scene.width
@@ -65,7 +67,9 @@ def test_tiles_give_what_the_whole_image_gives(tmp_path, weights):
 def test_tiles_show_their_seams_without_a_halo(tmp_path, weights, monkeypatch):
     """So the test above sees what it is for."""
     scene = Scene(height=40, width=420, frames=5)
-    window = Aligner(open_shot(scene.write(tmp_path)), STAGES, estimates=OfWindows(DRAFT)).align(scene.first + 2)
+    window = FrameStream(open_shot(scene.write(tmp_path)), only(STAGES), first_pass=Classical(DRAFT)).align(
+        scene.first + 2
+    )
     whole = Denoiser(weights, tile=512, precision="float32")(window).color
     monkeypatch.setattr(Denoiser, "halo", 0)
     tiled = Denoiser(weights, tile=32, precision="float32")(window).color
@@ -183,7 +187,7 @@ def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
         layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
 
     shot = open_shot(SCENE.write(tmp_path, edit=cut_out))
-    window = Aligner(shot, STAGES | {"alpha"}, estimates=OfWindows(DRAFT)).align(SCENE.first + 2)
+    window = FrameStream(shot, only(STAGES | {"alpha"}), first_pass=Classical(DRAFT)).align(SCENE.first + 2)
     alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"]
     assert alpha.shape == (SCENE.height, SCENE.width, 1)
     assert 0.4 <= alpha.min() <= alpha.max() <= 0.6  # kernels are convex
@@ -198,9 +202,9 @@ def test_what_is_opaque_stays_opaque(tmp_path, weights):
         alpha = ((y - 15) ** 2 + (x - 20 - 1.4 * index) ** 2 < 90).astype(np.float32)[..., None]
         layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
 
-    window = Aligner(open_shot(SCENE.write(tmp_path, edit=disc)), STAGES | {"alpha"}, estimates=OfWindows(DRAFT)).align(
-        SCENE.first + 2
-    )
+    window = FrameStream(
+        open_shot(SCENE.write(tmp_path, edit=disc)), only(STAGES | {"alpha"}), first_pass=Classical(DRAFT)
+    ).align(SCENE.first + 2)
     given = window.aovs["alpha"][2][..., 0]
     alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"][..., 0]
     for value in (0, 1):
@@ -217,7 +221,7 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
     scene = Scene(height=40, width=320, frames=5)  # wide enough for tiles whose halo holds no edge
     shot = open_shot(scene.write(tmp_path, edit=blank))
     denoiser = Denoiser(weights, tile=16, precision="float32")
-    aligners = [Aligner(shot, STAGES | extra, estimates=OfWindows(DRAFT)) for extra in (set(), {"skip"})]
+    aligners = [FrameStream(shot, only(STAGES | extra), first_pass=Classical(DRAFT)) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
     # What is lit is mirrored by 32 pixels. A trunk leaves next to nothing where there is nothing: 0.002 beside an edge.
     np.testing.assert_allclose(images[1], images[0], atol=1e-6 if weights.stem == "untrained" else 5e-3)
@@ -262,7 +266,7 @@ def test_bad_options_are_refused(weights):
 def test_more_threshold_stays_closer_to_the_input_and_to_its_own_frame():
     """On a rendered shot, with a small network that takes no estimates: 150 steps on two other scenes."""
     shot = open_shot("examples/shot/noisy.####.exr", frames="11")
-    window = Aligner(shot, STAGES).align(11)
+    window = FrameStream(shot, only(STAGES)).align(11)
     noisy = window.color[2] * window.modulation
     distances, weights_of_centre = [], []
     for threshold in (0.0, 0.25, 0.5, 0.75, 0.95):

@@ -11,7 +11,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hybrid.alignment.align import Aligner
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
@@ -19,8 +18,9 @@ from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
 from hybrid.neural import denoiser, unet
 from hybrid.neural.unet import denoise_bundled, denoise_unet
+from hybrid.stream import FrameStream
 from network.unet import OIDN_WEIGHTS, Trunk, TrunkConfig
-from tests.scenes import Scene
+from tests.scenes import Scene, only
 
 pytestmark = [
     pytest.mark.neural,
@@ -83,10 +83,10 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
 
     source = choose_estimate("auto", shot, mode="oidn-fast", quicker=quicker)
     assert "torch" in source.reason
-    Aligner(shot, {"demodulate"}, radius=0, estimates=source.estimates).align(1002)
+    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=source.estimates).align(1002)
     assert calls == [{"quality": "fast"}]
     named = choose_estimate("oidn-fast", shot, quicker=quicker)
-    Aligner(shot, {"demodulate"}, radius=0, estimates=named.estimates).align(1002)
+    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=named.estimates).align(1002)
     assert len(calls) == 1
 
 

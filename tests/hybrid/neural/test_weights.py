@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("torch")
 
-from hybrid.alignment.align import Aligner
 from hybrid.comparison.metrics import mean_bias, psnr
-from hybrid.estimates import MODE_OF, OfWindows
+from hybrid.estimates import MODE_OF, Classical
 from hybrid.files.shots import open_shot
 from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
+from hybrid.stream import FrameStream
 from network.checkpoint import load_model, shipped_weights
 from network.models import PRESETS, window_length
 from network.paper.blocks import ChannelAverage
@@ -30,7 +30,7 @@ FRAME = 11
 @lru_cache
 def window(radius=2):
     shot = open_shot(SHOT / "noisy.####.exr")
-    return Aligner(shot, Rules(), radius=radius, estimates=OfWindows(FINAL)).align(FRAME)
+    return FrameStream(shot, Rules(), radius=radius, first_pass=Classical(FINAL)).align(FRAME)
 
 
 def picture(denoiser):

@@ -7,16 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
-from hybrid.estimates import OfFrames
+from hybrid import stabilize
+from hybrid.alignment.align import Stillness, align_results, measure_stillness
+from hybrid.estimates import PerFrame
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
-from hybrid.pipeline import BESIDE, denoise_frames
-from hybrid.plan import Rules, decide, plan_shot
+from hybrid.pipeline import BESIDE
+from hybrid.plan import Rules
 from hybrid.records import read_records
-from hybrid.steady import MOST, Denoised, Pictures, _changed
-from tests.scenes import Scene
+from hybrid.stabilize import MOST, Denoised, FrameDenoiser, _changed
+from hybrid.stream import FrameStream, plan_shot
+from tests.scenes import Scene, denoise_view, only
 
 MOVING = Scene(frames=7, noise=0.1)
 STILL = replace(MOVING, step=(0, 0))
@@ -29,7 +31,7 @@ ERROR = 0.003
 
 
 # First looks, which are what tells whether light drifts.
-ESTIMATES = OfFrames(lambda frame: cv2.blur(np.nan_to_num(frame.color), (9, 9)))
+ESTIMATES = PerFrame(lambda frame: cv2.blur(np.nan_to_num(frame.color), (9, 9)))
 
 
 def truth(scene, number, scale=1.0):
@@ -47,17 +49,25 @@ def nearly(scene, scale=1.0):
     return make
 
 
-def pictures(shot, denoise, rules=None, estimates=ESTIMATES, **options):
-    return Pictures(Aligner(shot, rules or STEADY, estimates=estimates), denoise, **options)
+def pictures(shot, denoise, rules=None, first_pass=ESTIMATES, **options):
+    return FrameDenoiser(FrameStream(shot, rules or STEADY, first_pass=first_pass), denoise, **options)
+
+
+def aligned_results(maker, number, colors):
+    """Results of three frames as `FrameDenoiser` averages them, and their confidence."""
+    result = maker._results[number]
+    window = maker.stream.window_of_results(number, colors)
+    stillness = measure_stillness(result.drift_weight, maker.stream.shot.shape)
+    return align_results(window, result.trust[0], stillness, result.exposure)
 
 
 def made(shot, denoise, number=MIDDLE, rules=None, **options):
-    return pictures(shot, denoise, rules, **options).make(number)[0].color
+    return pictures(shot, denoise, rules, **options).make(number).denoised.color
 
 
 def flicker(shot, scene, rules):
     maker = pictures(shot, nearly(scene), rules)
-    errors = [maker.make(n)[0].color - truth(scene, n) for n in (MIDDLE, MIDDLE + 1)]
+    errors = [maker.make(n).denoised.color - truth(scene, n) for n in (MIDDLE, MIDDLE + 1)]
     inside = np.s_[8:-8, 8:-8]  # what is in all frames
     return errors[0][inside].std()
 
@@ -74,9 +84,9 @@ def test_it_is_the_average_weighted_by_confidence(tmp_path):
     shot = open_shot(STILL.write(tmp_path))
     denoise = nearly(STILL)
     maker = pictures(shot, denoise)
-    color = maker.make(MIDDLE)[0].color
-    own = {n: denoise(Aligner(shot, STEADY).align(n)).color for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
-    window, confidence, _ = maker.aligner.align_pictures(MIDDLE, own)
+    color = maker.make(MIDDLE).denoised.color
+    own = {n: denoise(FrameStream(shot, STEADY).align(n)).color for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
+    window, confidence = aligned_results(maker, MIDDLE, own)
     np.testing.assert_allclose(window, np.stack(list(own.values())), rtol=0.01)  # nothing moves, in the same light
     assert confidence[1].min() == 1
     assert 0.5 < confidence[0].mean() < 1
@@ -94,7 +104,7 @@ def test_light_that_has_changed_by_less_than_the_noise_stays_with_its_frame(tmp_
 
     inside = np.s_[8:-8, 8:-8]
     maker = pictures(shot, make)
-    error = (maker.make(MIDDLE)[0].color / truth(STILL, MIDDLE) - 1)[inside]
+    error = (maker.make(MIDDLE).denoised.color / truth(STILL, MIDDLE) - 1)[inside]
     assert abs(error.mean()) < 0.01
 
 
@@ -102,15 +112,15 @@ def test_of_two_frames_nothing_tells_whether_light_drifts(tmp_path):
     shot = open_shot(replace(STILL, frames=2).write(tmp_path))
     maker = pictures(shot, nearly(STILL))
     maker.make(STILL.first)
-    _, confidence, _ = maker.aligner.align_pictures(STILL.first, {n: truth(STILL, n) for n in shot.numbers})
+    _, confidence = aligned_results(maker, STILL.first, {n: truth(STILL, n) for n in shot.numbers})
     assert 0.4 < confidence[2].max() <= 0.5
 
 
 def test_where_nothing_tells_whether_light_drifts_neighbours_count_half(tmp_path):
     shot = open_shot(STILL.write(tmp_path))
-    maker = pictures(shot, nearly(STILL), estimates=None)
-    error = maker.make(MIDDLE)[0].color - truth(STILL, MIDDLE)
-    alone = pictures(shot, nearly(STILL), ALONE).make(MIDDLE)[0].color - truth(STILL, MIDDLE)
+    maker = pictures(shot, nearly(STILL), first_pass=None)
+    error = maker.make(MIDDLE).denoised.color - truth(STILL, MIDDLE)
+    alone = pictures(shot, nearly(STILL), ALONE).make(MIDDLE).denoised.color - truth(STILL, MIDDLE)
     inside = np.s_[8:-8, 8:-8]
     # weights of 1, 2, 1
     assert error[inside].std() == pytest.approx(alone[inside].std() * np.sqrt(6) / 4, rel=0.05)
@@ -131,14 +141,15 @@ def test_moving_shadows_are_not_averaged(tmp_path, monkeypatch):
         return np.asarray(truth(scene, number)[..., :3] * under_a_shadow(number - scene.first, 160), np.float32)
 
     shot = open_shot(scene.write(tmp_path, edit=shade))
-    estimates = OfFrames(lambda frame: clean(frame.number))
+    estimates = PerFrame(lambda frame: clean(frame.number))
 
     def error():
-        picture = made(shot, lambda aligned: Denoised(clean(aligned.number)), estimates=estimates)
+        picture = made(shot, lambda aligned: Denoised(clean(aligned.number)), first_pass=estimates)
         return float(np.abs(picture / clean(MIDDLE) - 1)[8:-8, 60:100].mean())
 
     seen = error()
-    monkeypatch.setattr(Aligner, "_stillness", lambda self, number: (np.ones(self.shot.shape, np.float32), 1))
+    still = Stillness(np.ones((scene.height, scene.width), np.float32), np.float32(1))
+    monkeypatch.setattr(stabilize, "measure_stillness", lambda *_: still)
     assert seen < 0.5 * error()
 
 
@@ -156,9 +167,9 @@ def test_where_the_light_of_the_whole_frame_drifts_no_finished_picture_is_averag
 
     shot = open_shot(scene.write(tmp_path, edit=shade))
     lit = {n: truth(scene, n)[..., :3] * waves(n - scene.first) for n in shot.numbers}
-    maker = pictures(shot, lambda aligned: Denoised(lit[aligned.number]), estimates=OfFrames(lambda f: lit[f.number]))
+    maker = pictures(shot, lambda aligned: Denoised(lit[aligned.number]), first_pass=PerFrame(lambda f: lit[f.number]))
     maker.make(MIDDLE)
-    _, confidence, _ = maker.aligner.align_pictures(MIDDLE, lit)
+    _, confidence = aligned_results(maker, MIDDLE, lit)
     assert np.all(confidence[1] == 1)
     if step:
         assert np.all(confidence[[0, 2]] == 0)
@@ -177,7 +188,9 @@ def test_what_shows_another_light_is_left_out(tmp_path):
         return Denoised(truth(STILL, aligned.number) * np.float32(1.3 if aligned.number == MIDDLE else 1))
 
     for number in (MIDDLE - 1, MIDDLE, MIDDLE + 1):
-        np.testing.assert_allclose(made(shot, make, number), make(Aligner(shot, ()).align(number)).color, rtol=6e-3)
+        np.testing.assert_allclose(
+            made(shot, make, number), make(FrameStream(shot, only(())).align(number)).color, rtol=6e-3
+        )
 
 
 def test_nothing_is_averaged_over_a_cut(tmp_path):
@@ -194,18 +207,18 @@ def test_nothing_is_averaged_over_a_cut(tmp_path):
     maker = pictures(shot, nearly(STILL))
     both = {n: truth(STILL, n) for n in (MIDDLE - 1, MIDDLE, MIDDLE + 1)}
     maker.make(MIDDLE)
-    _, confidence, _ = maker.aligner.align_pictures(MIDDLE, both)
+    _, confidence = aligned_results(maker, MIDDLE, both)
     assert confidence[0].max() > 0.5
     assert confidence[2].max() == 0
 
 
 def test_one_frame_calls_for_none(tmp_path):
     shot = open_shot(replace(STILL, frames=1).write(tmp_path))
-    denoised, counts = pictures(shot, nearly(STILL)).make(STILL.first)
-    np.testing.assert_array_equal(denoised.color, nearly(STILL)(Aligner(shot, ()).align(STILL.first)).color)
-    assert "steady" not in counts.stages
-    frames, pairs = counts.facts
-    assert not next(d for d in decide(frames, pairs).decisions if d.stage == "steady").on
+    result = pictures(shot, nearly(STILL)).make(STILL.first)
+    np.testing.assert_array_equal(
+        result.denoised.color, nearly(STILL)(FrameStream(shot, only(())).align(STILL.first)).color
+    )
+    assert "steady" not in result.plan.stages
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
@@ -245,8 +258,10 @@ def test_layers_that_add_up_to_the_color_still_do(tmp_path):
         key, depth = color * np.float32(0.3), np.full(color.shape, 7, np.float32)
         return Denoised(color, {"key": key, "depth": depth}, {"rest": color - key}, frozenset({"key", "rest"}))
 
-    denoised, _ = pictures(shot, make).make(MIDDLE)
-    assert np.abs(denoised.color - make(Aligner(shot, ()).align(MIDDLE)).color).max() > 1e-4  # something was averaged
+    denoised = pictures(shot, make).make(MIDDLE).denoised
+    assert (
+        np.abs(denoised.color - make(FrameStream(shot, only(())).align(MIDDLE)).color).max() > 1e-4
+    )  # something was averaged
     np.testing.assert_allclose(denoised.aovs["key"] + denoised.extra["rest"], denoised.color, rtol=1e-5)
     np.testing.assert_array_equal(denoised.aovs["depth"], 7)
 
@@ -274,7 +289,7 @@ class TestMean:
     def mean_of(self, folder, edit=None, rules=None):
         shot = open_shot(self.SCENE.write(folder, edit=edit))
         maker = pictures(shot, lambda a: Denoised(np.float32(0.97) * truth(self.SCENE, a.number)), rules or Rules())
-        return float(maker.make(self.NUMBER)[0].color.mean() / truth(self.SCENE, self.NUMBER).mean())
+        return float(maker.make(self.NUMBER).denoised.color.mean() / truth(self.SCENE, self.NUMBER).mean())
 
     def test_what_a_denoiser_loses_comes_back(self, tmp_path):
         assert self.mean_of(tmp_path / "off", rules=STEADY) == pytest.approx(0.97, abs=1e-4)
@@ -293,9 +308,8 @@ class TestMean:
             color[places(index)] = 400 * self.SCENE.clean(index)["ViewLayer.Combined"][places(index)]
 
         shot = open_shot(self.SCENE.write(tmp_path / "in", edit=shine))
-        aligner = Aligner(shot, Rules())
-        aligner.align(self.NUMBER)
-        frame, file = aligner.frames.get(self.NUMBER), shot.read(self.NUMBER).color
+        aligner = FrameStream(shot, Rules())
+        frame, file = aligner.frame(self.NUMBER), shot.read(self.NUMBER).color
         assert frame.fireflies >= 15
         assert frame.radiance[places(1)].mean() < 0.3 * file[places(1)].mean()
         np.testing.assert_allclose(frame.rendered, file, rtol=1e-5)
@@ -317,7 +331,7 @@ class TestInFiles:
 
     @staticmethod
     def run(shot, out, denoise, rules=None, **options):
-        return list(denoise_frames(shot, out, denoise, rules or STEADY, radius=1, **options))
+        return list(denoise_view(shot, out, denoise, rules or STEADY, radius=1, **options))
 
     def test_a_frame_depends_on_the_windows_beside_it(self, tmp_path):
         shot = open_shot(MOVING.write(tmp_path / "in"), frames=str(MIDDLE))
@@ -370,10 +384,10 @@ class TestInFiles:
         folder = MOVING.write(tmp_path / "in")
         shot = open_shot(folder, frames=f"{MOVING.first}-{MIDDLE}")
         given = open_shot(replace(MOVING, frames=4).write(tmp_path / "given", clean=True))
-        estimates = OfFrames(
+        estimates = PerFrame(
             lambda frame: given.read(frame.number).color if given.has(frame.number) else None, 0, given
         )
-        *_, last = self.run(shot, tmp_path / "out", nearly(MOVING), estimates=estimates)
+        *_, last = self.run(shot, tmp_path / "out", nearly(MOVING), first_pass=estimates)
         assert read_exr(last.path).parts[0].header[BESIDE] == f"{MIDDLE - 1}"
 
 
@@ -463,12 +477,12 @@ class TestSamples:
 
         shot = open_shot(scene.write(tmp_path, edit=snow))
         number = scene.first + 2
-        blind = OfFrames(lambda frame: cv2.medianBlur(np.ascontiguousarray(frame.color), 5))
+        blind = PerFrame(lambda frame: cv2.medianBlur(np.ascontiguousarray(frame.color), 5))
 
         def median(aligned):
             return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.own * aligned.modulation), 5))
 
-        result = made(shot, median, number, Rules(), estimates=blind)
+        result = made(shot, median, number, Rules(), first_pass=blind)
         rows, columns = (flakes + np.array([14, 0])).T
         inside = (rows >= 8) & (rows < 88)
         assert np.mean(result[rows[inside] % 96, columns[inside]].mean(axis=-1) > 4) > 0.9

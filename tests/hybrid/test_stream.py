@@ -1,4 +1,4 @@
-"""Frames that are loaded: read once, without fireflies, and forgotten."""
+"""Frames of a stream: read once, without fireflies, and dropped."""
 
 from __future__ import annotations
 
@@ -7,27 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid.alignment.align import Aligner
-from hybrid.alignment.loading import LoadedFrames
 from hybrid.files.shots import open_shot
-from hybrid.plan import Rules, plan_shot
+from hybrid.plan import Rules
+from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene
 
 # Locked off. Frame numbers 1001 to 1012.
 CALM = Scene(frames=12, step=(0, 0), height=48, width=64)
 
 
-def test_frames_are_forgotten_but_those_that_are_held(tmp_path):
-    frames = LoadedFrames(open_shot(CALM.write(tmp_path)), ())
-    frames.load([1001, 1002, 1003])
-    held = frames[1001]
-    frames.load([1004, 1005], hold=[1001])
-    assert frames[1001] is held
-    assert frames.get(1002) is None
-    assert frames.get(1004) is not None
-    frames.load([0, 1001])
-    assert (frames.get(0), frames.get(1005)) == (None, None)
-    assert frames[1001] is held
+def test_a_value_is_kept_as_long_as_all_of_its_frames(tmp_path):
+    stream = FrameStream(open_shot(CALM.write(tmp_path)), Rules())
+    first, second = stream.frame(1001), stream.frame(1002)
+    flow, last = stream.flow(1001, 1002), stream.flow(1002, 1003)
+    stream.keep([1002, 1003])
+    assert stream.frame(1002) is second
+    assert stream.flow(1002, 1003) is last
+    assert stream.frame(1001) is not first
+    assert stream.flow(1001, 1002) is not flow
+    assert stream.frame(0) is None
 
 
 PLACE = np.s_[20, 30]
@@ -42,9 +40,8 @@ def shining(*indices, place=PLACE, light=500):
 
 
 def load(shot, numbers):
-    frames = LoadedFrames(shot, Rules())
-    frames.load(numbers)
-    return frames
+    stream = FrameStream(shot, Rules())
+    return {number: stream.frame(number) for number in numbers}
 
 
 @pytest.mark.parametrize(("seen", "lamp"), [((4, 5), False), ((5, 6), False), ((4, 5, 6), True)])
@@ -126,14 +123,13 @@ def test_a_frame_that_is_shown_twice_counts_once_and_is_named(tmp_path):
             layers |= scene.noisy(5)
 
     shot = open_shot(scene.write(tmp_path, edit=hold))
-    aligner = Aligner(shot, Rules())
+    aligner = FrameStream(shot, Rules())
     for number, weightless in ((1006, {3}), (1007, {1}), (1005, {4}), (1004, set()), (1008, {0}), (1009, set())):
         window = aligner.align(number)
         assert {index for index, layer in enumerate(window.confidence) if not layer.any()} == weightless
-    aligner.align(1006)
-    flow = aligner.flows.between(1006, 1007)
+    flow = aligner.flow(1006, 1007)
     assert flow is not None
-    assert not flow[0].any()
+    assert not flow.vectors.any()
     assert plan_shot(shot).repeats == ((1006, 1007),)
     assert plan_shot(shot).cuts == ()
 
@@ -161,16 +157,19 @@ def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monke
         layers["ViewLayer.Combined"][20, 2 + 5 * index] = 5000
 
     read = []
-    monkeypatch.setattr(LoadedFrames, "_read_once", spied(LoadedFrames._read_once, read))
+    monkeypatch.setattr(FrameStream, "_rendered", spied(FrameStream._rendered, read))
     shot = open_shot(CALM.write(tmp_path, edit=everywhere))
     reads = []
     monkeypatch.setattr(type(shot), "read", spied(type(shot).read, reads))
-    frames = LoadedFrames(shot, Rules())
+    stream = FrameStream(shot, Rules())
     for number in shot.numbers:
-        frames.load(frames.around(number, 2))
-        assert frames[number].fireflies == 1
-        # The newest two, whose fireflies the next ones are asked about, and what was read to ask it about its own.
-        assert set(frames._read) <= {number + 1, number + 2, number + 3, *shot.numbers[-2:]}
+        stream.keep(stream.around(number, 2))
+        # The newest, whose fireflies the next ones are compared with, and those read to compare with its own.
+        kept = {frames[0] for kind, frames in stream._cache if kind in ("read", "rendered")}
+        assert kept <= {number, number + 1, number + 2, number + 3, *shot.numbers[-2:]}
+        for n in stream.around(number, 2):
+            stream.frame(n)
+        assert stream.frame(number).fireflies == 1
     assert len(read) > len(reads) == len(shot.numbers)
 
 

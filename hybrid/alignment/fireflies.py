@@ -1,0 +1,124 @@
+"""Remove single bright samples from a frame; those that neighbouring frames show as well are highlights, and stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.measure import MOVED_NOISE, equal_noise, repeats, same_noise_at
+from hybrid.alignment.prepare import PreparedFrame, rendered_flow
+from hybrid.runtime.timing import Timings
+from nlm.fireflies import (
+    Lights,
+    Places,
+    Points,
+    bright_near,
+    find_lights,
+    follow,
+    in_calm,
+    mean_light,
+    measure_lights,
+    nearest,
+    replace_fireflies,
+    same_light,
+    take_lights,
+)
+
+Mask = NDArray[np.bool_]
+
+# A highlight of a pixel has to be in so many frames beside its own, at most so many frames away.
+WITNESSES, REACH = 2, 2
+
+
+def remove_fireflies(
+    frame: PreparedFrame, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
+) -> PreparedFrame:
+    """Remove the single bright samples of a frame, and set its one-pixel highlights apart.
+
+    Parameters
+    ----------
+    frame : PreparedFrame
+        As prepared.
+    neighbour : callable
+        From −2, −1, 1 or 2 to the prepared frame so many frames away, fireflies included; None if there is none.
+    timings : Timings
+        Counts the stage "prepare".
+    """
+    with timings.stage("prepare"):
+        places, isolated = find_lights(frame.irradiance)
+    if not len(places):
+        return frame
+    highlights, alone = _find_highlights(frame, places, neighbour, timings)
+    with timings.stage("prepare"):
+        rendered, fireflies = frame.irradiance, places[isolated & alone]
+        if len(highlights.pixels):
+            rendered = take_lights(rendered, highlights.pixels)
+            frame = replace(frame, irradiance=rendered, highlights=highlights)
+        if len(fireflies):
+            mean = frame.mean
+            clean, replaced, _ = replace_fireflies(rendered, fireflies)
+            where = np.nonzero(replaced)
+            taken = where, rendered[where]
+            frame = replace(frame, irradiance=clean, fireflies=len(fireflies), removed_samples=taken)
+            frame = replace(frame, removed_radiance=max(mean - frame.mean, 0.0))
+    return frame
+
+
+def _find_highlights(
+    frame: PreparedFrame, places: Places, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
+) -> tuple[Lights, Mask]:
+    """Find which bright places are highlights, and which have nothing like them in the frames beside this one.
+
+    The two nearest frames with noise of their own have to show a highlight with the same light at the same place along
+    the motion, or the one that there is.
+    """
+    rough = measure_lights(frame.irradiance, places)
+    centre = measure_lights(frame.irradiance, nearest(rough.points), frame.divisor)
+    asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
+    alone = np.ones(len(places), bool)
+    still = np.zeros_like(centre.points)
+    moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
+    found: list[tuple[Lights, Points, Mask]] = []
+    compared = [(frame, still)]
+    for distance, side in product(range(1, REACH + 1), (-1, 1)):
+        undecided = (shown == asked) & (asked < WITNESSES)
+        if side not in moved or not (distance == 1 or undecided.any()):
+            continue
+        there = neighbour(distance * side)
+        if there is None:
+            del moved[side]
+            continue
+        with timings.stage("prepare"):
+            moved[side] = moved[side] + _motion(last[side], there, nearest(centre.points + moved[side]))
+            last[side] = there
+            pixels = follow(centre, moved[side])
+            lights = measure_lights(there.irradiance, pixels, there.divisor)
+            fresh = np.isfinite(lights.light).all(axis=1)
+            for other, before in compared:
+                noise = equal_noise(other.irradiance, there.irradiance)
+                unmoved = np.abs(moved[side] - before).max(axis=1) < MOVED_NOISE
+                fresh &= not repeats(*noise)
+                fresh &= ~(unmoved & same_noise_at(*noise, pixels))
+            if distance == 1:
+                alone &= ~(fresh & bright_near(places, frame.irradiance, pixels, there.irradiance))
+            same = fresh & undecided & same_light(centre, moved[side], lights)
+            same[same] = in_calm(centre[same], frame.irradiance, pixels[same], there.irradiance)
+        asked, shown = asked + (fresh & undecided), shown + same
+        found.append((lights, moved[side], same))
+        compared.append((there, moved[side]))
+    lasting = (asked > 0) & (shown == asked)
+    return mean_light(centre, found)[lasting], alone & ~lasting
+
+
+def _motion(here: PreparedFrame, there: PreparedFrame, pixels: Places) -> Points:
+    """Rows and columns that pixels of a frame move by to another one; 0 without vectors."""
+    flow, valid = rendered_flow(here, there) or (None, None)
+    if flow is None or valid is None:
+        return np.zeros(pixels.shape)
+    rows, columns = (np.clip(pixels[:, axis], 0, flow.shape[axis] - 1) for axis in (0, 1))
+    moved = flow[rows, columns, ::-1].astype(np.float64)
+    return np.where(valid[rows, columns, None] & np.isfinite(moved), moved, 0)

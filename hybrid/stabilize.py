@@ -1,0 +1,383 @@
+"""The result of a frame: its window denoised, averaged with the neighbouring results, and corrected by its samples.
+
+The errors of denoisers change from frame to frame more than the frames do, so results of neighbouring frames that show
+the same are averaged. Denoisers and averages lose light that few samples carry, and detail that looks like noise: the
+samples restore both last, as far as they are certain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.align import align, align_results, measure_stillness
+from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.alignment.unfiltered import as_gray
+from hybrid.alignment.window import AlignedWindow, Trust, Window
+from hybrid.plan import Context, Plan
+from hybrid.stream import FrameStream
+from hybrid.validation import find_lost_light, find_nonfinite
+from nlm.average import average
+from nlm.fireflies import Lights, add_lights
+from nlm.moving_lights import find_bright, witnessed
+from nlm.samples import SampleMean, blend_samples, restore_mean
+
+Array = NDArray[np.float32]
+
+# By how much a pixel may change at most where results are averaged; and where samples correct a pixel that has parts,
+# which change with it, so that the color is the same with and without them but where it was next to nothing.
+MOST, CORRECTED = 2.0, 1e4
+# Where this share of a frame's bright pixels move together, the others are content too: hidden, or leaving the frame.
+CONTENT = 0.6
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """A denoised frame.
+
+    Attributes
+    ----------
+    color : (H, W, 3) array
+        Radiance.
+    aovs : dict of str to (H, W, C) array
+        Other layers that were filtered along, to be written over their own channels.
+    extra : dict of str to (H, W) or (H, W, C) array
+        Layers to be added to the file.
+    parts : frozenset of str
+        Those of `aovs` and `extra` that add up to the color, (H, W, 3) each: they change as it does.
+    """
+
+    color: Array
+    aovs: Mapping[str, Array] = field(default_factory=dict)
+    extra: Mapping[str, Array] = field(default_factory=dict)
+    parts: frozenset[str] = frozenset()
+
+
+DenoiseWindow = Callable[[AlignedWindow], Denoised]
+
+
+@dataclass(frozen=True)
+class WindowResult:
+    """A window denoised, with what the averaging of neighbouring results reads.
+
+    Attributes
+    ----------
+    denoised : Denoised
+        The centre.
+    plan : Plan
+        The stages that ran on the window.
+    neighbour_samples : SampleMean or None
+        The samples of the other frames at the centre's pixels; with the stage "samples".
+    trust : dict of int to pair of Trust or None
+        From the first row of a band to the trust in the frames before and after.
+    drift_weight : (H, W) array or None
+        As `AlignedWindow.drift_weight`.
+    exposure : float
+        Of the centre's irradiance as rendered, or of the nearest frame with light.
+    brightest : float
+        The greatest mean radiance of the frames of the window.
+    repaired, fireflies, outliers : int
+        As `AlignedWindow` has them, over all bands.
+    """
+
+    denoised: Denoised
+    plan: Plan
+    neighbour_samples: SampleMean | None
+    trust: dict[int, tuple[Trust | None, Trust | None]]
+    drift_weight: Array | None
+    exposure: float
+    brightest: float
+    repaired: int
+    fireflies: int
+    outliers: int
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The finished frame, and figures of it.
+
+    Attributes
+    ----------
+    denoised : Denoised
+        The frame.
+    plan : Plan
+        The stages that ran on its window.
+    averaged : tuple of int
+        The frames whose results were there to be averaged, itself among them.
+    mean, removed_radiance : float
+        Mean radiance of the noisy frame without its fireflies, and the mean radiance of these.
+    repaired, fireflies, outliers : int
+        As for `WindowResult`.
+    beyond : int
+        Values beyond the range of half floats.
+    """
+
+    denoised: Denoised
+    plan: Plan
+    averaged: tuple[int, ...]
+    mean: float
+    removed_radiance: float
+    repaired: int
+    fireflies: int
+    outliers: int
+    beyond: int
+
+
+class FrameDenoiser:
+    """Denoises the frames of a shot, one after the other.
+
+    Parameters
+    ----------
+    stream : FrameStream
+        Of the shot.
+    denoise : callable
+        From `AlignedWindow` to `Denoised`.
+    rows : int, optional
+        How many rows of a frame to work on at a time; all without. The result is the same.
+    keep_going : bool
+        Where a neighbouring frame cannot be denoised, leave it out of the average.
+
+    Notes
+    -----
+    With d the denoised windows, W the warp to the frame t, R the relighting to its light (`nlm.relight`) and c the
+    confidence of their comparison (`hybrid.alignment.align.align_results`), 1 for the frame itself, the result of t is
+    Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1, corrected by the samples (`nlm.samples`). The result of t therefore
+    depends on the window of t + 1. Where light drifts (`nlm.drift`), or drift cannot be measured (windows of three
+    frames, or without a first pass), nothing is relit, and c is a half at most. Where the light of a whole frame drifts
+    nothing is averaged: c is multiplied by the share of it that stands still, from 0 (a fifth) to 1 (two fifths).
+    """
+
+    def __init__(
+        self, stream: FrameStream, denoise: DenoiseWindow, *, rows: int | None = None, keep_going: bool = False
+    ) -> None:
+        self.stream = stream
+        self.denoise = denoise
+        self.rows = rows or stream.shot.shape[0]
+        self.keep_going = keep_going
+        self._results: dict[int, WindowResult] = {}
+
+    def make(self, number: int) -> FrameResult:
+        """Denoise frame `number`.
+
+        Raises
+        ------
+        ValueError, OSError
+            If the frame, or a neighbour, cannot be denoised, or its light is not that of the noisy frame
+            (`hybrid.validation.find_lost_light`).
+        """
+        averaged = self.neighbours(number)
+        self._results = {n: result for n, result in self._results.items() if n in averaged}
+        for n in averaged:
+            if n not in self._results:
+                self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
+                try:
+                    self._results[n] = self._denoise_window(n)
+                except (ValueError, OSError):
+                    if n == number or not self.keep_going:
+                        raise
+        result = self._results[number]
+        denoised, beyond = result.denoised, 0
+        if "steady" in result.plan.stages and len(self._results) > 1:
+            denoised = self._stabilize(number)
+        frame = self.stream.frame(number)
+        if frame is not None:
+            self._check_light(denoised.color, frame, result.brightest)
+            denoised = self._correct(denoised, frame, result)
+            if "samples" in result.plan.stages:
+                denoised = self._with_moving_lights(denoised, frame)
+            if frame.highlights is not None:
+                denoised = _with_highlights(denoised, frame.highlights)
+            denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
+        return FrameResult(
+            denoised,
+            result.plan,
+            tuple(sorted(self._results)),
+            0.0 if frame is None else frame.mean,
+            0.0 if frame is None else frame.removed_radiance,
+            result.repaired,
+            result.fireflies,
+            result.outliers,
+            beyond,
+        )
+
+    def neighbours(self, number: int) -> list[int]:
+        """The frame, and the neighbours whose results are averaged with it."""
+        return self.stream.neighbours(number) if "steady" in self.stream.rules.allowed else [number]
+
+    def _denoise_window(self, number: int) -> WindowResult:
+        """Denoise a frame's own window, band by band."""
+        stream, numbers = self.stream, self.stream.around(number)
+        window: Window | None = stream.window(number)
+        assert window is not None
+        plan = stream.plan(numbers, Context(window.first_pass is not None, stream.radius))
+        brightest = max(frame.mean for frame in window.frames if frame is not None)
+        exposure, layers, bands = window.lit.as_rendered.exposure, _Layers(stream.shot.shape), self._bands()
+        trust, outliers, aligned = {}, 0, None
+        for band in bands:
+            assert window is not None
+            aligned = align(window, band, timings=stream.timings)
+            if band is bands[-1]:
+                window = None  # frees its composed flows while the denoiser runs
+            denoised = self.denoise(aligned)
+            outliers += aligned.outliers
+            trust[band.start] = aligned.neighbour_trust
+            layers.add(band, aligned.inner, {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight})
+            layers.add(band, aligned.inner, {("aovs", name): layer for name, layer in denoised.aovs.items()})
+            layers.add(band, aligned.inner, {("extra", name): layer for name, layer in denoised.extra.items()})
+            sides = {} if aligned.sides is None else vars(aligned.sides)
+            layers.add(band, aligned.inner, {("sides", name): layer for name, layer in sides.items()})
+        assert aligned is not None
+        samples = layers.named("sides")
+        return WindowResult(
+            Denoised(layers.named("color")[""], layers.named("aovs"), layers.named("extra"), denoised.parts),
+            replace(plan, shares=aligned.shares),
+            SampleMean(**samples) if samples else None,
+            trust,
+            layers.named("drift").get(""),
+            exposure,
+            brightest,
+            aligned.repaired,
+            aligned.fireflies,
+            outliers,
+        )
+
+    def _stabilize(self, number: int) -> Denoised:
+        """The denoised frame averaged with its neighbours, and its parts changed alike."""
+        result, timings = self._results[number], self.stream.timings
+        colors = {n: other.denoised.color for n, other in self._results.items()}
+        window = self.stream.window_of_results(number, colors)
+        color = np.empty_like(result.denoised.color)
+        with timings.stage("steady"):
+            stillness = measure_stillness(result.drift_weight, color.shape[:2])
+        for band in self._bands():
+            trust = result.trust[band.start]
+            aligned, confidence = align_results(window, trust, stillness, result.exposure, band, timings=timings)
+            with timings.stage("steady"):
+                color[band] = average(aligned, confidence)
+        with timings.stage("steady"):
+            return _changed(result.denoised, color)
+
+    def _check_light(self, color: Array, frame: PreparedFrame, brightest: float) -> None:
+        """Raise ValueError for a result that cannot be right, before its samples hide that."""
+        with self.stream.timings.stage("check"):
+            if find_nonfinite(color):
+                return  # nothing is corrected by it: the pipeline refuses it
+            if fault := find_lost_light(color, frame.radiance, frame.valid, lambda: brightest):
+                raise ValueError(f"frame {frame.number}: {fault}; it was not written")
+
+    def _correct(self, denoised: Denoised, frame: PreparedFrame, result: WindowResult) -> Denoised:
+        """The denoised frame with the means of its samples, and with the samples where they are certain."""
+        color, timings = denoised.color, self.stream.timings
+        exposure = measure_exposure(color)
+        if "mean" in result.plan.stages:
+            with timings.stage("mean"):
+                # First without fireflies: a mean of few bright samples is not known, that of all others is.
+                for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
+                    color = restore_mean(color, _where_rendered(frame, noisy, color), exposure)
+        if result.neighbour_samples is not None:
+            with timings.stage("samples"):
+                noisy = _where_rendered(frame, frame.radiance, color)
+                color = blend_samples(color, noisy, result.neighbour_samples, exposure, frame.radiance_variance)
+        return _changed(denoised, color, CORRECTED)
+
+    def _with_moving_lights(self, denoised: Denoised, frame: PreparedFrame) -> Denoised:
+        """The denoised frame with bright pixels as rendered that the neighbouring results show to move together."""
+        step = self.stream.shot.step
+        others = [n for n in (frame.number - step, frame.number + step) if n in self._results]
+        with self.stream.timings.stage("samples"):
+            excess = _excess(frame, self._results[frame.number].denoised.color)
+            bright = find_bright(excess)
+            if not (others and bright.any()):
+                return denoised
+            seen = np.zeros_like(bright)
+            for n in others:
+                there = self.stream.frame(n)
+                assert there is not None
+                other = _excess(there, self._results[n].denoised.color)
+                flow = self.stream.flow(frame.number, n)
+                seen |= witnessed(excess, bright, other, find_bright(other), None if flow is None else flow.vectors)
+            if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(bright):
+                seen = bright
+            color = np.where(seen[..., None], frame.rendered, denoised.color)
+        return _changed(denoised, color, CORRECTED)
+
+    def _bands(self) -> list[slice]:
+        height = self.stream.shot.shape[0]
+        return [slice(top, min(top + self.rows, height)) for top in range(0, height, self.rows)]
+
+
+class _Layers:
+    """Layers of a frame, put together from bands of rows; a single band is taken as it is."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._shape = shape
+        self._layers: dict[tuple[str, str], Array] = {}
+
+    def add(self, band: slice, inner: slice, layers: Mapping[tuple[str, str], Array | None]) -> None:
+        """Write a band's rows, which are the rows `inner` of these layers."""
+        for key, layer in layers.items():
+            if layer is None:
+                continue
+            if band.stop - band.start == self._shape[0]:
+                self._layers[key] = layer
+                continue
+            if key not in self._layers:
+                self._layers[key] = np.empty((*self._shape, *layer.shape[2:]), np.float32)
+            self._layers[key][band] = layer[inner]
+
+    def named(self, kind: str) -> dict[str, Array]:
+        """The layers of a kind."""
+        return {name: layer for (other, name), layer in self._layers.items() if other == kind}
+
+
+def _excess(frame: PreparedFrame, picture: Array) -> Array:
+    """By how much a frame as rendered exceeds its picture, relative to the picture plus the exposure (H, W)."""
+    light = picture.mean(axis=-1) + np.float32(measure_exposure(picture))
+    return np.asarray((frame.rendered - picture).mean(axis=-1) / light * frame.valid, np.float32)
+
+
+def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array:
+    """The noisy frame, with the picture in the place of pixels that were not finite."""
+    return noisy if frame.valid.all() else np.where(frame.valid[..., None], noisy, picture)
+
+
+def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
+    """The picture with another color, and its parts, if any, changed alike: by a factor of `most` at most."""
+    own, factor = denoised.color, np.float32(most)
+    if most > MOST and not denoised.parts:
+        return replace(denoised, color=color)
+    bounded = np.clip(color, own / factor, own * factor)  # before the division, which may exceed float32
+    change = np.divide(bounded, own, out=np.ones_like(own), where=own > 0)
+    within = (own <= 0) | (bounded == color)
+    aovs, extra = (
+        {name: layer * change if name in denoised.parts else layer for name, layer in layers.items()}
+        for layers in (denoised.aovs, denoised.extra)
+    )
+    return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
+
+
+def _with_highlights(denoised: Denoised, highlights: Lights) -> Denoised:
+    """Add persistent highlights to the picture, and scale its parts alike."""
+    color = add_lights(denoised.color, highlights)
+    ratio = np.divide(color, denoised.color, out=np.ones_like(color), where=denoised.color > 0)
+    aovs, extra = (
+        {name: layer * ratio if name in denoised.parts else layer for name, layer in layers.items()}
+        for layers in (denoised.aovs, denoised.extra)
+    )
+    return replace(denoised, color=color, aovs=aovs, extra=extra)
+
+
+def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
+    """The picture and its parts with what no filter took (`hybrid.alignment.unfiltered`)."""
+    unfiltered, aovs = frame.unfiltered, dict(denoised.aovs)
+    for name in aovs.keys() & unfiltered.gray:
+        aovs[name] = as_gray(aovs[name])
+    for name in aovs.keys() & unfiltered.negative.keys() & denoised.parts:
+        # Shared out of the picture, which had no negative light, parts have none.
+        aovs[name] = np.maximum(aovs[name], 0) + unfiltered.smooth_negative(name, denoised.color, frame.guide)
+    aovs = {name: unfiltered.without_outside(layer) for name, layer in aovs.items()}
+    return replace(denoised, color=unfiltered.restore(denoised.color, frame.guide), aovs=aovs)

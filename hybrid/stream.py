@@ -1,0 +1,365 @@
+"""The frames of a shot in memory, and everything that is made of each once, while windows slide over them.
+
+`FrameStream` is the only owner of what a window leaves to the next one. Each value is made when it is first read, and
+dropped when one of the frames it belongs to leaves the kept ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Protocol, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flow.tvl1 import refine_flow
+from hybrid.alignment.align import align
+from hybrid.alignment.fireflies import REACH, remove_fireflies
+from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
+from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
+from hybrid.alignment.prepare import PreparedFrame, prepare
+from hybrid.alignment.unfiltered import find_region, mirror_region
+from hybrid.alignment.window import AlignedWindow, Window
+from hybrid.files.frame import Frame, Frames
+from hybrid.files.shots import Shot
+from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
+from hybrid.runtime.timing import Timings
+
+Array = NDArray[np.float32]
+Value = TypeVar("Value")
+
+
+class FirstPass(Protocol):
+    """A source of denoised single frames (`hybrid.estimates` has three kinds).
+
+    Attributes
+    ----------
+    holds : int
+        Bytes that it takes for itself while it works.
+    files : Shot or None
+        The finished sequence that it reads, if it does.
+    from_noisy : bool
+        Whether it denoises windows of noisy frames.
+    reads_frame : bool
+        Whether it reads `FrameStream.as_read`.
+    """
+
+    @property
+    def holds(self) -> int:
+        """Bytes that it takes for itself while it works."""
+
+    @property
+    def files(self) -> Shot | None:
+        """The finished sequence that it reads, if it does."""
+
+    @property
+    def from_noisy(self) -> bool:
+        """Whether it denoises windows of noisy frames."""
+
+    @property
+    def reads_frame(self) -> bool:
+        """Whether it reads `FrameStream.as_read`."""
+
+    def reach(self, radius: int) -> int:
+        """Count the frames on each side of the centre that are read for a window of this radius."""
+
+    def make(self, stream: FrameStream, number: int) -> Array | None:
+        """Denoise frame `number` of the stream: radiance (H, W, 3), finite; None where there is nothing to read."""
+
+
+class FrameStream:
+    """The frames of a shot, and what is made of each.
+
+    Parameters
+    ----------
+    shot : Frames
+        Read lazily.
+    rules : Rules
+        What is forced.
+    first_pass : FirstPass, optional
+        A source of denoised frames.
+    radius : int
+        Frames on each side of the centre of a window.
+    refine : callable
+        Corrects vectors as `flow.tvl1.refine_flow` does.
+    timings : Timings, optional
+        Counts the stages "read", "prepare", "plan", "estimate", "flow", "warp" and "confidence".
+    """
+
+    def __init__(
+        self,
+        shot: Frames,
+        rules: Rules,
+        first_pass: FirstPass | None = None,
+        *,
+        radius: int = RADIUS,
+        refine: Callable[..., Array] = refine_flow,
+        timings: Timings | None = None,
+    ) -> None:
+        self.shot = shot
+        self.rules = rules
+        self.source = first_pass
+        self.radius = radius
+        self.timings = timings or Timings()
+        self._refine = refine
+        # Kind of a value and the frames it belongs to → the value.
+        self._cache: dict[tuple[str, tuple[int, ...]], object] = {}
+
+    def keep(self, numbers: Collection[int]) -> None:
+        """Drop every value that belongs to another frame.
+
+        Frames with their fireflies are kept as long as the removal of fireflies from later ones reads them.
+        """
+        kept = {*numbers}
+        loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
+        first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
+        last = max(kept) + REACH * self.shot.step
+        self._cache = {
+            (kind, frames): value
+            for (kind, frames), value in self._cache.items()
+            if (first <= frames[0] <= last if kind in ("read", "rendered") else kept.issuperset(frames))
+        }
+
+    def around(self, number: int, radius: int | None = None) -> list[int]:
+        """Numbers of the window around a frame, ascending, whether or not these frames are there."""
+        radius, step = self.radius if radius is None else radius, self.shot.step
+        return list(range(number - radius * step, number + radius * step + 1, step))
+
+    def neighbours(self, number: int) -> list[int]:
+        """The frame and those beside it that are there, with a picture where the first pass is read from files."""
+        files = None if self.source is None else self.source.files
+        return [n for n in self.around(number, 1) if self.shot.has(n) and (files is None or files.has(n))]
+
+    # Values of a frame, or of a pair of frames.
+
+    def frame(self, number: int) -> PreparedFrame | None:
+        """A frame, prepared and without fireflies; None where the shot has none."""
+        return self._cached("frame", (number,), self._load) if self.shot.has(number) else None
+
+    def as_read(self, number: int) -> Frame:
+        """A frame as read from its file, but without fireflies. Dropped once its first pass is made."""
+        prepared = self._there(number)
+        if ("read", (number,)) not in self._cache:
+            self._read(number)
+        frame = cast(Frame, self._cache["read", (number,)])
+        return frame if prepared is self._rendered(number) else replace(frame, color=prepared.radiance)
+
+    def denoised(self, number: int) -> Array | None:
+        """The first pass of a frame, radiance (H, W, 3); None where there is none."""
+        source = self.source
+        if source is None or self.frame(number) is None:
+            return None
+        denoised = self._cached("first pass", (number,), lambda n: source.make(self, n))
+        self._cache.pop(("read", (number,)), None)
+        return denoised
+
+    def measurements(self, numbers: Sequence[int]) -> tuple[list[FrameFacts], list[PairFacts]]:
+        """Figures of those of these frames that are there, and of their neighbouring pairs."""
+        there = [n for n in numbers if self.shot.has(n)]
+        pairs = [(a, b) for a, b in pairwise(there) if b - a == self.shot.step]
+        return [self._facts(n) for n in there], [self._pair_facts(a, b) for a, b in pairs]
+
+    def plan(self, numbers: Sequence[int], context: Context = NOISY) -> Plan:
+        """Decide which stages run on these frames."""
+        return self.rules.decide(*self.measurements(numbers), context)
+
+    def flow(self, start: int, end: int) -> Flow | None:
+        """Flow between neighbouring frames; None at a gap or a cut."""
+        earlier, later = sorted((start, end))
+        if not (self.shot.has(earlier) and self.shot.has(later)):
+            return None
+        flows = self._cached("flows", (earlier, later), self._measure_flows)
+        return flows.to_later if start < end else flows.to_earlier
+
+    # Windows.
+
+    def window(self, number: int, radius: int | None = None, *, noisy: bool = False) -> Window:
+        """Collect the window around a frame.
+
+        Parameters
+        ----------
+        number : int
+            A frame of the shot.
+        radius : int, optional
+            Frames on each side; that of the stream without.
+        noisy : bool
+            Whether to leave the first pass out.
+
+        Raises
+        ------
+        ValueError, OSError
+            If a frame cannot be read, or does not fit the others.
+        """
+        numbers = self.around(number, radius)
+        with_first_pass = not noisy and self.source is not None
+        # Frame by frame, as a first pass may need the frame as read, which is dropped then.
+        pairs = [(self.frame(n), self.denoised(n) if with_first_pass else None) for n in numbers]
+        frames, denoised = zip(*pairs, strict=True)
+        return self._collect(number, numbers, frames, denoised if with_first_pass else None)
+
+    def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
+        """The window of a frame and its two neighbours, with these results (H, W, 3) in the place of a first pass."""
+        numbers = self.around(number, 1)
+        frames = tuple(self.frame(n) if n in results else None for n in numbers)
+        return self._collect(number, numbers, frames, tuple(results.get(n) for n in numbers))
+
+    def align(self, number: int, rows: slice | None = None) -> AlignedWindow:
+        """Align the window around a frame (`hybrid.alignment.align.align`), keeping no frame but its own."""
+        self.keep(self.around(number, self.support))
+        return align(self.window(number), rows, timings=self.timings)
+
+    @property
+    def support(self) -> int:
+        """Frames on each side of the centre that are prepared for a window."""
+        return self.radius if self.source is None else self.source.reach(self.radius)
+
+    def _collect(
+        self,
+        number: int,
+        numbers: list[int],
+        frames: tuple[PreparedFrame | None, ...],
+        denoised: tuple[Array | None, ...] | None,
+    ) -> Window:
+        middle = len(numbers) // 2
+        plan = self.plan(numbers, Context(denoised is not None, middle))
+        forth: dict[int, Flow | None] = {}
+        back: dict[int, Flow | None] = {}
+        for side in (numbers[middle + 1 :], numbers[:middle][::-1]):
+            before = number
+            for n in side:
+                forth[n] = self._composed(forth, number, before, n)
+                back[n] = self._composed(back, number, before, n, reverse=True)
+                before = n
+        links = tuple(_link(forth.get(n), back.get(n)) for n in numbers)
+        steps = [self._cache.get(("flows", pair)) for pair in pairwise(numbers)]
+        refined = [share for step in steps if step is not None for share in cast(PairFlows, step).refined]
+        repeated = tuple(
+            n != number and self._repeats(n, n + (self.shot.step if n < number else -self.shot.step)) for n in numbers
+        )
+        return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
+
+    def _composed(
+        self, flows: dict[int, Flow | None], centre: int, before: int, number: int, *, reverse: bool = False
+    ) -> Flow | None:
+        """Extend the flows between the centre and `before` to the next frame."""
+        step = self.flow(number, before) if reverse else self.flow(before, number)
+        if before == centre:
+            return step
+        with self.timings.stage("flow"):
+            return compose_flows(step, flows[before]) if reverse else compose_flows(flows[before], step)
+
+    # How each value is made.
+
+    def _cached(self, kind: str, frames: tuple[int, ...], make: Callable[..., Value]) -> Value:
+        if (kind, frames) not in self._cache:
+            self._cache[kind, frames] = make(*frames)
+        return cast(Value, self._cache[kind, frames])
+
+    def _load(self, number: int) -> PreparedFrame:
+        """Read and prepare a frame, and remove its fireflies."""
+        rendered = self._rendered(number)
+        assert rendered is not None
+        if self.source is None or not self.source.reads_frame:
+            self._cache.pop(("read", (number,)), None)
+        if "fireflies" not in self.rules.allowed:
+            return rendered
+        return remove_fireflies(rendered, lambda k: self._rendered(number + k * self.shot.step), self.timings)
+
+    def _rendered(self, number: int) -> PreparedFrame | None:
+        """A frame with its fireflies; None where the shot has none."""
+        return self._cached("rendered", (number,), self._read) if self.shot.has(number) else None
+
+    def _read(self, number: int) -> PreparedFrame:
+        with self.timings.stage("read"):
+            frame = self.shot.read(number)
+        with self.timings.stage("prepare"):
+            region = find_region(frame.color)
+            frame = frame if region is None else mirror_region(frame, region)
+            prepared = prepare(frame, demodulated="demodulate" in self.rules.allowed)
+            if region is not None:
+                inside = np.zeros_like(prepared.valid)
+                inside[region] = prepared.valid[region]
+                prepared = replace(prepared, unfiltered=replace(prepared.unfiltered, region=region), valid=inside)
+        self._cache["read", (number,)] = frame
+        return prepared
+
+    def _small(self, number: int) -> SmallFrame:
+        return self._cached("small", (number,), lambda n: shrink(self._there(n)))
+
+    def _facts(self, number: int) -> FrameFacts:
+        frame = self._there(number)
+
+        def measure(n: int) -> FrameFacts:
+            with self.timings.stage("plan"):
+                return measure_frame(frame, self._small(n))
+
+        return self._cached("frame facts", (number,), measure)
+
+    def _pair_facts(self, a: int, b: int) -> PairFacts:
+        first, second = self._there(a), self._there(b)
+
+        def measure(*_: int) -> PairFacts:
+            with self.timings.stage("plan"):
+                return measure_pair(first, second, (self._small(a), self._small(b)))
+
+        return self._cached("pair facts", (a, b), measure)
+
+    def _repeats(self, a: int, b: int) -> bool:
+        """Whether one of two neighbouring frames is the other once more."""
+        first, second = sorted((a, b))
+        return self.shot.has(first) and self.shot.has(second) and self._pair_facts(first, second).repeated
+
+    def _measure_flows(self, earlier: int, later: int) -> PairFlows:
+        plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)
+        if facts.cut:
+            return PairFlows(None, None)
+        stages = plan.stages - {"warp"} if facts.repeated else plan.stages
+        with self.timings.stage("flow"):
+            return measure_flows(self._there(earlier), self._there(later), stages, self._refine)
+
+    def _there(self, number: int) -> PreparedFrame:
+        frame = self.frame(number)
+        assert frame is not None
+        return frame
+
+
+def _link(forward: Flow | None, backward: Flow | None) -> Link | None:
+    """Both flows, or None where one is missing."""
+    return None if forward is None or backward is None else Link(forward, backward)
+
+
+def plan_shot(
+    shot: Frames,
+    rules: Rules | None = None,
+    *,
+    context: Context = DENOISED,
+    advance: Callable[[], object] = lambda: None,
+) -> Plan:
+    """Plan every frame of a shot, with the frames on which each stage runs.
+
+    Parameters
+    ----------
+    shot : Frames
+        All of its frames are read.
+    rules : Rules, optional
+        What is forced.
+    context : Context
+        The windows.
+    advance : callable
+        Called after each frame.
+
+    Returns
+    -------
+    Plan
+        One decision for each of `STAGES`, with the figure of the window that calls for it most.
+    """
+    stream = FrameStream(shot, rules or Rules(), radius=context.radius)
+    plans = {}
+    for number in shot.numbers:
+        window = stream.around(number)
+        stream.keep(window)
+        plans[number] = stream.plan(window, context)
+        advance()
+    return merge(plans)
