@@ -27,7 +27,7 @@ from hybrid.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from nlm.average import replace_nonfinite
-from nlm.fireflies import Lights, hold_lights
+from nlm.fireflies import Highlights, clamp_halos
 
 Array = NDArray[np.float32]
 
@@ -368,7 +368,7 @@ def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Ca
     return estimate_oidn(frame, denoise, **settings)
 
 
-def _checked(found: Array | None, frame: Frame, highlights: Lights | None = None) -> Array | None:
+def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:
     """An estimate that fits its frame and is finite, without highlights that are not in the frame, and their halos."""
     if found is None:
         return None
@@ -382,7 +382,7 @@ def _checked(found: Array | None, frame: Frame, highlights: Lights | None = None
         raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
     filled = np.maximum(filled, 0)
     if highlights is not None:
-        filled = hold_lights(filled, highlights.pixels)
+        filled = clamp_halos(filled, highlights.pixels)
     if fault := find_lost_light(filled, noisy, ~bad):
         raise ValueError(f"{what}: {fault}")
     return filled

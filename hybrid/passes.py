@@ -11,7 +11,7 @@ from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frame import Frame
 from hybrid.files.passes import BEAUTY, Passes, Sum
 from nlm.average import replace_nonfinite
-from nlm.parts import above, find_sums, in_noise, is_noisy, is_textured, may_differ
+from nlm.parts import few_differ, find_sums, is_noisy, is_textured, share_outside, shares_noise
 
 Array = NDArray[np.float32]
 
@@ -86,11 +86,11 @@ def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
         words[name] = "denoised by itself: it adds up to the beauty with no others"
         if name not in lights:
             words[name] = f"denoised by itself: it has {own[0].shape[-1]} channels, the beauty 3"
-        elif not may_differ(share := above(lights[name], color, exposure)):
+        elif not few_differ(share := share_outside(lights[name], color, exposure)):
             words[name] = f"denoised by itself: it is above the beauty, or negative, in {share:.0%} of the picture"
         elif complete:
             words[name] = "denoised by itself: the beauty is the sum of others"
-        elif all(in_noise(_radiance_of(frame, name), frame.color) for frame in frames):
+        elif all(shares_noise(_radiance_of(frame, name), frame.color) for frame in frames):
             sums.append(Sum(BEAUTY, (name,), complete=False))
             words[name] = "part of the beauty, the rest of which is in no layer: shared out of it"
     level = float(color.mean(dtype=np.float64))

@@ -15,9 +15,9 @@ from hybrid.alignment.window import AlignedWindow
 from hybrid.oidn import denoise_oidn
 from hybrid.runtime.timing import Timings
 from nlm.average import average, robust_average
-from nlm.gather import gather
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
+from nlm.pooling import pool_samples
 
 Array = NDArray[np.float32]
 
@@ -175,7 +175,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
 
     Notes
     -----
-    G is the gated average of the estimates, b the gathered picture (`nlm.gather`), O = OIDN(b) with clean guides. The
+    G is the gated average of the estimates, b the gathered picture (`nlm.pooling`), O = OIDN(b) with clean guides. The
     result is G + 0.8 (O − G). A share found by cross-validation
     (both made once more without the centre, whose noisy picture is then regressed on their difference) takes a third
     run of OIDN, and was worth 0.05 dB less than the constant on thirteen shots.
@@ -184,7 +184,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("gather"):
-        gathered = gather(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+        gathered = pool_samples(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
         average = gathered.average * aligned.modulation
         image = gathered.image * aligned.modulation
     with timings.stage("denoise"):

@@ -22,8 +22,8 @@ from hybrid.plan import Context, Plan
 from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
 from nlm.average import average
-from nlm.fireflies import Lights, add_lights
-from nlm.moving_lights import find_bright, witnessed
+from nlm.fireflies import Highlights, add_highlights
+from nlm.moving_lights import confirmed_by_neighbour, find_bright
 from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
@@ -299,7 +299,9 @@ class FrameDenoiser:
                 assert there is not None
                 other = _excess(there, self._results[n].denoised.color)
                 flow = self.stream.flow(frame.number, n)
-                seen |= witnessed(excess, bright, other, find_bright(other), None if flow is None else flow.vectors)
+                seen |= confirmed_by_neighbour(
+                    excess, bright, other, find_bright(other), None if flow is None else flow.vectors
+                )
             if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(bright):
                 seen = bright
             color = np.where(seen[..., None], frame.rendered, denoised.color)
@@ -360,9 +362,9 @@ def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
     return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
 
 
-def _with_highlights(denoised: Denoised, highlights: Lights) -> Denoised:
+def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:
     """Add persistent highlights to the picture, and scale its parts alike."""
-    color = add_lights(denoised.color, highlights)
+    color = add_highlights(denoised.color, highlights)
     ratio = np.divide(color, denoised.color, out=np.ones_like(color), where=denoised.color > 0)
     aovs, extra = (
         {name: layer * ratio if name in denoised.parts else layer for name, layer in layers.items()}

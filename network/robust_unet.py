@@ -73,7 +73,7 @@ class Realisations:
     frames : Tensor
         ``(N, T, 3, H, W)`` on OIDN's transfer curve, with noise of their own; their mean is `picture`.
     picture : Tensor
-        ``(N, 3, H, W)``, the samples of all frames gathered (`nlm.gather`), on the same curve.
+        ``(N, 3, H, W)``, the samples of all frames gathered (`nlm.pooling`), on the same curve.
     average : Tensor
         ``(N, 3, H, W)``, the gated average of the estimates, on the same curve.
     confidence : Tensor
@@ -106,7 +106,7 @@ def realise(
     Parameters
     ----------
     estimate, residual : Tensor
-        ``(N, T, 3, H, W)`` irradiance, as for `nlm.gather.gather`.
+        ``(N, T, 3, H, W)`` irradiance, as for `nlm.pooling.pool_samples`.
     confidence : Tensor
         ``(N, T, 1, H, W)``, at least 0.
     modulation : Tensor

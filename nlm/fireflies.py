@@ -31,14 +31,14 @@ DIM = 1 / 16
 # Where noise is so strong that another frame has more than 3 samples within 8 pixels that are as bright as a lamp's
 # quarter, and not in the frame, two may agree by chance: kitchens have 3 to 90 around such. Fireflies on a hundredth of
 # the pixels are 2.
-BESIDE, STRANGERS = 17, 3
+STRANGER_WINDOW, STRANGERS = 17, 3
 # Patterns are averaged over frames where the light is within so many pixels of the same place in its pixel: farther
 # away it is spread over other pixels.
 SAME_PHASE = 0.25
 
 
 @dataclass(frozen=True)
-class Lights:
+class Highlights:
     """Lights of one or two pixels, of one frame.
 
     Attributes
@@ -58,15 +58,15 @@ class Lights:
     light: Floats
     pattern: Floats
 
-    def __getitem__(self, chosen: Mask) -> Lights:
+    def __getitem__(self, chosen: Mask) -> Highlights:
         """Some of them."""
-        return Lights(self.pixels[chosen], self.points[chosen], self.light[chosen], self.pattern[chosen])
+        return Highlights(self.pixels[chosen], self.points[chosen], self.light[chosen], self.pattern[chosen])
 
 
 _PAIRED, _ISOLATED = 1, 2
 
 
-def nearest(points: Points) -> Places:
+def nearest_pixel(points: Points) -> Places:
     """Return the pixels that points are in, (K, 2): halves go to the later one."""
     return np.floor(points + 0.5).astype(np.intp)
 
@@ -100,7 +100,7 @@ def find_fireflies(color: Floats) -> Places:
     return np.argwhere(_find(_level(color), OVER_BRIGHTEST, OVER_MEAN) == _ISOLATED)
 
 
-def find_lights(color: Floats) -> tuple[Places, Mask]:
+def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
     """Find what may be a lamp of a pixel: fireflies, and what would be one but for one pixel of the ring.
 
     Parameters
@@ -120,7 +120,7 @@ def find_lights(color: Floats) -> tuple[Places, Mask]:
     return places, found[places[:, 0], places[:, 1]] == _ISOLATED
 
 
-def measure_lights(color: Floats, pixels: Places, factor: Floats | None = None) -> Lights:
+def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = None) -> Highlights:
     """Measure what pixels and those around them show above their surroundings.
 
     Parameters
@@ -153,10 +153,10 @@ def measure_lights(color: Floats, pixels: Places, factor: Floats | None = None) 
     total, side = weight.sum(axis=(1, 2))[:, None], np.array([-1, 0, 1])
     offset = np.stack([weight.sum(axis=2) @ side, weight.sum(axis=1) @ side], axis=-1)
     points = pixels + np.divide(offset, total, out=np.zeros_like(offset), where=total > 0)
-    return Lights(pixels, points, light.astype(np.float32), pattern.astype(np.float32))
+    return Highlights(pixels, points, light.astype(np.float32), pattern.astype(np.float32))
 
 
-def follow(lights: Lights, moved: Points) -> Places:
+def follow_motion(lights: Highlights, moved: Points) -> Places:
     """Return the pixels in which lights are once they have moved, (K, 2).
 
     Parameters
@@ -166,11 +166,11 @@ def follow(lights: Lights, moved: Points) -> Places:
     moved : (K, 2) float64
         By so many rows and columns.
     """
-    straight = lights.pixels + nearest(moved)
-    return np.where(_same_phase(moved)[:, None], straight, nearest(lights.points + moved))
+    straight = lights.pixels + nearest_pixel(moved)
+    return np.where(_same_phase(moved)[:, None], straight, nearest_pixel(lights.points + moved))
 
 
-def same_light(first: Lights, moved: Points, second: Lights) -> Mask:
+def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask:
     """Tell which lights of a frame another frame shows as well.
 
     Parameters
@@ -193,7 +193,7 @@ def same_light(first: Lights, moved: Points, second: Lights) -> Mask:
     return np.asarray((far <= NEAR) & (difference <= DIFFERENT * total))
 
 
-def in_calm(own: Lights, color: Floats, pixels: Places, other: Floats) -> Mask:
+def without_strangers(own: Highlights, color: Floats, pixels: Places, other: Floats) -> Mask:
     """Tell around which lights of a frame another one has no bright samples of its own.
 
     Parameters
@@ -215,12 +215,14 @@ def in_calm(own: Lights, color: Floats, pixels: Places, other: Floats) -> Mask:
     """
     first, second = cv2.dilate(_level(color), np.ones((3, 3), np.uint8)), _level(other)
     peak = first[own.pixels[:, 0], own.pixels[:, 1], None, None]
-    (rows, columns, inside), (y, x, seen) = (_blocks(middle, color.shape, BESIDE) for middle in (own.pixels, pixels))
+    (rows, columns, inside), (y, x, seen) = (
+        _blocks(middle, color.shape, STRANGER_WINDOW) for middle in (own.pixels, pixels)
+    )
     strange = (second[y, x] > peak / 4) & (first[rows, columns] < peak / 8) & inside & seen
     return np.asarray(strange.sum(axis=(1, 2)) <= STRANGERS)
 
 
-def bright_near(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
+def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
     """Tell which bright samples of a frame are like others that another frame has near there.
 
     Parameters
@@ -246,7 +248,7 @@ def bright_near(places: Places, color: Floats, pixels: Places, other: Floats) ->
     return np.asarray(inside & (near >= RECURS * _level(color)[places[:, 0], places[:, 1]]))
 
 
-def mean_light(own: Lights, others: Sequence[tuple[Lights, Points, Mask]]) -> Lights:
+def average_highlights(own: Highlights, others: Sequence[tuple[Highlights, Points, Mask]]) -> Highlights:
     """Average lights over the frames that show them.
 
     Parameters
@@ -271,10 +273,10 @@ def mean_light(own: Lights, others: Sequence[tuple[Lights, Points, Mask]]) -> Li
     pattern = _significant(pattern)
     pattern /= pattern.sum(axis=(1, 2), keepdims=True)  # a light that was found has some
     mean = (light / count[:, None]).astype(np.float32)
-    return Lights(own.pixels, own.points, mean, pattern.astype(np.float32))
+    return Highlights(own.pixels, own.points, mean, pattern.astype(np.float32))
 
 
-def add_lights(picture: Floats, lights: Lights) -> Floats:
+def add_highlights(picture: Floats, lights: Highlights) -> Floats:
     """Return a picture (H, W, C) with lights added to it, each in its pattern, which sums to 1.
 
     Parameters
@@ -293,8 +295,8 @@ def add_lights(picture: Floats, lights: Lights) -> Floats:
     return made
 
 
-def take_lights(color: Floats, pixels: Places) -> Floats:
-    """Return a frame (H, W, C) without what `measure_lights` finds at these pixels, (K, 2).
+def remove_highlights(color: Floats, pixels: Places) -> Floats:
+    """Return a frame (H, W, C) without what `measure_highlights` finds at these pixels, (K, 2).
 
     Parameters
     ----------
@@ -310,7 +312,7 @@ def take_lights(color: Floats, pixels: Places) -> Floats:
     return clean
 
 
-def hold_lights(picture: Floats, places: Places, radius: int = 3) -> Floats:
+def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
     """Hold a denoised picture around lights to the brightest of what is around them.
 
     Parameters
@@ -416,7 +418,7 @@ def _significant(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _same_phase(moved: Points) -> Mask:
     """Whether what has moved so far is at the same place in its pixel."""
-    return np.asarray(np.abs(moved - nearest(moved)).max(axis=1) <= SAME_PHASE)
+    return np.asarray(np.abs(moved - nearest_pixel(moved)).max(axis=1) <= SAME_PHASE)
 
 
 @njit(cache=True)

@@ -85,7 +85,7 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
 
     A pixel's own difference says nothing beside: it is the error of the two estimates, and to weigh by it is to choose
     the frames whose errors are the centre's. Without it averages are up to 2 dB steadier, and gathered frames
-    (`nlm.gather`) 0.5 dB better.
+    (`nlm.pooling`) 0.5 dB better.
     """
     if estimates.ndim != 4 or estimates.shape[0] % 2 == 0:
         raise ValueError(f"estimates: expected (odd frames, height, width, channels), got {estimates.shape}")

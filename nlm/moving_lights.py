@@ -74,7 +74,9 @@ def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
     return [(int(y) - _REACH, int(x) - _REACH) for y, x in np.argwhere(counts >= enough)]
 
 
-def witnessed(excess: Floats, bright: Mask, other_excess: Floats, other_bright: Mask, flow: Floats | None) -> Mask:
+def confirmed_by_neighbour(
+    excess: Floats, bright: Mask, other_excess: Floats, other_bright: Mask, flow: Floats | None
+) -> Mask:
     """Tell which bright pixels of a frame another frame shows where their shared motion leads.
 
     Parameters

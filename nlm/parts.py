@@ -52,15 +52,15 @@ def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
         total += part
     with np.errstate(invalid="ignore"):  # infinities of saturated halves
         near = np.abs(total - whole) <= np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
-    return may_differ(float(1 - near.mean()))
+    return few_differ(float(1 - near.mean()))
 
 
-def may_differ(share: float) -> bool:
+def few_differ(share: float) -> bool:
     """Tell whether so few values differ, as a share in [0, 1], that a sum is still one: saturated halves, fireflies."""
     return share <= _MOST
 
 
-def above(part: Floats, whole: Floats, exposure: float) -> float:
+def share_outside(part: Floats, whole: Floats, exposure: float) -> float:
     """Give the share of values in which a layer is negative or above the picture.
 
     Parameters
@@ -79,7 +79,7 @@ def above(part: Floats, whole: Floats, exposure: float) -> float:
     return float(1 - ((part <= whole + slack) & (part >= -slack)).mean())
 
 
-def in_noise(part: Floats, whole: Floats) -> bool:
+def shares_noise(part: Floats, whole: Floats) -> bool:
     """Tell whether a layer's noise is in a picture: its second differences are found in the picture's as they are.
 
     Parameters
@@ -209,7 +209,7 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
         k, chosen, total = begun.pop()
         with np.errstate(invalid="ignore"):
             possible = (total + lowest[k] <= target + slack) & (total + highest[k] >= target - slack)
-        if not may_differ(1 - possible.mean()):
+        if not few_differ(1 - possible.mean()):
             continue
         if chosen and np.mean(np.abs(total - target) <= slack) >= 1 - _MOST:
             found.append(chosen)

@@ -73,7 +73,7 @@ class SampleMean:
     trust: Floats
 
 
-def average_sides(
+def average_neighbours(
     estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats
 ) -> SampleMean:
     """Average the samples of all frames of a window but its centre.

@@ -22,7 +22,7 @@ from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import color_gate, color_gates
 from nlm.relight import relight
-from nlm.samples import average_sides
+from nlm.samples import average_neighbours
 
 Array = NDArray[np.float32]
 
@@ -133,7 +133,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
             # Before the first pass is pulled to the centre's: the samples stay as they are.
             pictures, residual = (color, None) if estimates is None else (estimates, sources.residual)
             assert pictures is not None
-            sides = average_sides(pictures, residual, confidence, warped.confidence, modulation)
+            sides = average_neighbours(pictures, residual, confidence, warped.confidence, modulation)
         weight = None
         if estimates is not None and "drift" in stages:
             weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)

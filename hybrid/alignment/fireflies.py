@@ -13,19 +13,19 @@ from hybrid.alignment.measure import MOVED_NOISE, equal_noise, repeats, same_noi
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.runtime.timing import Timings
 from nlm.fireflies import (
-    Lights,
+    Highlights,
     Places,
     Points,
-    bright_near,
-    find_lights,
-    follow,
-    in_calm,
-    mean_light,
-    measure_lights,
-    nearest,
+    average_highlights,
+    find_bright_samples,
+    follow_motion,
+    measure_highlights,
+    nearest_pixel,
+    recurs_nearby,
+    remove_highlights,
     replace_fireflies,
-    same_light,
-    take_lights,
+    same_highlight,
+    without_strangers,
 )
 
 Mask = NDArray[np.bool_]
@@ -49,14 +49,14 @@ def remove_fireflies(
         Counts the stage "prepare".
     """
     with timings.stage("prepare"):
-        places, isolated = find_lights(frame.irradiance)
+        places, isolated = find_bright_samples(frame.irradiance)
     if not len(places):
         return frame
     highlights, alone = _find_highlights(frame, places, neighbour, timings)
     with timings.stage("prepare"):
         rendered, fireflies = frame.irradiance, places[isolated & alone]
         if len(highlights.pixels):
-            rendered = take_lights(rendered, highlights.pixels)
+            rendered = remove_highlights(rendered, highlights.pixels)
             frame = replace(frame, irradiance=rendered, highlights=highlights)
         if len(fireflies):
             mean = frame.mean
@@ -70,19 +70,19 @@ def remove_fireflies(
 
 def _find_highlights(
     frame: PreparedFrame, places: Places, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
-) -> tuple[Lights, Mask]:
+) -> tuple[Highlights, Mask]:
     """Find which bright places are highlights, and which have nothing like them in the frames beside this one.
 
     The two nearest frames with noise of their own have to show a highlight with the same light at the same place along
     the motion, or the one that there is.
     """
-    rough = measure_lights(frame.irradiance, places)
-    centre = measure_lights(frame.irradiance, nearest(rough.points), frame.divisor)
+    rough = measure_highlights(frame.irradiance, places)
+    centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor)
     asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
     alone = np.ones(len(places), bool)
     still = np.zeros_like(centre.points)
     moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
-    found: list[tuple[Lights, Points, Mask]] = []
+    found: list[tuple[Highlights, Points, Mask]] = []
     compared = [(frame, still)]
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
         undecided = (shown == asked) & (asked < WITNESSES)
@@ -93,10 +93,10 @@ def _find_highlights(
             del moved[side]
             continue
         with timings.stage("prepare"):
-            moved[side] = moved[side] + _motion(last[side], there, nearest(centre.points + moved[side]))
+            moved[side] = moved[side] + _motion(last[side], there, nearest_pixel(centre.points + moved[side]))
             last[side] = there
-            pixels = follow(centre, moved[side])
-            lights = measure_lights(there.irradiance, pixels, there.divisor)
+            pixels = follow_motion(centre, moved[side])
+            lights = measure_highlights(there.irradiance, pixels, there.divisor)
             fresh = np.isfinite(lights.light).all(axis=1)
             for other, before in compared:
                 noise = equal_noise(other.irradiance, there.irradiance)
@@ -104,14 +104,14 @@ def _find_highlights(
                 fresh &= not repeats(*noise)
                 fresh &= ~(unmoved & same_noise_at(*noise, pixels))
             if distance == 1:
-                alone &= ~(fresh & bright_near(places, frame.irradiance, pixels, there.irradiance))
-            same = fresh & undecided & same_light(centre, moved[side], lights)
-            same[same] = in_calm(centre[same], frame.irradiance, pixels[same], there.irradiance)
+                alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))
+            same = fresh & undecided & same_highlight(centre, moved[side], lights)
+            same[same] = without_strangers(centre[same], frame.irradiance, pixels[same], there.irradiance)
         asked, shown = asked + (fresh & undecided), shown + same
         found.append((lights, moved[side], same))
         compared.append((there, moved[side]))
     lasting = (asked > 0) & (shown == asked)
-    return mean_light(centre, found)[lasting], alone & ~lasting
+    return average_highlights(centre, found)[lasting], alone & ~lasting
 
 
 def _motion(here: PreparedFrame, there: PreparedFrame, pixels: Places) -> Points:

@@ -15,7 +15,7 @@ from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
 from hybrid.files.frame import Frame
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.average import reject_outliers, replace_nonfinite
-from nlm.fireflies import Lights, add_lights
+from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
 
 Array = NDArray[np.float32]
@@ -103,7 +103,7 @@ class PreparedFrame:
     fireflies: int = 0
     removed_radiance: float = 0.0
     removed_samples: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
-    highlights: Lights | None = None
+    highlights: Highlights | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -147,7 +147,7 @@ class PreparedFrame:
     @property
     def with_highlights(self) -> Array:
         """The noisy radiance (H, W, 3), without fireflies, with highlights."""
-        return self.radiance if self.highlights is None else add_lights(self.radiance, self.highlights)
+        return self.radiance if self.highlights is None else add_highlights(self.radiance, self.highlights)
 
     @property
     def rendered(self) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nlm.parts import above, may_differ, sums_to
+from nlm.parts import few_differ, share_outside, sums_to
 
 Array = NDArray[np.float32]
 
@@ -63,7 +63,7 @@ class Passes:
             if found.complete:
                 holds = sums_to(parts, whole, exposure)
             else:
-                holds = all(may_differ(above(part, whole, exposure)) for part in parts)
+                holds = all(few_differ(share_outside(part, whole, exposure)) for part in parts)
             if holds:
                 yield found
 

@@ -29,8 +29,8 @@ from network.devices import find_device, has_bfloat16
 from network.models import denoise_tile, for_inference, window_length
 from network.robust_unet import MIRRORED, Borders, RobustUNet
 from nlm.average import average
-from nlm.gather import hold_to_window
 from nlm.parts import add_light, filter_layers, split_light
+from nlm.pooling import clamp_to_window
 
 Array = NDArray[np.float32]
 
@@ -164,7 +164,7 @@ class Denoiser(WindowDenoiser):
         layers = self._layers(aligned)
         irradiance, filtered, parts = self._run_tiles(aligned, layers)
         if self.needs_first_pass:
-            irradiance = hold_to_window(irradiance, layers["estimate"], layers["residual"])
+            irradiance = clamp_to_window(irradiance, layers["estimate"], layers["residual"])
         alone = _averaged(aligned, irradiance) if self.needs_first_pass else _apart(filtered, aligned)
         aovs, color, add_up = _share_out(aligned, alone, irradiance, add=self.add_layers)
         extra = {}

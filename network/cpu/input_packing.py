@@ -20,7 +20,7 @@ from torch import Tensor
 from loops.parallel import run_bands
 from network import unet as trunk
 
-#: As in `nlm.gather`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
+#: As in `nlm.pooling`: what a frame shows beyond its estimate counts up to so many times its light and the exposure.
 RESIDUAL_LIMIT = 6.0
 #: Channels of each frame: its picture, and confidence. Of all alike: the centre's albedo and normal, the gathered
 #: average, samples gathered.

@@ -50,7 +50,7 @@ class Clip:
     estimate : Tensor
         ``(L, T, 3, H, W)`` aligned estimates of the frames, irradiance, made from the same noisy frames alone.
     residual : Tensor
-        ``(L, T, 3, H, W)`` what the noisy frames show beyond them, aligned to the nearest pixel (`nlm.gather`).
+        ``(L, T, 3, H, W)`` what the noisy frames show beyond them, aligned to the nearest pixel (`nlm.pooling`).
     confidence : Tensor
         ``(L, T, 1, H, W)`` in [0, 1].
     modulation : Tensor

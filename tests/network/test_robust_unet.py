@@ -15,7 +15,7 @@ from network import unet as trunk
 from network.models import denoise_tile, filter_window, for_inference
 from network.robust_unet import KEEP, RobustUNet, RobustUNetConfig, realise, start_from_oidn
 from network.unet import find_library, load_oidn, pu_forward, pu_inverse
-from nlm.gather import gather
+from nlm.pooling import pool_samples
 
 pytestmark = pytest.mark.neural
 
@@ -82,7 +82,7 @@ def test_the_frames_are_what_is_gathered_by_hand() -> None:
     window["residual"][0, 1, :, 4, 4] = 1e4  # a firefly, held to six times the light in both
     found = realised(window)
     frames, residuals = (window[name][0].permute(0, 2, 3, 1).numpy() for name in ("estimate", "residual"))
-    by_hand = gather(frames, residuals, window["confidence"][0, :, 0].numpy(), 1.0)
+    by_hand = pool_samples(frames, residuals, window["confidence"][0, :, 0].numpy(), 1.0)
     gathered = found.parts.sum(1)[0].permute(1, 2, 0).numpy()
     np.testing.assert_allclose(gathered, by_hand.image, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found.samples[0, 0].numpy() * 5, by_hand.samples, rtol=1e-4)

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from nlm.fireflies import (
-    add_lights,
-    bright_near,
+    add_highlights,
+    average_highlights,
+    clamp_halos,
+    find_bright_samples,
     find_fireflies,
-    find_lights,
-    follow,
-    hold_lights,
-    in_calm,
-    mean_light,
-    measure_lights,
-    nearest,
+    follow_motion,
+    measure_highlights,
+    nearest_pixel,
+    recurs_nearby,
+    remove_highlights,
     replace_fireflies,
-    same_light,
-    take_lights,
+    same_highlight,
+    without_strangers,
 )
 
 
@@ -70,8 +70,8 @@ def calm(star=(), size=(24, 32)):
 
 
 def lights_of(frame):
-    places, _ = find_lights(frame)
-    return measure_lights(frame, nearest(measure_lights(frame, places).points))
+    places, _ = find_bright_samples(frame)
+    return measure_highlights(frame, nearest_pixel(measure_highlights(frame, places).points))
 
 
 @pytest.mark.parametrize("place", [(10, 14), (10, 14.5), (10.3, 14.5), (0, 14), (22, 30)])
@@ -80,20 +80,20 @@ def test_a_light_is_measured_taken_and_added_again(place):
     own = lights_of(frame)
     np.testing.assert_allclose(own.light, [[8, 4, 1]], rtol=1e-4)
     np.testing.assert_allclose(own.points, [place], atol=0.06)
-    without = take_lights(frame, own.pixels)
+    without = remove_highlights(frame, own.pixels)
     np.testing.assert_allclose(without, calm(), rtol=1e-4)
-    np.testing.assert_allclose(add_lights(without, mean_light(own, [])), frame, rtol=2e-2, atol=0.02)
+    np.testing.assert_allclose(add_highlights(without, average_highlights(own, [])), frame, rtol=2e-2, atol=0.02)
 
 
 def test_of_two_lights_beside_each_other_neither_is_isolated_and_both_are_taken():
     frame = calm([(10, 14, 5), (11, 16, 9)])
-    places, isolated = find_lights(frame)
+    places, isolated = find_bright_samples(frame)
     assert places.tolist() == [[10, 14], [11, 16]]
     assert not isolated.any()
     assert len(find_fireflies(frame)) == 0
     own = lights_of(frame)
     np.testing.assert_allclose(own.light.mean(axis=1), [5, 9], rtol=1e-4)
-    np.testing.assert_allclose(take_lights(frame, own.pixels), calm(), rtol=1e-4)
+    np.testing.assert_allclose(remove_highlights(frame, own.pixels), calm(), rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -109,43 +109,43 @@ def test_of_two_lights_beside_each_other_neither_is_isolated_and_both_are_taken(
 )
 def test_the_same_light_is_at_the_same_place_along_the_motion_in_the_same_color(other, same):
     own, moved = lights_of(calm([(10, 14, (8, 4, 1))])), np.array([[0.0, 6.0]])
-    seen = measure_lights(calm([other]), follow(own, moved))
-    assert same_light(own, moved, seen).tolist() == [same]
+    seen = measure_highlights(calm([other]), follow_motion(own, moved))
+    assert same_highlight(own, moved, seen).tolist() == [same]
 
 
 def test_the_mean_of_lights_leaves_out_patterns_of_another_place_in_the_pixel():
     own = lights_of(calm([(10, 14, 6)]))
     moved = np.array([[0.0, 0.5]])
-    seen = measure_lights(calm([(10, 14.5, 8)]), follow(own, moved))
-    mean = mean_light(own, [(seen, moved, np.array([True]))])
+    seen = measure_highlights(calm([(10, 14.5, 8)]), follow_motion(own, moved))
+    mean = average_highlights(own, [(seen, moved, np.array([True]))])
     np.testing.assert_allclose(mean.light, [[7, 7, 7]], rtol=1e-4)
     np.testing.assert_allclose(mean.pattern[0, 1, 1], 1)
 
 
 def test_a_light_outside_the_frame_is_none():
     own, moved = lights_of(calm([(10, 14, 6)])), np.array([[0.0, 9999.0]])
-    seen = measure_lights(calm(), follow(own, moved))
+    seen = measure_highlights(calm(), follow_motion(own, moved))
     assert np.isnan(seen.light).all()
-    assert not same_light(own, moved, seen).any()
+    assert not same_highlight(own, moved, seen).any()
 
 
 def test_a_sample_near_which_another_frame_is_bright_is_told_from_one_that_is_alone():
     frame, other = noisy(), noisy(1)
     frame[20, 30] = 2_000
     places = find_fireflies(frame)
-    assert not bright_near(places, frame, places, other).any()
+    assert not recurs_nearby(places, frame, places, other).any()
     other[23, 33] = 1_500
-    assert bright_near(places, frame, places, other).all()
-    assert not bright_near(places, frame, places - [[0, 1]], other).any()
-    assert not bright_near(places, frame, places + 9_999, other).any()
+    assert recurs_nearby(places, frame, places, other).all()
+    assert not recurs_nearby(places, frame, places - [[0, 1]], other).any()
+    assert not recurs_nearby(places, frame, places + 9_999, other).any()
 
 
 def test_calm_is_where_other_frames_have_few_bright_samples_of_their_own():
     frame, other = calm([(10, 14, 6), (13, 20, 9)]), calm([(10, 14, 6), (13, 20, 9)])
     own = lights_of(frame)
-    assert in_calm(own, frame, own.pixels, other).all()
+    assert without_strangers(own, frame, own.pixels, other).all()
     other[6, 10:14] = 5
-    assert in_calm(own, frame, own.pixels, other).tolist() == [False, True]
+    assert without_strangers(own, frame, own.pixels, other).tolist() == [False, True]
 
 
 def test_a_halo_is_held_to_its_surroundings_and_an_outline_stays():
@@ -153,8 +153,8 @@ def test_a_halo_is_held_to_its_surroundings_and_an_outline_stays():
     picture[:, 20:] = 1
     halo = picture.copy()
     halo[8:13, 10:15] += 0.3
-    np.testing.assert_array_equal(hold_lights(halo, np.array([[10, 12]])), picture)
-    np.testing.assert_array_equal(hold_lights(picture, np.array([[10, 19]])), picture)
+    np.testing.assert_array_equal(clamp_halos(halo, np.array([[10, 12]])), picture)
+    np.testing.assert_array_equal(clamp_halos(picture, np.array([[10, 19]])), picture)
 
 
 def test_replaced_is_the_firefly_alone_and_its_light_is_accounted_for():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.moving_lights import find_bright, shared_motions, witnessed
+from nlm.moving_lights import confirmed_by_neighbour, find_bright, shared_motions
 
 SHAPE = (96, 128)
 
@@ -28,7 +28,7 @@ def test_flakes_that_fall_together_are_found(flakes, motion) -> None:
     here, there = excess(flakes), excess(flakes + motion, seed=3)
     bright = find_bright(here), find_bright(there)
     assert shared_motions(*bright) == [motion]
-    found = witnessed(here, bright[0], there, bright[1], None)
+    found = confirmed_by_neighbour(here, bright[0], there, bright[1], None)
     moved = flakes + motion
     stay = flakes[(moved >= 0).all(axis=1) & (moved < SHAPE).all(axis=1)]
     assert found[tuple(stay.T)].all()
@@ -55,7 +55,7 @@ def test_noise_that_stands_still_is_no_motion(flakes) -> None:
 
 def test_another_light_at_the_same_place_is_no_witness(flakes) -> None:
     here, there = excess(flakes), excess(flakes + np.array([9, 0]), light=9.0)
-    assert not witnessed(here, find_bright(here), there, find_bright(there), None).any()
+    assert not confirmed_by_neighbour(here, find_bright(here), there, find_bright(there), None).any()
 
 
 def test_too_few_and_too_many_bright_pixels_tell_nothing() -> None:
@@ -68,5 +68,5 @@ def test_highlights_that_move_with_their_surfaces_are_left_to_the_denoiser(flake
     flow = np.full((*SHAPE, 2), (9.5, 1.5), np.float32)
     bright = find_bright(here), find_bright(there)
     assert shared_motions(*bright) == [(2, 9)]
-    assert not witnessed(here, bright[0], there, bright[1], flow).any()
-    assert witnessed(here, bright[0], there, bright[1], -flow).any()
+    assert not confirmed_by_neighbour(here, bright[0], there, bright[1], flow).any()
+    assert confirmed_by_neighbour(here, bright[0], there, bright[1], -flow).any()

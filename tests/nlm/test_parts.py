@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.parts import above, add_light, filter_layers, find_sums, in_noise, is_noisy, is_textured, split_light, sums_to
+from nlm.parts import (
+    add_light,
+    filter_layers,
+    find_sums,
+    is_noisy,
+    is_textured,
+    share_outside,
+    shares_noise,
+    split_light,
+    sums_to,
+)
 
 SIZE = (48, 64)
 
@@ -97,14 +107,14 @@ def test_what_is_light_is_told_from_what_is_not() -> None:
     assert sums_to(noisy, whole, 1.0)
     assert not sums_to(noisy, 1.1 * whole, 1.0)
     assert not sums_to(noisy[:1], whole, 1.0)
-    assert above(noisy[0], whole, 1.0) == 0
-    assert above(3 * whole, whole, 1.0) == above(-whole, whole, 1.0) == 1
+    assert share_outside(noisy[0], whole, 1.0) == 0
+    assert share_outside(3 * whole, whole, 1.0) == share_outside(-whole, whole, 1.0) == 1
     mask = np.zeros((*SIZE, 3), np.float32)
     mask[10:20] = 0.1
     assert is_noisy(noisy[0])
     assert not is_noisy(mask)
-    assert in_noise(noisy[0], whole)
-    assert not in_noise(lights(5)[1][0], whole)
+    assert shares_noise(noisy[0], whole)
+    assert not shares_noise(lights(5)[1][0], whole)
 
 
 def test_what_was_multiplied_by_the_albedo_shows_its_texture() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.samples import SampleMean, average_sides, blend_samples, restore_mean
+from nlm.samples import SampleMean, average_neighbours, blend_samples, restore_mean
 
 SHAPE = (96, 128)
 ONES = np.ones((*SHAPE, 3), np.float32)
@@ -31,7 +31,7 @@ def window(truth: np.ndarray, noise: float, frames: int = 5) -> tuple[np.ndarray
     """The noisy centre, and the mean of the frames beside it."""
     all_frames = np.stack([noisy(truth, noise, 10 + t) for t in range(frames)])
     confidence = np.ones(all_frames.shape[:3], np.float32)
-    return all_frames[frames // 2], average_sides(all_frames, None, confidence, confidence, np.ones_like(truth))
+    return all_frames[frames // 2], average_neighbours(all_frames, None, confidence, confidence, np.ones_like(truth))
 
 
 def error(image: np.ndarray, truth: np.ndarray) -> float:
@@ -46,7 +46,7 @@ def test_the_mean_of_the_sides_is_its_definition() -> None:
     confidence[:, 3] = 0
     estimates[0, 5] = np.nan
     modulation = rng.uniform(0.1, 1, (9, 11, 3)).astype(np.float32)
-    found = average_sides(estimates, residuals, confidence, np.zeros_like(confidence), modulation)
+    found = average_neighbours(estimates, residuals, confidence, np.zeros_like(confidence), modulation)
     for y, x in np.ndindex(9, 11):
         sides = [t for t in (0, 1, 3, 4) if confidence[t, y, x] > 0 and np.isfinite(estimates[t, y, x]).all()]
         weights = confidence[sides, y, x].astype(np.float64)
@@ -216,4 +216,4 @@ def test_shapes_must_fit() -> None:
     with pytest.raises(ValueError, match="noisy: expected shape"):
         blend_samples(lines()[1:], own, sides, 1.0)
     with pytest.raises(ValueError, match="residuals: expected shape"):
-        average_sides(np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), np.ones((4, 5, 3)))
+        average_neighbours(np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), np.ones((4, 5, 3)))

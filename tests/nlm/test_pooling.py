@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.gather import gather, hold_to_window
+from nlm.pooling import clamp_to_window, pool_samples
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_gather_is_its_definition(window) -> None:
     estimates[0, 6, 6, 1] = np.nan
     residuals[4, 7, 7] = np.inf, -np.inf, 0
     confidence[2, 8, 8] = np.nan
-    gathered = gather(*window, exposure=0.4)
+    gathered = pool_samples(*window, exposure=0.4)
     expected = plain_gather(*window, exposure=0.4)
     for found, wanted in zip((gathered.average, gathered.image, gathered.samples), expected, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=2e-5, atol=1e-6)  # sums of five float32
@@ -52,7 +52,7 @@ def test_gather_is_its_definition(window) -> None:
 def test_constants_are_preserved(window) -> None:
     _, _, confidence = window
     constant = np.full((5, 9, 11, 3), 0.7, np.float32)
-    gathered = gather(constant, np.zeros_like(constant), confidence, 0.5)
+    gathered = pool_samples(constant, np.zeros_like(constant), confidence, 0.5)
     np.testing.assert_allclose(gathered.average, 0.7, rtol=1e-6)
     np.testing.assert_allclose(gathered.image, 0.7, rtol=1e-6)
 
@@ -61,8 +61,8 @@ def test_constants_are_preserved(window) -> None:
 def test_a_scaled_window_is_gathered_to_a_scaled_one(window, scale: float) -> None:
     estimates, residuals, confidence = window
     residuals[3, 5, 5] = 1e6
-    plain = gather(estimates, residuals, confidence, 0.4)
-    scaled = gather(scale * estimates, scale * residuals, confidence, scale * 0.4)
+    plain = pool_samples(estimates, residuals, confidence, 0.4)
+    scaled = pool_samples(scale * estimates, scale * residuals, confidence, scale * 0.4)
     np.testing.assert_array_equal(scaled.average, scale * plain.average)
     np.testing.assert_array_equal(scaled.image, scale * plain.image)
     np.testing.assert_array_equal(scaled.samples, plain.samples)
@@ -72,7 +72,7 @@ def test_equal_trust_brings_the_noise_of_as_many_frames() -> None:
     rng = np.random.default_rng(3)
     estimates = np.ones((5, 60, 60, 3), np.float32)
     residuals = rng.normal(0, 0.3, estimates.shape).astype(np.float32)
-    gathered = gather(estimates, residuals, np.ones((5, 60, 60), np.float32), 1.0)
+    gathered = pool_samples(estimates, residuals, np.ones((5, 60, 60), np.float32), 1.0)
     np.testing.assert_allclose(gathered.samples, 5, rtol=1e-6)
     # 10800 samples: the variance is known to 1.4 %, four deviations are 5.5 %.
     assert gathered.image.var() == pytest.approx(0.3**2 / 5, rel=0.055)
@@ -82,19 +82,19 @@ def test_equal_trust_brings_the_noise_of_as_many_frames() -> None:
 
 def test_samples_lie_between_one_frame_and_all(window) -> None:
     estimates, residuals, confidence = window
-    samples = gather(estimates, residuals, confidence, 1.0).samples
+    samples = pool_samples(estimates, residuals, confidence, 1.0).samples
     np.testing.assert_array_equal(samples[2], 0)
     np.testing.assert_allclose(samples[3], 1, rtol=1e-6)
     rest = np.delete(samples, [2, 3], axis=0)
     assert rest.min() > 1
     assert rest.max() <= 5
     # However little a frame is trusted, it is a frame.
-    np.testing.assert_allclose(gather(estimates, residuals, 1e-30 * confidence, 1.0).samples, samples, rtol=1e-5)
+    np.testing.assert_allclose(pool_samples(estimates, residuals, 1e-30 * confidence, 1.0).samples, samples, rtol=1e-5)
 
 
 def test_without_trust_the_centre_is_left(window) -> None:
     estimates, residuals, confidence = window
-    gathered = gather(estimates, residuals, np.zeros_like(confidence), 1.0)
+    gathered = pool_samples(estimates, residuals, np.zeros_like(confidence), 1.0)
     np.testing.assert_array_equal(gathered.average, estimates[2])
     np.testing.assert_array_equal(gathered.image, estimates[2])
     np.testing.assert_array_equal(gathered.samples, 0)
@@ -103,10 +103,10 @@ def test_without_trust_the_centre_is_left(window) -> None:
 def test_a_frame_that_nobody_trusts_may_hold_anything(window) -> None:
     estimates, residuals, confidence = window
     confidence[4] = 0
-    plain = gather(estimates, residuals, confidence, 1.0)
+    plain = pool_samples(estimates, residuals, confidence, 1.0)
     for value in (np.nan, np.inf, 1e30):
         estimates[4] = residuals[4] = value
-        again = gather(estimates, residuals, confidence, 1.0)
+        again = pool_samples(estimates, residuals, confidence, 1.0)
         for name in ("average", "image", "samples"):
             np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
 
@@ -115,7 +115,7 @@ def test_a_firefly_keeps_its_hue_and_loses_its_power() -> None:
     estimates = np.full((5, 3, 3, 3), 0.5, np.float32)
     residuals = np.zeros_like(estimates)
     residuals[3, 1, 1] = 3e5, 2e5, 1e5
-    image = gather(estimates, residuals, np.ones((5, 3, 3), np.float32), 1.0).image
+    image = pool_samples(estimates, residuals, np.ones((5, 3, 3), np.float32), 1.0).image
     added = image[1, 1] - 0.5
     # A fifth of 6 · (0.5 + 1) in the mean over channels.
     assert added.mean() == pytest.approx(6 * 1.5 / 5, rel=1e-5)
@@ -128,39 +128,39 @@ def test_noise_below_the_limit_is_left_alone() -> None:
     estimates = np.full((1, 2, 2, 3), 0.5, np.float32)
     residuals = np.full_like(estimates, 8.9)
     confidence = np.ones((1, 2, 2), np.float32)
-    np.testing.assert_allclose(gather(estimates, residuals, confidence, 1.0).image, 9.4, rtol=1e-6)
+    np.testing.assert_allclose(pool_samples(estimates, residuals, confidence, 1.0).image, 9.4, rtol=1e-6)
     # Samples without light lie an estimate below: never far enough.
-    np.testing.assert_allclose(gather(estimates, -estimates, confidence, 1e-9).image, 0, atol=1e-7)
+    np.testing.assert_allclose(pool_samples(estimates, -estimates, confidence, 1e-9).image, 0, atol=1e-7)
 
 
 def test_bad_arguments_are_errors(window) -> None:
     estimates, residuals, confidence = window
     with pytest.raises(ValueError, match="residuals: expected shape"):
-        gather(estimates, residuals[:, 1:], confidence, 1.0)
+        pool_samples(estimates, residuals[:, 1:], confidence, 1.0)
     with pytest.raises(ValueError, match="confidence: expected shape"):
-        gather(estimates, residuals, confidence[:, 1:], 1.0)
+        pool_samples(estimates, residuals, confidence[:, 1:], 1.0)
     with pytest.raises(ValueError, match=r"window: expected .* odd frames"):
-        gather(estimates[1:], residuals[1:], confidence[1:], 1.0)
+        pool_samples(estimates[1:], residuals[1:], confidence[1:], 1.0)
     for exposure in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="exposure: expected a positive number"):
-            gather(estimates, residuals, confidence, exposure)
+            pool_samples(estimates, residuals, confidence, exposure)
 
 
 def test_a_picture_is_held_to_the_range_of_its_window(window) -> None:
     estimates, residuals, _ = window
     rng = np.random.default_rng(3)
     picture = rng.normal(0, 20, estimates.shape[1:]).astype(np.float32)
-    held = hold_to_window(picture, estimates, residuals)
+    held = clamp_to_window(picture, estimates, residuals)
     both = np.concatenate([estimates, estimates + residuals])
     for y, x, c in np.ndindex(picture.shape):
         near = both[:, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2, c]
         assert held[y, x, c] == np.clip(picture[y, x, c], near.min(), near.max())
-    np.testing.assert_array_equal(hold_to_window(estimates[2], estimates, residuals), estimates[2])
+    np.testing.assert_array_equal(clamp_to_window(estimates[2], estimates, residuals), estimates[2])
 
 
 def test_the_range_of_a_window_leaves_out_what_is_not_finite(window) -> None:
     estimates, residuals, _ = window
-    expected = hold_to_window(10 * estimates[2], estimates, residuals)
+    expected = clamp_to_window(10 * estimates[2], estimates, residuals)
     spoiled = np.concatenate([estimates, np.full_like(estimates[:1], np.inf), np.full_like(estimates[:1], np.nan)])
     more = np.concatenate([residuals, np.zeros_like(residuals[:2])])
-    np.testing.assert_array_equal(hold_to_window(10 * estimates[2], spoiled, more), expected)
+    np.testing.assert_array_equal(clamp_to_window(10 * estimates[2], spoiled, more), expected)

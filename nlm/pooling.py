@@ -21,7 +21,7 @@ _LIMIT = np.float32(6)
 
 
 @dataclass(frozen=True)
-class Gathered:
+class PooledSamples:
     """A frame with the samples of its neighbours.
 
     Attributes
@@ -40,7 +40,7 @@ class Gathered:
     samples: Floats
 
 
-def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: float) -> Gathered:
+def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, exposure: float) -> PooledSamples:
     """Gather the samples of aligned frames at the centre.
 
     Parameters
@@ -84,10 +84,10 @@ def gather(estimates: Floats, residuals: Floats, confidence: Floats, exposure: f
     samples = np.empty(estimates.shape[1:3], np.float32)
     given = estimates, residuals, confidence, np.float32(exposure)
     run_bands(_gather, len(samples), *given, average, image, samples)
-    return Gathered(average, image, samples)
+    return PooledSamples(average, image, samples)
 
 
-def hold_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
+def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
     """Hold a picture to the range of what it was made from.
 
     Parameters
@@ -95,7 +95,7 @@ def hold_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Flo
     picture : (H, W, 3) float32
         Finite.
     estimates, residuals : (T, H, W, 3) float32
-        As for `gather`, in the unit of the picture.
+        As for `pool_samples`, in the unit of the picture.
 
     Returns
     -------
