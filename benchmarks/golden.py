@@ -212,8 +212,14 @@ def differences(name: str, before: dict, after: dict) -> Iterator[str]:
 
 def _renamed(header: dict[str, str]) -> dict[str, str]:
     """A header in new words."""
-    words = {key: sorted(RENAMED.get(word, word) for word in value.split()) for key, value in header.items()}
+    words = {key: sorted(_new_name(word) for word in value.split()) for key, value in header.items()}
     return {RENAMED.get(key, key): " ".join(value) for key, value in words.items()}
+
+
+def _new_name(word: str) -> str:
+    """The new name of a word, which may have a sign."""
+    sign = word[:1] if word[:1] in "+-" else ""
+    return sign + RENAMED.get(word[len(sign) :], word[len(sign) :])
 
 
 def main() -> int:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.motion import MotionConvention
-from hybrid.estimates import SPECS
 from hybrid.files.frame import Frame
 from hybrid.files.profile import parse_motion
 from hybrid.files.shots import Shot
+from hybrid.first_pass import SPECS
 from hybrid.job import DenoiseOptions, choose_first_pass, open_denoiser, replace_options
 from hybrid.plan import Plan
 from hybrid.stabilize import FrameDenoiser
@@ -173,7 +173,7 @@ def _denoise(
 ) -> Iterator[ArrayResult]:
     denoiser = open_denoiser(options)
     source = choose_first_pass(cast("Shot", shot), options, denoiser)
-    stream = FrameStream(shot, options.rules, source.estimates, radius=denoiser.radius)
+    stream = FrameStream(shot, options.rules, source.first_pass, radius=denoiser.radius)
     denoise = FrameDenoiser(stream, denoiser)
     for number in numbers:
         made = denoise.make(number)

@@ -97,12 +97,14 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
         differs from the average of the estimates (of the colors, where there are none) over the frames so weighed,
         |r − a| / (a + exposure), means over channels.
     """
-    sides = [index for index, trust in enumerate(aligned.trust) if index != aligned.centre and trust.any()]
-    mean = average(aligned.color if aligned.estimate is None else aligned.estimate, aligned.confidence)
+    sides = [
+        index for index, trust in enumerate(aligned.geometric_confidence) if index != aligned.centre and trust.any()
+    ]
+    mean = average(aligned.color if aligned.first_pass is None else aligned.first_pass, aligned.confidence)
     changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)
     nothing = np.zeros(irradiance.shape[:2], np.float32)
     return {
-        "stage.align": aligned.trust[sides].mean(axis=0) if sides else nothing,
+        "stage.align": aligned.geometric_confidence[sides].mean(axis=0) if sides else nothing,
         "stage.gate": aligned.confidence[sides].mean(axis=0) if sides else nothing,
         "stage.network": np.asarray(np.minimum(changed, 1), np.float32),
     }

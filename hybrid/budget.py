@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from hybrid.denoisers import WindowDenoiser
-from hybrid.estimates import EstimateSource, PerFrame
 from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
+from hybrid.first_pass import FirstPassSource, PerFrame
 from hybrid.plan import Rules
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FirstPass, FrameStream
@@ -37,7 +37,7 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot, rules: Rules, presets: Iterable[str], load: Callable[[str], tuple[WindowDenoiser, EstimateSource]]
+    shot: Shot, rules: Rules, presets: Iterable[str], load: Callable[[str], tuple[WindowDenoiser, FirstPassSource]]
 ) -> Iterator[Measured]:
     """Measure presets on the middle of a shot, one after the other.
 
@@ -72,7 +72,9 @@ def measure_presets(
     for preset in presets:
         denoiser, source = load(preset)
         # A sequence holds whole frames, and only a part is measured.
-        given: FirstPass | None = PerFrame(lambda frame: frame.color) if source.name == "sequence" else source.estimates
+        given: FirstPass | None = (
+            PerFrame(lambda frame: frame.color) if source.name == "sequence" else source.first_pass
+        )
         frames, spent = FrameDenoiser(FrameStream(part, rules, given, radius=denoiser.radius), denoiser), []
         for number in numbers:
             start = time.perf_counter()

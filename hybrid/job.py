@@ -19,12 +19,12 @@ from types import ModuleType
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
 from hybrid.denoisers import AverageDenoiser, ClassicalDenoiser, PooledDenoiser, WindowDenoiser
-from hybrid.estimates import MODE_OF, OIDN_MODES, SPECS, EstimateSource, PerFrame, choose_estimate
 from hybrid.files.passes import BEAUTY
 from hybrid.files.replace import temporary_folder
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import PACKAGES, versions
+from hybrid.first_pass import OIDN_MODE_OF_PRESET, OIDN_MODES, SPECS, FirstPassSource, PerFrame, find_first_pass
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import find_device
 from hybrid.pipeline import (
@@ -60,7 +60,7 @@ FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-
 PRECISIONS = ("auto", "float32", "bfloat16")
 AOV_SUMS = ("layers", "beauty")
 # Presets that --budget chooses from, the most accurate first.
-MEASURED = tuple(reversed(MODE_OF))
+MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class DenoiseOptions:
     threshold : float or None
         For networks that predict kernels, in [0, 1): higher drops more taps.
     first_pass : str
-        Source of the denoised image per frame (`hybrid.estimates.choose_estimate`), or a finished sequence. Without:
+        Source of the denoised image per frame (`hybrid.first_pass.find_first_pass`), or a finished sequence. Without:
         "auto" for a network, "none" for the classical chain, "oidn-fast" for pooled samples.
     keep_first_pass : str or None
         Pattern or folder where OIDN's first pass is kept for later runs.
@@ -286,7 +286,7 @@ class Job:
     judgement : ValidationReport
         Of the first view, with the findings of all.
     denoiser : WindowDenoiser
-    first_passes : tuple of EstimateSource
+    first_passes : tuple of FirstPassSource
         One for each view.
     rows : int or None
         Rows of a frame that are worked on at a time; None: all.
@@ -303,7 +303,7 @@ class Job:
     views: tuple[Shot, ...]
     judgement: ValidationReport
     denoiser: WindowDenoiser
-    first_passes: tuple[EstimateSource, ...]
+    first_passes: tuple[FirstPassSource, ...]
     rows: int | None
     settings: Mapping[str, object]
     timings: Timings
@@ -373,7 +373,7 @@ def check_paths(
     shot: Shot,
     output: str | Path,
     options: DenoiseOptions,
-    sources: Sequence[EstimateSource] = (),
+    sources: Sequence[FirstPassSource] = (),
     *,
     reads: Mapping[str, str | Path | None] = {},
     writes: Mapping[str, Path | None] = {},
@@ -388,7 +388,7 @@ def check_paths(
         Pattern or folder of the denoised frames.
     options : DenoiseOptions
         Name further files.
-    sources : sequence of EstimateSource
+    sources : sequence of FirstPassSource
         First passes, whose files are read or written.
     reads, writes : mapping of str to path or None
         Further files.
@@ -506,7 +506,7 @@ def _check_first_pass_of(denoiser: WindowDenoiser, options: DenoiseOptions) -> N
         )
 
 
-def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> EstimateSource:
+def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> FirstPassSource:
     """Return the first pass of a view; a network that needs one has the classical one where none is asked for.
 
     Parameters
@@ -521,13 +521,13 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
     Raises
     ------
     ValueError, ImportError, FileNotFoundError
-        As `hybrid.estimates.choose_estimate`.
+        As `hybrid.first_pass.find_first_pass`.
     """
     if not denoiser.needs_first_pass:
-        return EstimateSource("none", None, "the denoiser takes none")
+        return FirstPassSource("none", None, "the denoiser takes none")
     support = temporal_support(None, denoiser.radius, options.rules)
     quicker, bundled = denoiser.backends
-    return choose_estimate(
+    return find_first_pass(
         "nlm" if options.first_pass == "none" else options.first_pass,
         view.with_neighbours(support * (options.passes - 1)),
         own=CLASSICAL_PRESETS.get(options.preset, FINAL),
@@ -542,7 +542,7 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
 
 def _oidn_mode(options: DenoiseOptions) -> str:
     """The mode of OIDN that the first pass "auto" has."""
-    return "oidn-clean" if options.weights is not None else MODE_OF.get(options.preset, "oidn-clean")
+    return "oidn-clean" if options.weights is not None else OIDN_MODE_OF_PRESET.get(options.preset, "oidn-clean")
 
 
 def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
@@ -551,7 +551,7 @@ def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
     def with_preset(preset: str) -> DenoiseOptions:
         return replace(options, preset=preset, budget=None)
 
-    def load(preset: str) -> tuple[WindowDenoiser, EstimateSource]:
+    def load(preset: str) -> tuple[WindowDenoiser, FirstPassSource]:
         # Nothing is kept: the frames that are measured are parts.
         measured = replace(with_preset(preset), keep_first_pass=None)
         denoiser = open_denoiser(measured)
@@ -570,7 +570,7 @@ def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
 
 
 def _settings(
-    options: DenoiseOptions, view: Shot, denoiser: WindowDenoiser, first_pass: EstimateSource
+    options: DenoiseOptions, view: Shot, denoiser: WindowDenoiser, first_pass: FirstPassSource
 ) -> dict[str, object]:
     """What pixels depend on beside preset, stages and versions, and without paths: frames name their files."""
     weights = {}
@@ -599,7 +599,7 @@ def _digest(path: Path) -> str:
 
 
 def _plan_rows(
-    options: DenoiseOptions, views: Sequence[Shot], denoiser: WindowDenoiser, first_pass: EstimateSource
+    options: DenoiseOptions, views: Sequence[Shot], denoiser: WindowDenoiser, first_pass: FirstPassSource
 ) -> int | None:
     if options.max_memory is None:
         return None
@@ -607,7 +607,7 @@ def _plan_rows(
         parse_size(options.max_memory) // len(views),
         views[0],
         options.rules.allowed,
-        first_pass.estimates,
+        first_pass.first_pass,
         radius=denoiser.radius,
         network=denoiser.memory(views[0].shape),
         gathers=denoiser.pools,
@@ -634,7 +634,7 @@ def run_job(job: Job, progress: Progress | None = None) -> Iterator[Finished | F
         limit_threads(options.threads)
     if options.reuse_freed_memory and options.max_memory is None:
         reuse_freed_memory()
-    views = [View(shot, source.estimates) for shot, source in zip(job.views, job.first_passes, strict=True)]
+    views = [View(shot, source.first_pass) for shot, source in zip(job.views, job.first_passes, strict=True)]
     sources: SourcesOf | None = None
     home = output_path(job.output, job.views[0], job.views[0].numbers[0]).parent
     with ExitStack() as stack:

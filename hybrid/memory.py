@@ -134,7 +134,7 @@ def _planes(
     reach = radius if estimates is None else estimates.reach(radius)
     frames = min(2 * reach + 1, shot.count)
     window = (2 * radius + 1) * _planes_aligned(layers)
-    pictures = 3 if "steady" in stages else 1
+    pictures = 3 if "stabilize" in stages else 1
     kept = frames * frame + _planes_of_flows(layers, stages, frames, radius) + pictures * _planes_written(layers)
     # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
     passing = max(len(header.channel_names) + frame + PREPARING, REFINING if _can_refine(stages) else 0)

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.fireflies import REACH
-from hybrid.beside import ReadAhead
-from hybrid.estimates import OIDN_MODES, EstimateSource
 from hybrid.files.replace import check_outputs, remove_leftovers
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
+from hybrid.first_pass import OIDN_MODES, FirstPassSource
 from hybrid.plan import Plan, Rules
+from hybrid.prefetch import Prefetcher
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
 from hybrid.stream import FirstPass, FrameStream
@@ -67,7 +67,7 @@ class Finished:
 def check_written(
     shot: Shot,
     output: str | Path,
-    sources: Sequence[EstimateSource],
+    sources: Sequence[FirstPassSource],
     inputs: Mapping[str, str | Path | None],
     others: Mapping[str, Path | None],
 ) -> None:
@@ -79,7 +79,7 @@ def check_written(
         What is denoised.
     output : str or Path
         As for `denoise_frames`.
-    sources : sequence of EstimateSource
+    sources : sequence of FirstPassSource
         Whose files are read, or kept.
     inputs, others : mapping of str to Path or None
         What else is read, and what else is written: what it is called → where.
@@ -101,7 +101,7 @@ def check_written(
 def describe_run(
     command: str,
     preset: str,
-    source: EstimateSource,
+    source: FirstPassSource,
     rules: Rules,
     settings: Mapping[str, object],
     *,
@@ -113,7 +113,7 @@ def describe_run(
     ----------
     command, preset : str
         What makes them.
-    source : EstimateSource
+    source : FirstPassSource
         Where their estimates come from.
     rules : Rules
         What the user has forced.
@@ -295,7 +295,7 @@ class _ShotDenoiser:
         self.shot = views[0].shot
         self.support = temporal_support(views[0].first_pass, radius, rules)
         self.sources = sources_of(views, radius, rules, settings.sources)
-        self.readers = [ReadAhead(view.shot, thread, timings) for view in views]
+        self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
         self.denoisers = []
         for reader, view in zip(self.readers, views, strict=True):
             stream = FrameStream(reader, rules, view.first_pass, radius=radius, timings=timings)
@@ -382,7 +382,7 @@ def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) ->
     rules : Rules
         The forced stages.
     """
-    return REACH + ("steady" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
+    return REACH + ("stabilize" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
 
 
 def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:

@@ -30,18 +30,21 @@ SWITCHES = {
     "fireflies": "remove single bright samples of a frame before anything spreads them",
     "demodulate": "divide by the albedo and filter the light alone",
     "drift": "average less of denoised frames whose light drifts, as far as samples show",
-    "steady": "average each result with those of the neighbouring frames",
-    "mean": "restore the local means of the samples, fireflies included, as far as these are certain",
-    "samples": "blend samples into results where their noise is small against the difference",
+    "stabilize": "average each result with those of the neighbouring frames",
+    "restore-mean": "restore the local means of the samples, fireflies included, as far as these are certain",
+    "blend-samples": "blend samples into results where their noise is small against the difference",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
 _ORDER = (
-    "fireflies demodulate outliers warp dense-flow refine gate drift fixed-noise prefilter steady mean samples alpha"
+    "fireflies demodulate outliers warp dense-flow refine gate drift fixed-noise prefilter stabilize restore-mean "
+    "blend-samples alpha"
 )
 STAGES = {name: {**MEASURED, **SWITCHES}[name] for name in (*_ORDER.split(), "skip")}
+#: Old names of stages, accepted for one release.
+OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 #: Stages of networks alone.
-NEURAL_STAGES = frozenset({"steady", "alpha", "skip"})
+NEURAL_STAGES = frozenset({"stabilize", "alpha", "skip"})
 
 # Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
 STILL = 0.05
@@ -152,6 +155,8 @@ class Rules:
     off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
+        for name in ("on", "off"):
+            object.__setattr__(self, name, frozenset(OLD_NAMES.get(stage, stage) for stage in getattr(self, name)))
         for name in sorted(self.on | self.off):
             if name not in STAGES:
                 raise ValueError(f"stage is {name!r}, expected one of {', '.join(STAGES)}")
@@ -251,9 +256,9 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         _switch("drift", bool(pairs), neighbours),
         _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
         _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
-        _switch("steady", bool(pairs), neighbours),
-        _switch("mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
-        _switch("samples", True, "each pixel is compared with its samples"),
+        _switch("stabilize", bool(pairs), neighbours),
+        _switch("restore-mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
+        _switch("blend-samples", True, "each pixel is compared with its samples"),
         _switch("alpha", bool(transparent), alpha),
         _switch("skip", clean > 0, f"{clean:.1%} of the tiles hold no noise"),
     )

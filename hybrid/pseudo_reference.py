@@ -142,11 +142,11 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
     ``Σ c_t e_t / Σ c_t``, c the confidence: the greater of geometry's, times the color gate (`nlm.gate`) where the plan
     has it, and 0.3 times the gate. Geometry cannot tell which pixels of an outline are alike; their colors can.
     """
-    if aligned.estimate is None:
+    if aligned.first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("average"):
-        return average(aligned.estimate, aligned.confidence) * aligned.modulation
+        return average(aligned.first_pass, aligned.confidence) * aligned.modulation
 
 
 def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
@@ -180,11 +180,11 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
     (both made once more without the centre, whose noisy picture is then regressed on their difference) takes a third
     run of OIDN, and was worth 0.05 dB less than the constant on thirteen shots.
     """
-    if aligned.estimate is None or aligned.residual is None or aligned.picture is None:
+    if aligned.first_pass is None or aligned.residual is None or aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("gather"):
-        gathered = pool_samples(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+        gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
         average = gathered.average * aligned.modulation
         image = gathered.image * aligned.modulation
     with timings.stage("denoise"):
@@ -196,7 +196,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
             None if albedo is None else normal,  # OIDN takes no normal alone
             prefilter="balanced" if noisy else None,
             clean=not noisy,
-            scale=measure_gain(aligned.picture),
+            scale=measure_gain(aligned.centre_first_pass),
             device=device,
         )
     with timings.stage("gather"):

@@ -71,7 +71,7 @@ class WindowResult:
     plan : Plan
         The stages that ran on the window.
     neighbour_samples : SampleMean or None
-        The samples of the other frames at the centre's pixels; with the stage "samples".
+        The samples of the other frames at the centre's pixels; with the stage "blend-samples".
     trust : dict of int to pair of Trust or None
         From the first row of a band to the trust in the frames before and after.
     drift_weight : (H, W) array or None
@@ -181,13 +181,13 @@ class FrameDenoiser:
                         raise
         result = self._results[number]
         denoised, beyond = result.denoised, 0
-        if "steady" in result.plan.stages and len(self._results) > 1:
+        if "stabilize" in result.plan.stages and len(self._results) > 1:
             denoised = self._stabilize(number)
         frame = self.stream.frame(number)
         if frame is not None:
             self._check_light(denoised.color, frame, result.brightest)
             denoised = self._correct(denoised, frame, result)
-            if "samples" in result.plan.stages:
+            if "blend-samples" in result.plan.stages:
                 denoised = self._with_moving_lights(denoised, frame)
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
@@ -206,7 +206,7 @@ class FrameDenoiser:
 
     def neighbours(self, number: int) -> list[int]:
         """The frame, and the neighbours whose results are averaged with it."""
-        return self.stream.neighbours(number) if "steady" in self.stream.rules.allowed else [number]
+        return self.stream.neighbours(number) if "stabilize" in self.stream.rules.allowed else [number]
 
     def _denoise_window(self, number: int) -> WindowResult:
         """Denoise a frame's own window, band by band."""
@@ -228,7 +228,7 @@ class FrameDenoiser:
             layers.add(band, aligned.inner, {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight})
             layers.add(band, aligned.inner, {("aovs", name): layer for name, layer in denoised.aovs.items()})
             layers.add(band, aligned.inner, {("extra", name): layer for name, layer in denoised.extra.items()})
-            sides = {} if aligned.sides is None else vars(aligned.sides)
+            sides = {} if aligned.neighbour_samples is None else vars(aligned.neighbour_samples)
             layers.add(band, aligned.inner, {("sides", name): layer for name, layer in sides.items()})
         assert aligned is not None
         samples = layers.named("sides")
@@ -251,14 +251,14 @@ class FrameDenoiser:
         colors = {n: other.denoised.color for n, other in self._results.items()}
         window = self.stream.window_of_results(number, colors)
         color = np.empty_like(result.denoised.color)
-        with timings.stage("steady"):
+        with timings.stage("stabilize"):
             stillness = measure_stillness(result.drift_weight, color.shape[:2])
         for band in self._bands():
             trust = result.trust[band.start]
             aligned, confidence = align_results(window, trust, stillness, result.exposure, band, timings=timings)
-            with timings.stage("steady"):
+            with timings.stage("stabilize"):
                 color[band] = average(aligned, confidence)
-        with timings.stage("steady"):
+        with timings.stage("stabilize"):
             return _changed(result.denoised, color)
 
     def _check_light(self, color: Array, frame: PreparedFrame, brightest: float) -> None:
@@ -273,13 +273,13 @@ class FrameDenoiser:
         """The denoised frame with the means of its samples, and with the samples where they are certain."""
         color, timings = denoised.color, self.stream.timings
         exposure = measure_exposure(color)
-        if "mean" in result.plan.stages:
-            with timings.stage("mean"):
+        if "restore-mean" in result.plan.stages:
+            with timings.stage("restore-mean"):
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
                 for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
                     color = restore_mean(color, _where_rendered(frame, noisy, color), exposure)
         if result.neighbour_samples is not None:
-            with timings.stage("samples"):
+            with timings.stage("blend-samples"):
                 noisy = _where_rendered(frame, frame.radiance, color)
                 color = blend_samples(color, noisy, result.neighbour_samples, exposure, frame.radiance_variance)
         return _changed(denoised, color, CORRECTED)
@@ -288,7 +288,7 @@ class FrameDenoiser:
         """The denoised frame with bright pixels as rendered that the neighbouring results show to move together."""
         step = self.stream.shot.step
         others = [n for n in (frame.number - step, frame.number + step) if n in self._results]
-        with self.stream.timings.stage("samples"):
+        with self.stream.timings.stage("blend-samples"):
             excess = _excess(frame, self._results[frame.number].denoised.color)
             bright = find_bright(excess)
             if not (others and bright.any()):

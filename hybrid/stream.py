@@ -32,7 +32,7 @@ Value = TypeVar("Value")
 
 
 class FirstPass(Protocol):
-    """A source of denoised single frames (`hybrid.estimates` has three kinds).
+    """A source of denoised single frames (`hybrid.first_pass` has three kinds).
 
     Attributes
     ----------

@@ -69,9 +69,7 @@ def _server() -> forkserver.ForkServer:
 def start(said: Path, *words: object, **setup: object) -> BaseProcess:
     """Start the command in a process that writes what it prints to `said`; `setup` is that of `_run`."""
     server = _server()
-    process = get_context("forkserver").Process(
-        target=_run, args=(said, [str(word) for word in words]), kwargs=setup
-    )
+    process = get_context("forkserver").Process(target=_run, args=(said, [str(word) for word in words]), kwargs=setup)
     with mock.patch.object(forkserver, "connect_to_new_process", server.connect_to_new_process):
         process.start()
     return process

@@ -129,7 +129,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
         elif "gate" in stages:
             confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
         sides = None
-        if "samples" in stages:
+        if "blend-samples" in stages:
             # Before the first pass is pulled to the centre's: the samples stay as they are.
             pictures, residual = (color, None) if estimates is None else (estimates, sources.residual)
             assert pictures is not None
@@ -140,17 +140,17 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
             pull_to_centre(estimates, confidence, weight)
     return AlignedWindow(
         number=centre.number,
-        own=own,
+        centre_irradiance=own,
         aligned_color=color,
         guides=guides,
         sources=sources,
         confidence=confidence,
         modulation=modulation,
         clean_albedo=clean,
-        trust=warped.confidence,
+        geometric_confidence=warped.confidence,
         rendered_variance=centre.variance,
-        estimate=estimates,
-        picture=None if window.first_pass is None else window.first_pass[middle],
+        first_pass=estimates,
+        centre_first_pass=None if window.first_pass is None else window.first_pass[middle],
         aovs={name.removeprefix("aov "): layer for name, layer in warped.layers.items() if name.startswith("aov ")},
         repaired=centre.repaired,
         outliers=outliers,
@@ -161,7 +161,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
         stages=stages,
         shares={"refine": float(np.mean(window.refined))} if window.refined else {},
         pass_colors={name: tint[padded] for name, tint in centre.pass_colors.items()},
-        sides=sides,
+        neighbour_samples=sides,
         neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
         drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1],
         passes=centre.passes,
@@ -192,7 +192,7 @@ def align_results(
     rows : slice, optional
         As for `align`.
     timings : Timings, optional
-        Counts the stages "warp" and "steady".
+        Counts the stages "warp" and "stabilize".
 
     Returns
     -------
@@ -213,7 +213,7 @@ def align_results(
             _set_trust(confidence, coverage, window, index, known, padded)
     assert window.first_pass is not None
     results = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
-    with timings.stage("steady"):
+    with timings.stage("stabilize"):
         divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
         light = results if divisor is None else results / remodulate(np.ones_like(noisy), divisor)
         # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the

@@ -145,7 +145,7 @@ class AlignedWindow:
     ----------
     number : int
         The centre frame's number.
-    own : (H, W, 3) array
+    centre_irradiance : (H, W, 3) array
         The centre's irradiance.
     aligned_color : (T, H, W, 3) array or None
         `color`, where it was needed for the alignment.
@@ -159,14 +159,14 @@ class AlignedWindow:
         Radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1.
     clean_albedo : (H, W, 3) array or None
         The centre's albedo, prefiltered where the plan has it.
-    trust : (T, H, W) array
+    geometric_confidence : (T, H, W) array
         Confidence by geometry alone, with which guides are prefiltered.
     rendered_variance : (H, W, 3) array or None
         Of the centre's irradiance, where the file has one.
-    estimate : (T, H, W, 3) array or None
+    first_pass : (T, H, W, 3) array or None
         The first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where the light
         drifts.
-    picture : (H, W, 3) array or None
+    centre_first_pass : (H, W, 3) array or None
         The centre's first pass, radiance of the whole frame.
     aovs : dict of str to (T, H, W, C) array
         Further layers, warped, and divided by the albedo where they are textured.
@@ -188,8 +188,8 @@ class AlignedWindow:
         The share of the picture, in [0, 1], on which a stage ran that runs only in places.
     pass_colors : dict of str to (H, W, 3) array
         The centre's colors of those `aovs` that are light without it.
-    sides : SampleMean or None
-        The mean of the neighbours' samples at the centre's pixels, radiance; with the stage "samples".
+    neighbour_samples : SampleMean or None
+        The mean of the neighbours' samples at the centre's pixels, radiance; with the stage "blend-samples".
     neighbour_trust : tuple of Trust or None
         Of the frame before and the frame after the centre; None where there is none.
     drift_weight : (H, W) array or None
@@ -199,17 +199,17 @@ class AlignedWindow:
     """
 
     number: int
-    own: Array
+    centre_irradiance: Array
     aligned_color: Array | None
     guides: dict[str, Array]
     sources: WarpSources
     confidence: Array
     modulation: Array
     clean_albedo: Array | None
-    trust: Array
+    geometric_confidence: Array
     rendered_variance: Array | None
-    estimate: Array | None
-    picture: Array | None
+    first_pass: Array | None
+    centre_first_pass: Array | None
     aovs: dict[str, Array]
     repaired: int
     fireflies: int
@@ -220,7 +220,7 @@ class AlignedWindow:
     stages: frozenset[str]
     shares: Mapping[str, float] = field(default_factory=dict)
     pass_colors: dict[str, Array] = field(default_factory=dict)
-    sides: SampleMean | None = None
+    neighbour_samples: SampleMean | None = None
     neighbour_trust: tuple[Trust | None, Trust | None] = (None, None)
     drift_weight: Array | None = None
     passes: Passes = NO_PASSES
@@ -233,8 +233,8 @@ class AlignedWindow:
         """
         if self.aligned_color is not None:
             return self.aligned_color
-        color = self.sources.warp("irradiance", self.own)
-        color[self.centre] = self.own
+        color = self.sources.warp("irradiance", self.centre_irradiance)
+        color[self.centre] = self.centre_irradiance
         return color
 
     @property
@@ -252,7 +252,7 @@ class AlignedWindow:
         """The centre's albedo and normal, prefiltered, (H, W, G). Made at the first access."""
         clean = [] if self.clean_albedo is None else [self.clean_albedo]
         if "normal" in self.guides:
-            clean.append(clean_guide("normal", self.guides, self.sources, self.trust, self.stages))
+            clean.append(clean_guide("normal", self.guides, self.sources, self.geometric_confidence, self.stages))
         return np.concatenate(clean, axis=-1) if clean else None
 
     @cached_property
@@ -265,7 +265,7 @@ class AlignedWindow:
     @property
     def residual(self) -> Array | None:
         """Noisy irradiance − first pass, aligned, (T, H, W, 3); None without a first pass (`WarpSources.residual`)."""
-        return None if self.estimate is None else self.sources.residual
+        return None if self.first_pass is None else self.sources.residual
 
     @property
     def centre(self) -> int:

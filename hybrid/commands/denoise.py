@@ -39,7 +39,6 @@ from hybrid.commands.options import (
     SheetOption,
     ShotArgument,
     StrictOption,
-    split_names,
     usage,
 )
 from hybrid.commands.shots import (
@@ -49,12 +48,13 @@ from hybrid.commands.shots import (
     in_view,
     log_findings,
     say_cuts,
+    split_stages,
     views_of,
 )
-from hybrid.estimates import SPECS
 from hybrid.files.layers import summarize_layers
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
+from hybrid.first_pass import SPECS
 from hybrid.job import DenoiseOptions, Job, Step, check_paths, open_job, run_job
 from hybrid.pipeline import Failed, Finished
 from hybrid.plan import NEURAL_STAGES, Plan, merge
@@ -227,8 +227,8 @@ def denoise(
             passes=passes,
             breakdown=breakdown,
             aov_sum=aov_sum,
-            stages=tuple(split_names(stages)),
-            no_stages=tuple(split_names(no_stages)),
+            stages=split_stages(stages),
+            no_stages=split_stages(no_stages),
             tile=tile,
             precision=precision,
             device=device,

@@ -19,7 +19,7 @@ from hybrid.files.sequences import find_views, name_view, parse_frames
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sidecars import names_sequence
 from hybrid.job import import_neural as import_torch
-from hybrid.plan import Plan, Rules
+from hybrid.plan import OLD_NAMES, Plan, Rules
 from hybrid.runtime.compiled import watch_compiling
 from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 
@@ -193,7 +193,15 @@ def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = 
     return [*cuts, *repeats]
 
 
+def split_stages(names: Sequence[str] | None) -> tuple[str, ...]:
+    """Split names of stages, and log a line for each old one."""
+    for old in (stages := split_names(names)):
+        if old in OLD_NAMES:
+            LOG.warning(f"stage {old} is now {OLD_NAMES[old]}; the old name goes in the next release")
+    return tuple(OLD_NAMES.get(name, name) for name in stages)
+
+
 def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:
     """The stages that the user has forced."""
     with usage():
-        return Rules(frozenset(split_names(on)), frozenset(split_names(off)))
+        return Rules(frozenset(split_stages(on)), frozenset(split_stages(off)))

@@ -20,9 +20,9 @@ from skimage.restoration import denoise_nl_means, estimate_sigma
 from flow.tvl1 import refine_flow
 from hybrid.alignment.transfer import compress, expand, measure_exposure
 from hybrid.alignment.window import AlignedWindow
-from hybrid.estimates import MODE_OF, choose_estimate, estimate_oidn, read_denoised
 from hybrid.files.frame import Frame, MappedShot
 from hybrid.files.shots import Shot
+from hybrid.first_pass import OIDN_MODE_OF_PRESET, denoise_frame_oidn, find_first_pass, read_denoised
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, ClassicalPreset, filter_window, gated_average, gather_and_denoise
@@ -90,7 +90,7 @@ def noisy(shot: Shot) -> Iterator[tuple[int, Array]]:
 
 
 def finished(shot: Shot, *, other: Shot) -> Iterator[tuple[int, Array]]:
-    """The frames that a denoiser has left in files (`hybrid.estimates.read_denoised`).
+    """The frames that a denoiser has left in files (`hybrid.first_pass.read_denoised`).
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def _aligner(
 ) -> FrameStream:
     """What aligns windows with the stages that they call for.
 
-    `source` is that of the estimates (`hybrid.estimates`), `rules` have stages forced; without `vectors` those of the
+    `source` is that of the estimates (`hybrid.first_pass`), `rules` have stages forced; without `vectors` those of the
     renderer are not looked at; `solver` has settings of TV-L1, and has it run.
     """
     seen = shot if vectors else _blind(shot)
@@ -137,8 +137,8 @@ def _aligner(
         rules = replace(rules, on=rules.on | {"refine"})
     refine = partial(refine_flow, **(solver or {}))
     bundled = _small_network() if source == "bundled" else None
-    chosen = choose_estimate(source, shot, mode=MODE_OF["fast"], bundled=bundled)
-    return FrameStream(seen, rules, chosen.estimates, radius=radius, refine=refine)
+    chosen = find_first_pass(source, shot, mode=OIDN_MODE_OF_PRESET["fast"], bundled=bundled)
+    return FrameStream(seen, rules, chosen.first_pass, radius=radius, refine=refine)
 
 
 def _windows(shot: Shot, numbers: Sequence[int], **window: Any) -> Iterator[AlignedWindow]:
@@ -306,10 +306,10 @@ def window_maps(aligned: AlignedWindow, denoise: DenoiseWindow) -> dict[str, Arr
     # Small enough to change no decision, and large enough to stand far above the rounding of float32.
     step = np.float32(1 / 256)
     part = np.where(side, step, 0).astype(np.float32)[:, None, None]
-    estimate = aligned.estimate
-    if estimate is not None:
-        estimate = estimate * (1 + part[..., None])
-    brighter = replace(aligned, aligned_color=aligned.color * (1 + part[..., None]), estimate=estimate)
+    first_pass = aligned.first_pass
+    if first_pass is not None:
+        first_pass = first_pass * (1 + part[..., None])
+    brighter = replace(aligned, aligned_color=aligned.color * (1 + part[..., None]), first_pass=first_pass)
     before, after = (denoise(window).mean(axis=-1) for window in (aligned, brighter))
     change = step * before  # which underflows where it is all but black
     share = np.divide(after - before, change, out=np.zeros_like(before), where=change > 0)
@@ -338,7 +338,7 @@ def oidn(shot: Shot, *, quality: Quality = "high", prefilter: Quality | None = N
         Number and linear radiance of each frame.
     """
     for number in shot.numbers:
-        yield number, estimate_oidn(shot.read(number), quality=quality, prefilter=prefilter)
+        yield number, denoise_frame_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 
 
 def oidn_then_average(shot: Shot) -> Iterator[tuple[int, Array]]:
@@ -349,7 +349,7 @@ def oidn_then_average(shot: Shot) -> Iterator[tuple[int, Array]]:
 
 
 def _denoised(frame: Frame) -> Frame:
-    return replace(frame, color=estimate_oidn(frame, prefilter="high"), variance=None)
+    return replace(frame, color=denoise_frame_oidn(frame, prefilter="high"), variance=None)
 
 
 def skimage_nlm(shot: Shot) -> Iterator[tuple[int, Array]]:
@@ -446,7 +446,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN best": _aligned("Gated averages", gated_average, source="oidn-best"),
     "gathered": _aligned("Gated averages", gather_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("fast", "bundled"),
-    **{f"network {preset}": _network(preset, mode) for preset, mode in MODE_OF.items()},
+    **{f"network {preset}": _network(preset, mode) for preset, mode in OIDN_MODE_OF_PRESET.items()},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast"),
     "OIDN high": _oidn("high"),

@@ -155,13 +155,13 @@ class ShotHeaders:
         """The smallest window that holds the color of every frame."""
         if self.files.canvas is not None:
             return self.files.canvas
-        windows = []
+        windows, size = [], self.size  # raises for layers that no frame has
         for path in self.files.files.values():
             # A file that cannot be read, or is of another size, raises when it is read for its pixels.
             with suppress(ExrError, OSError):
                 image = self.open(path, pixels=False)
                 part = image.parts[self.layers_in(image).color.part]
-                if display_size(part) == self.size:
+                if display_size(part) == size:
                     windows.append(data_window(part))
         lefts, tops, rights, bottoms = zip(*windows, strict=True)
         canvas = Window(min(lefts), min(tops), max(rights), max(bottoms))

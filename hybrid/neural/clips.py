@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from hybrid.alignment.window import AlignedWindow
-from hybrid.estimates import OIDN_MODES, choose_estimate
 from hybrid.files.shots import Shot
+from hybrid.first_pass import OIDN_MODES, find_first_pass
 from hybrid.neural.denoiser import clean_guides, exposure_of, gain_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.plan import Rules
@@ -56,7 +56,7 @@ def write_clips(
     tiles : int
         Clips of each frame, placed by `network.training.clips.importance`.
     estimate : str
-        Where the estimates come from (`hybrid.estimates.choose_estimate`); not "none".
+        Where the estimates come from (`hybrid.first_pass.find_first_pass`); not "none".
     reference : Shot, optional
         The same frames clean, or some of them: clips are made of these alone, and trained towards them.
     target : Shot, optional
@@ -90,9 +90,9 @@ def write_clips(
     if not numbers:
         what = ", ".join(levels) + ("" if len(every) == len(shots) else " and what they are trained towards")
         raise ValueError(f"levels: expected frames in common, got none in {what} of {name}")
-    sources = [choose_estimate(estimate, shot) for shot in every if shot is not reference]
+    sources = [find_first_pass(estimate, shot) for shot in every if shot is not reference]
     aligners = [
-        FrameStream(shot, Rules(), source.estimates, radius=radius)
+        FrameStream(shot, Rules(), source.first_pass, radius=radius)
         for shot, source in zip((*shots, *([] if target is None else [target])), sources, strict=True)
     ]
     # Beside estimates by OIDN it is there for a second look as well.
@@ -150,7 +150,7 @@ def _level(
     Without the flow to the frame after, if it has one, there is none of ``to_next``.
     """
     aligned = aligner.align(number)
-    if aligned.estimate is None or aligned.residual is None:
+    if aligned.first_pass is None or aligned.residual is None:
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
@@ -164,7 +164,7 @@ def _level(
         "color": tensor_of(color),
         "albedo": tensor_of(np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo)),
         "normal": tensor_of(np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal)),
-        "estimate": tensor_of(aligned.estimate),
+        "estimate": tensor_of(aligned.first_pass),
         "residual": tensor_of(aligned.residual),
         "confidence": tensor_of(aligned.confidence[..., None]),
         "modulation": tensor_of(aligned.modulation[None])[:, 0],

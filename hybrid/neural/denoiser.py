@@ -112,7 +112,7 @@ class Denoiser(WindowDenoiser):
 
     @property
     def quicker(self) -> Callable[..., Array] | None:
-        """What may stand for OIDN where it makes the estimates (`hybrid.estimates.choose_estimate`).
+        """What may stand for OIDN where it makes the estimates (`hybrid.first_pass.find_first_pass`).
 
         Not where "float32" was asked for: then the pictures are OIDN's own.
         """
@@ -179,10 +179,10 @@ class Denoiser(WindowDenoiser):
         """What the network is given of a window, (T, H, W, C) each, and all AOVs side by side."""
         layers = {"confidence": aligned.confidence[..., None]}
         if self.needs_first_pass:
-            if aligned.estimate is None or aligned.residual is None:
+            if aligned.first_pass is None or aligned.residual is None:
                 raise ValueError("estimate: expected those of the frames, as this network takes, got none")
             guides = self._guides(aligned)
-            layers |= {"estimate": aligned.estimate, "residual": aligned.residual} | guides
+            layers |= {"estimate": aligned.first_pass, "residual": aligned.residual} | guides
             layers["modulation"] = aligned.modulation[None]
         else:
             layers["color"] = aligned.mixed(aligned.color)
@@ -201,17 +201,20 @@ class Denoiser(WindowDenoiser):
 
     def _run_tiles(self, aligned: AlignedWindow, layers: dict[str, Array]) -> tuple[Array, Array, Array | None]:
         """Irradiance (H, W, 3); AOVs side by side (H, W, C); with a breakdown the frames' parts (T, H, W, 4)."""
-        own, centre = aligned.own, aligned.centre
+        own, centre = aligned.centre_irradiance, aligned.centre
         frames, height, width = aligned.confidence.shape
         others = layers.get("aovs", np.empty((frames, height, width, 0), np.float32))
         given = {name: layer for name, layer in layers.items() if name != "aovs"}
         facts = {"exposure": exposure_of(aligned).to(self._device)}
-        if aligned.picture is not None:
+        if aligned.centre_first_pass is not None:
             facts["gain"] = gain_of(aligned).to(self._device)
         # Where no tile lies, nobody looks.
         irradiance, filtered = np.zeros_like(own), np.empty_like(others[centre])
         # A picture that is black, as far as numbers go, is left as it is.
-        dark = aligned.picture is not None and measure_exposure(aligned.picture) == 1 > aligned.picture.max()
+        dark = (
+            aligned.centre_first_pass is not None
+            and measure_exposure(aligned.centre_first_pass) == 1 > aligned.centre_first_pass.max()
+        )
         parts = None if self.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Where nothing varies in time nor in space, not even by rounding, the mean is the pixel.
@@ -358,6 +361,6 @@ def exposure_of(aligned: AlignedWindow) -> torch.Tensor:
 
 def gain_of(aligned: AlignedWindow) -> torch.Tensor:
     """What radiance is multiplied by before a trunk's transfer curve, (1,): in training and in running."""
-    if aligned.picture is None:
+    if aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
-    return torch.tensor([measure_gain(aligned.picture)], dtype=torch.float32)
+    return torch.tensor([measure_gain(aligned.centre_first_pass)], dtype=torch.float32)

@@ -5,7 +5,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import PerFrame
+from hybrid.first_pass import PerFrame
 from hybrid.pseudo_reference import FINAL, STANDARD, filter_window
 from tests.hard_cases.hard import (
     MIDDLE,

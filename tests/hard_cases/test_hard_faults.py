@@ -17,10 +17,10 @@ import OpenEXR
 import pytest
 
 from hybrid.cli import main
-from hybrid.estimates import Classical, PerFrame
 from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import Classical, PerFrame
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.plan import STAGES, Rules

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import Classical
+from hybrid.first_pass import Classical
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
 from tests.hard_cases.hard import (
     MIDDLE,

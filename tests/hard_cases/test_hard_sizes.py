@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
-from hybrid.estimates import PerFrame
+from hybrid.first_pass import PerFrame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
 from hybrid.stream import plan_shot
 from tests.flow.scenes import plain

@@ -8,8 +8,8 @@ import numpy as np
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import stage_layers
-from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.stream import FrameStream
 from nlm.average import average
 from tests.scenes import Scene, only
@@ -29,7 +29,7 @@ def align(folder, frames: int = 3) -> AlignedWindow:
 
 def test_the_maps_show_where_geometry_trusts_light_differs_and_the_network_has_changed_something(tmp_path):
     window = align(tmp_path)
-    result = average(window.estimate, window.confidence)
+    result = average(window.first_pass, window.confidence)
     result[30:40, 50:60] *= 3
     maps = stage_layers(window, result)
     assert maps["stage.align"].min() > 0.99  # nothing moves

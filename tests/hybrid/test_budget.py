@@ -8,8 +8,8 @@ import pytest
 
 from hybrid import budget, cli, job
 from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
-from hybrid.estimates import choose_estimate
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import find_first_pass
 from hybrid.job import MEASURED, DenoiseOptions
 from hybrid.plan import Rules
 from hybrid.stabilize import Denoised
@@ -58,7 +58,7 @@ def test_presets_are_measured_in_turn(tmp_path, monkeypatch, estimate):
     monkeypatch.setattr(budget, "SIDE", 16)
     folder = SCENE.write(tmp_path)
     shot, seen = open_shot(folder), []
-    source = choose_estimate(str(folder) if estimate == "sequence" else estimate, shot)
+    source = find_first_pass(str(folder) if estimate == "sequence" else estimate, shot)
 
     def load(preset):
         return Fake(lambda window: seen.append((preset, window.number))), source
@@ -72,7 +72,7 @@ def test_presets_are_measured_in_turn(tmp_path, monkeypatch, estimate):
 
 def test_of_two_frames_that_are_all_both_count(tmp_path):
     shot = open_shot(replace(SCENE, frames=2).write(tmp_path))
-    source = choose_estimate("nlm", shot)
+    source = find_first_pass("nlm", shot)
     # Both pictures are made for the first frame; the second alone would have cost next to nothing.
     measured = measure_presets(shot, Rules(), MEASURED, lambda _: (Fake(lambda window: time.sleep(0.2)), source))
     assert all(m.seconds >= 0.2 for m in measured)

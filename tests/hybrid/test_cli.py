@@ -17,8 +17,8 @@ import typer
 from hybrid.cli import COMMANDS, LazyCommand, main
 from hybrid.commands.options import check_first_pass
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import SPECS
 from hybrid.files.exr import read_exr
+from hybrid.first_pass import SPECS
 from hybrid.records import read_records
 from tests.exr_files import write_layers
 from tests.scenes import Scene
@@ -497,8 +497,10 @@ def test_a_lack_of_memory_is_one_line_whoever_says_so(shot_folder, capsys, monke
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("hybrid.stream.plan_shot", fail)
+    monkeypatch.setattr("hybrid.commands.inspect.plan_shot", fail)
     assert "not enough memory" in one_line_error(capsys, "inspect", shot_folder)
-    monkeypatch.setattr("hybrid.stream.plan_shot", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
+    monkeypatch.setattr(
+        "hybrid.commands.inspect.plan_shot", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug"))
+    )
     with pytest.raises(RuntimeError, match="a bug"):
         main(["inspect", str(shot_folder)])

@@ -12,8 +12,8 @@ from hybrid import pseudo_reference
 from hybrid.alignment.transfer import demodulate, measure_gain
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import PerFrame, choose_estimate
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame, find_first_pass
 from hybrid.oidn import _device
 from hybrid.pseudo_reference import SECOND_LOOK, gated_average, gather_and_denoise
 from hybrid.stabilize import Denoised, FrameDenoiser
@@ -61,7 +61,7 @@ def test_the_gathered_picture_is_denoised_with_the_scale_of_the_whole_frame(tmp_
     for stages, guides in ((STAGES, (None, True)), (STAGES | {"prefilter"}, ("balanced", False))):
         aligned = FrameStream(shot, only(stages), first_pass=PerFrame(truth)).align(MIDDLE)
         result = gather_and_denoise(aligned)
-        gathered = pool_samples(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+        gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
         image, average = (layer * aligned.modulation for layer in (gathered.image, gathered.average))
         np.testing.assert_allclose(given["color"], image, rtol=1e-6)
         np.testing.assert_array_equal(given["albedo"], shot.read(MIDDLE).albedo)
@@ -74,7 +74,7 @@ def test_the_gathered_picture_is_denoised_with_the_scale_of_the_whole_frame(tmp_
 
 def test_five_frames_bring_the_samples_of_nearly_five(tmp_path) -> None:
     aligned = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(truth)).align(MIDDLE)
-    gathered = pool_samples(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+    gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
     inner = np.s_[6:-6, 12:-12]
     assert gathered.samples[inner].mean() > 4.5
     clean = truth(open_shot(tmp_path).read(MIDDLE))
@@ -92,7 +92,7 @@ def test_with_one_seed_for_all_frames_nothing_is_gathered_where_nothing_moves(tm
         aligned = FrameStream(
             shot, only(stages), first_pass=PerFrame(lambda f: still.clean(0)["ViewLayer.Combined"])
         ).align(1003)
-        gathered = pool_samples(aligned.estimate, aligned.residual, aligned.confidence, aligned.exposure)
+        gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
         np.testing.assert_allclose(gathered.samples, samples, rtol=1e-3)
 
 
@@ -101,7 +101,7 @@ def test_missing_neighbours_bring_nothing(tmp_path) -> None:
     first = FrameStream(shot, only(STAGES), first_pass=PerFrame(truth)).align(SCENE.first)
     np.testing.assert_array_equal(first.residual[:2], 0)
     assert np.isfinite(first.residual).all()
-    assert pool_samples(first.estimate, first.residual, first.confidence, first.exposure).samples.max() <= 3.001
+    assert pool_samples(first.first_pass, first.residual, first.confidence, first.exposure).samples.max() <= 3.001
     without = FrameStream(
         shot, only(STAGES), first_pass=PerFrame(lambda f: None if f.number == MIDDLE + 1 else truth(f))
     )
@@ -132,19 +132,19 @@ class TestWithOidn:
     def test_is_better_than_the_gated_average_and_than_oidn(self, tmp_path) -> None:
         shot = open_shot(SCENE.write(tmp_path))
         clean = truth(shot.read(MIDDLE))
-        fast = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
-        best = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn-best", shot).estimates).align(MIDDLE)
+        fast = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn-fast", shot).first_pass).align(MIDDLE)
+        best = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn-best", shot).first_pass).align(MIDDLE)
         gathered = psnr(gather_and_denoise(fast), clean)
         # Measured: 1.4 and 0.9 dB.
         assert gathered > psnr(gated_average(fast), clean) + 0.5
-        assert gathered > psnr(best.estimate[2] * best.modulation, clean) + 0.5
+        assert gathered > psnr(best.first_pass[2] * best.modulation, clean) + 0.5
 
     def test_a_part_of_a_frame_is_what_the_whole_is_there(self, tmp_path) -> None:
         scene = Scene(frames=3, height=448, width=48)
         shot = open_shot(scene.write(tmp_path))
         parts = [
             FrameDenoiser(
-                FrameStream(shot, only(STAGES), radius=1, first_pass=choose_estimate("oidn-fast", shot).estimates),
+                FrameStream(shot, only(STAGES), radius=1, first_pass=find_first_pass("oidn-fast", shot).first_pass),
                 lambda aligned: Denoised(gather_and_denoise(aligned)),
                 rows=rows,
             )

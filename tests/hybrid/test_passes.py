@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybrid.cli import main
-from hybrid.estimates import Classical
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import Classical
 from hybrid.passes import classify_passes, sample_rows
 from hybrid.pseudo_reference import DRAFT
 from hybrid.stream import FrameStream

@@ -16,7 +16,7 @@ from tests.scenes import Scene, denoise_view
 SCENE = Scene(frames=4, noise=0.1)
 FIRST = SCENE.first
 # A frame is made of its own window alone.
-ALONE = Rules(off=frozenset({"steady"}))
+ALONE = Rules(off=frozenset({"stabilize"}))
 
 
 @pytest.fixture

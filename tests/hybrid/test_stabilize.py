@@ -9,10 +9,10 @@ import pytest
 
 from hybrid import stabilize
 from hybrid.alignment.align import Stillness, align_results, measure_stillness
-from hybrid.estimates import PerFrame
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
+from hybrid.first_pass import PerFrame
 from hybrid.pipeline import BESIDE
 from hybrid.plan import Rules
 from hybrid.records import read_records
@@ -23,9 +23,9 @@ from tests.scenes import Scene, denoise_view, only
 MOVING = Scene(frames=7, noise=0.1)
 STILL = replace(MOVING, step=(0, 0))
 MIDDLE = MOVING.first + 3
-ALONE = Rules(off=frozenset({"steady", "mean", "samples"}))
+ALONE = Rules(off=frozenset({"stabilize", "restore-mean", "blend-samples"}))
 # The average of pictures by itself: samples correct nothing.
-STEADY = Rules(off=frozenset({"mean", "samples"}))
+STEADY = Rules(off=frozenset({"restore-mean", "blend-samples"}))
 # Of a denoiser: far below what the gate lets pass (0.004 of the tone curve), far above rounding.
 ERROR = 0.003
 
@@ -218,7 +218,7 @@ def test_one_frame_calls_for_none(tmp_path):
     np.testing.assert_array_equal(
         result.denoised.color, nearly(STILL)(FrameStream(shot, only(())).align(STILL.first)).color
     )
-    assert "steady" not in result.plan.stages
+    assert "stabilize" not in result.plan.stages
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
@@ -345,7 +345,7 @@ class TestInFiles:
         assert begun == [MIDDLE - 1, MIDDLE, MIDDLE + 1]
         header = read_exr(frame.path).parts[0].header
         assert header[BESIDE] == f"{MIDDLE - 1} {MIDDLE + 1}"
-        assert "steady" in header["ravg/stages"].split()
+        assert "stabilize" in header["ravg/stages"].split()
         for n in range(MIDDLE - 3, MIDDLE + 4):  # the picture beside, its window, and one for what shines alone
             assert f"shot.{n}.exr" in header[MADE_FROM]
 
@@ -415,11 +415,11 @@ def test_the_network_makes_its_pictures_so(tmp_path):
         *_, (_, record) = read_records(tmp_path / name)
         return read_exr(tmp_path / name / "shot.1002.exr").pixels(("ViewLayer.Combined.R",)), record
 
-    steady, record = run("steady")
-    alone, other = run("alone", "--no-stages", "steady")
+    steady, record = run("stabilize")
+    alone, other = run("alone", "--no-stages", "stabilize")
     assert np.abs(steady - alone).max() > 1e-4
-    assert "steady" in record["stages"]
-    assert "steady" not in other["stages"]
+    assert "stabilize" in record["stages"]
+    assert "stabilize" not in other["stages"]
 
 
 class TestSamples:
@@ -427,7 +427,7 @@ class TestSamples:
 
     @staticmethod
     def blurred(aligned):
-        return Denoised(cv2.blur(aligned.own * aligned.modulation, (5, 5)))
+        return Denoised(cv2.blur(aligned.centre_irradiance * aligned.modulation, (5, 5)))
 
     def test_a_shot_without_noise_stays_as_it_is(self, tmp_path):
         scene = MOVING  # equal frames may be one seed's: these tell nothing
@@ -436,7 +436,7 @@ class TestSamples:
         wanted = truth(scene, MIDDLE)
         result = made(shot, self.blurred, rules=Rules())
         np.testing.assert_allclose(result[inside], wanted[inside], rtol=0.01)
-        off = made(shot, self.blurred, rules=Rules(off=frozenset({"samples"})))
+        off = made(shot, self.blurred, rules=Rules(off=frozenset({"blend-samples"})))
         assert np.abs(off[inside] / wanted[inside] - 1).max() > 0.1
 
     @pytest.mark.parametrize("noise", [1.0, 0.3, 0.1, 0.03, 0.01, 0.003])
@@ -480,7 +480,7 @@ class TestSamples:
         blind = PerFrame(lambda frame: cv2.medianBlur(np.ascontiguousarray(frame.color), 5))
 
         def median(aligned):
-            return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.own * aligned.modulation), 5))
+            return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.centre_irradiance * aligned.modulation), 5))
 
         result = made(shot, median, number, Rules(), first_pass=blind)
         rows, columns = (flakes + np.array([14, 0])).T

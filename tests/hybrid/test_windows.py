@@ -8,10 +8,10 @@ import pytest
 from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
-from hybrid.estimates import PerFrame
 from hybrid.files import reader as reader_module
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.plan import DENOISED, NOISY, STAGES, Rules
 from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
 from hybrid.records import read_records
@@ -164,7 +164,7 @@ def test_a_lamp_that_estimates_have_lost_has_its_light_once(tmp_path, step):
 
     made, dark = run("lit", lit, Rules()), run("dark", None, Rules())
     at = 20 + 2 * step[1], 30 + 2 * step[0]
-    assert run("off", lit, Rules(off=frozenset({"fireflies", "samples"})))[at] < 6
+    assert run("off", lit, Rules(off=frozenset({"fireflies", "blend-samples"})))[at] < 6
     assert made[at] == pytest.approx(500, rel=2e-3)
     around = np.s_[at[0] - 4 : at[0] + 5, at[1] - 4 : at[1] + 5]
     assert made[around].sum() == pytest.approx(500 + dark[around].sum(), rel=0.01)

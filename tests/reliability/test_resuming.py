@@ -83,10 +83,10 @@ class Project:
 
     def write(self, frames: int) -> None:
         shot(self.frames, frames, step=(2, 1), **RAW)
-        blurred(self.estimates, self.frames)
+        blurred(self.first_pass, self.frames)
 
     def run(self, out: Path, *more: object) -> Done:
-        return ravg("pseudoref", self.frames, "-o", out, *DRAFT, "--estimate", self.estimates, *more).succeeds()
+        return ravg("pseudoref", self.frames, "-o", out, *DRAFT, "--estimate", self.first_pass, *more).succeeds()
 
     def resumes_as_fresh(self, *more: object) -> None:
         """Assert that --resume leaves what a run into an empty folder makes."""
@@ -102,10 +102,10 @@ CHANGES: dict[str, Callable[[Project], object]] = {
     "the last frame rendered again, of the same time": lambda p: render_again(p.frame(1008)),
     "two frames swapped": lambda p: exchange(p.frame(1003), p.frame(1006)),
     "a frame that is gone": lambda p: p.frame(1008).unlink(),
-    "estimates made again": lambda p: [render_again(x, later()) for x in p.estimates.iterdir()],
-    "an older estimate": lambda p: render_again(p.estimates / "shot.1004.exr", 1e9),
-    "an estimate of the same time and size": lambda p: render_again(p.estimates / "shot.1004.exr"),
-    "noisy frames as estimates": lambda p: [shutil.copy2(x, p.estimates / x.name) for x in p.frames.iterdir()],
+    "estimates made again": lambda p: [render_again(x, later()) for x in p.first_pass.iterdir()],
+    "an older estimate": lambda p: render_again(p.first_pass / "shot.1004.exr", 1e9),
+    "an estimate of the same time and size": lambda p: render_again(p.first_pass / "shot.1004.exr"),
+    "noisy frames as estimates": lambda p: [shutil.copy2(x, p.first_pass / x.name) for x in p.frames.iterdir()],
     "an output that is another frame's": lambda p: shutil.copy2(p.out / "shot.1005.exr", p.out / "shot.1004.exr"),
     "an output cut short": lambda p: os.truncate(p.out / "shot.1004.exr", 3000),
     "an empty output": lambda p: os.truncate(p.out / "shot.1004.exr", 0),
@@ -168,7 +168,7 @@ def test_resume_says_why(folder):
     project = Project(folder)
     project.write(5)
     project.run(project.out)
-    render_again(project.estimates / "shot.1003.exr", 1e9)
+    render_again(project.first_pass / "shot.1003.exr", 1e9)
     said = project.run(project.out, "--resume").said
     assert "made again" in said
     assert "shot.1003.exr" in said
@@ -182,7 +182,7 @@ def test_resume_leaves_alone_what_is_the_same(folder, elsewhere):
     stamps = {path: path.stat().st_mtime_ns for path in project.out.glob("*.exr")}
     if elsewhere:
         (folder / "elsewhere").mkdir()
-        for path in (project.frames, project.estimates):
+        for path in (project.frames, project.first_pass):
             path.rename(folder / "elsewhere" / path.name)
     Project(folder / "elsewhere" if elsewhere else folder).run(project.out, "--resume")
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}

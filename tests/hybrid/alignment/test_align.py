@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid.alignment.transfer import ALBEDO_FLOOR
-from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
@@ -26,7 +26,7 @@ def test_estimates_are_aligned_as_the_frames_are(tmp_path):
     aligned = window(SCENE.write(tmp_path / "noisy"), first_pass=source)
     layers = SCENE.clean(2)
     light = layers["ViewLayer.Combined"] / (layers["ViewLayer.Denoising Albedo"] + ALBEDO_FLOOR)
-    for estimate, confidence in zip(aligned.estimate, aligned.confidence, strict=True):
+    for estimate, confidence in zip(aligned.first_pass, aligned.confidence, strict=True):
         sure = confidence > 0.5
         assert sure.mean() > 0.5
         # Whole-pixel vectors: nothing is interpolated; files are float32.

@@ -13,10 +13,10 @@ import pytest
 from hybrid.alignment.prepare import prepare
 from hybrid.alignment.unfiltered import find_region, mirror_region, split_unfiltered
 from hybrid.cli import main
-from hybrid.estimates import PerFrame
 from hybrid.files.exr import HALF_MAX, read_exr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average
 from hybrid.stabilize import Denoised, FrameDenoiser
@@ -225,7 +225,7 @@ class TestRegion:
         shot = open_shot(scene.write(tmp_path, edit=crop))
         blur = PerFrame(lambda frame: cv2.blur(frame.color, (7, 7)))
         maker = FrameDenoiser(
-            FrameStream(shot, Rules(off=frozenset({"mean", "samples"})), first_pass=blur),
+            FrameStream(shot, Rules(off=frozenset({"restore-mean", "blend-samples"})), first_pass=blur),
             lambda aligned: Denoised(gated_average(aligned)),
         )
         color = maker.make(scene.first + 1).denoised.color

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid.estimates import PerFrame
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.stream import FrameStream
 from nlm.average import replace_nonfinite
 from tests.scenes import Scene, only
@@ -66,7 +66,7 @@ def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
         np.testing.assert_array_equal(own, getattr(alone, name))
         np.testing.assert_array_equal(layer[2], own)
         np.testing.assert_array_equal(layer[3], own)  # a frame that is missing
-        sure = aligned.trust[1] > 0.9
+        sure = aligned.geometric_confidence[1] > 0.9
         assert sure.mean() > 0.5
         # Whole-pixel vectors: nothing is interpolated.
         np.testing.assert_allclose(layer[1][sure], own[sure], atol=1e-5)

@@ -337,7 +337,7 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
         for folder in folders:
             out = tmp_path / f"{folder.name}{passes}"
             options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--stages", "warp"]
-            code = run("denoise", folder, "-o", out, "--passes", passes, "--no-stages", "refine,steady", *options)
+            code = run("denoise", folder, "-o", out, "--passes", passes, "--no-stages", "refine,stabilize", *options)
             assert code == 0, capsys.readouterr().err
             left = {item.name for item in out.iterdir()}  # nothing of the first pass
             assert left == {"ravg", *(f"shot.{number}.exr" for number in (1001, 1002, 1003))}

@@ -93,10 +93,10 @@ class TestMaps:
     def test_estimates_of_side_frames_are_contributions_of_theirs(self, shot: Shot) -> None:
         aligned = self.aligned(shot, 0.0)
         aligned = replace(aligned, estimate=np.repeat(aligned.color[1:2], 3, axis=0))
-        alone = window_maps(aligned, lambda window: average(window.estimate, window.confidence))
+        alone = window_maps(aligned, lambda window: average(window.first_pass, window.confidence))
         assert alone["Temporal contribution"].max() == 0
         trusted = replace(aligned, confidence=np.ones_like(aligned.confidence))
-        maps = window_maps(trusted, lambda window: average(window.estimate, window.confidence))
+        maps = window_maps(trusted, lambda window: average(window.first_pass, window.confidence))
         np.testing.assert_allclose(maps["Temporal contribution"], 2 / 3, atol=2e-4)
 
 
@@ -110,8 +110,8 @@ def test_methods_are_told_apart_by_names_that_a_command_line_can_list() -> None:
 
 
 def test_a_missing_estimate_makes_a_method_absent(shot: Shot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from hybrid import estimates
+    from hybrid import first_pass
 
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: "pyoidn is not installed")
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: "pyoidn is not installed")
     with pytest.raises(ImportError, match="pyoidn is not installed"):
         next(METHODS["gated OIDN"].run(shot))

@@ -9,9 +9,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hybrid import estimates, pseudo_reference
-from hybrid.estimates import Classical, choose_estimate
+from hybrid import first_pass, pseudo_reference
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import Classical, find_first_pass
 from hybrid.neural import clips as module
 from hybrid.neural import denoiser
 from hybrid.neural.clips import write_clips
@@ -88,12 +88,12 @@ def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_p
 def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path, monkeypatch):
     found: list[Clip] = []
     monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
     monkeypatch.setattr(pseudo_reference, "denoise_oidn", lambda color, *_, **__: 0.25 * color)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
     write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="oidn-fast")
-    window = FrameStream(shot, Rules(), first_pass=choose_estimate("oidn-fast", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, Rules(), first_pass=find_first_pass("oidn-fast", shot).first_pass).align(MIDDLE)
     image = found[0].pseudo_reference[0].permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(image, gather_and_denoise(window))
     assert np.abs(image - gated_average(window)).max() > 0.01 * image.mean()

@@ -10,8 +10,8 @@ from tests.scenes import Scene, only
 torch = pytest.importorskip("torch")
 
 from hybrid.breakdown import Breakdown  # noqa: E402
-from hybrid.estimates import Classical  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
+from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural.denoiser import Denoiser  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
@@ -237,7 +237,7 @@ def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, we
     assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
     parts, whole = sum(denoised.extra[f"contribution.{name}"] for name in names), denoised.color
     if weights.stem == "fast":  # whose pictures are made of what the frames give together
-        gathered = pool_samples(window.estimate, window.residual, window.confidence, window.exposure)
+        gathered = pool_samples(window.first_pass, window.residual, window.confidence, window.exposure)
         whole = gathered.image * window.modulation
     np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
     shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])

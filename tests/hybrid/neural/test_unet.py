@@ -13,9 +13,9 @@ torch = pytest.importorskip("torch")
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import OIDN_MODES, choose_estimate, estimate_oidn
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import OIDN_MODES, denoise_frame_oidn, find_first_pass
 from hybrid.neural import denoiser, unet
 from hybrid.neural.unet import denoise_bundled, denoise_unet
 from hybrid.stream import FrameStream
@@ -41,8 +41,8 @@ def test_is_the_picture_of_oidn(frame, mode, guides) -> None:
     layers = [frame.albedo, frame.normal][:guides] + [None] * (2 - guides)
     plain = Frame(1002, frame.color, *layers)
     settings = OIDN_MODES[mode]
-    expected = estimate_oidn(plain, **settings)
-    result = estimate_oidn(plain, denoise_unet, **settings)
+    expected = denoise_frame_oidn(plain, **settings)
+    result = denoise_frame_oidn(plain, denoise_unet, **settings)
     assert result.shape == expected.shape
     # Another network's picture is 35 to 45 dB away; 60 was measured here.
     assert psnr(result, expected) > 52
@@ -61,14 +61,14 @@ def test_what_comes_with_ravg_stands_for_each_quality_of_oidn(frame) -> None:
 
 def test_clean_guides_are_declared_so(frame) -> None:
     settings = {"quality": "high", "prefilter": None, "clean": True}
-    assert psnr(estimate_oidn(frame, denoise_unet, **settings), estimate_oidn(frame, **settings)) > 52
+    assert psnr(denoise_frame_oidn(frame, denoise_unet, **settings), denoise_frame_oidn(frame, **settings)) > 52
 
 
 def test_tiles_do_not_show(frame, monkeypatch) -> None:
     tall = Frame(1, *(np.tile(layer, (5, 1, 1)) for layer in (frame.color, frame.albedo, frame.normal)))
-    whole = estimate_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
+    whole = denoise_frame_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
     monkeypatch.setattr(unet, "TILE", 64)
-    parts = estimate_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
+    parts = denoise_frame_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
     # Exact but for the order of sums in bfloat16.
     assert psnr(parts, whole) > 70
 
@@ -81,12 +81,12 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
         calls.append(mode)
         return color
 
-    source = choose_estimate("auto", shot, mode="oidn-fast", quicker=quicker)
+    source = find_first_pass("auto", shot, mode="oidn-fast", quicker=quicker)
     assert "torch" in source.reason
-    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=source.estimates).align(1002)
+    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=source.first_pass).align(1002)
     assert calls == [{"quality": "fast"}]
-    named = choose_estimate("oidn-fast", shot, quicker=quicker)
-    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=named.estimates).align(1002)
+    named = find_first_pass("oidn-fast", shot, quicker=quicker)
+    FrameStream(shot, only({"demodulate"}), radius=0, first_pass=named.first_pass).align(1002)
     assert len(calls) == 1
 
 

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("torch")
 
 from hybrid.comparison.metrics import mean_bias, psnr
-from hybrid.estimates import MODE_OF, Classical
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import OIDN_MODE_OF_PRESET, Classical
 from hybrid.neural.denoiser import Denoiser
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
@@ -50,7 +50,7 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
     assert final > robust + 2
 
 
-@pytest.mark.parametrize("preset", [*MODE_OF, "tkpcn"])
+@pytest.mark.parametrize("preset", [*OIDN_MODE_OF_PRESET, "tkpcn"])
 def test_weights_reach_what_their_card_says(reference, preset):
     path = shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")

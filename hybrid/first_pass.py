@@ -46,7 +46,7 @@ SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
 # What "auto" takes of them for a preset of the network, which looks at the samples again: what the first look is
 # matters little. With "oidn" `fast`, which keeps half of it, gains 0.2 dB, and 0.2 in time, on eight validation shots,
 # and takes 1.49 to 1.56 times OIDN's high mode where 1.5 is the bound; the two others gain next to nothing.
-MODE_OF = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
+OIDN_MODE_OF_PRESET = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
 
 
 @dataclass(frozen=True)
@@ -140,14 +140,14 @@ class Classical:
 
 
 @dataclass(frozen=True)
-class EstimateSource:
+class FirstPassSource:
     """Where the estimates of a shot come from.
 
     Attributes
     ----------
     name : str
         What was taken; written to the header of the output.
-    estimates : FirstPass or None
+    first_pass : FirstPass or None
         For a `FrameStream`; None for none.
     reason : str
         Why this one.
@@ -160,14 +160,14 @@ class EstimateSource:
     """
 
     name: str
-    estimates: FirstPass | None
+    first_pass: FirstPass | None
     reason: str
     files: Shot | None = None
     kept: tuple[Path, ...] = ()
     device: str | None = None
 
 
-def choose_estimate(
+def find_first_pass(
     spec: str,
     shot: Shot,
     *,
@@ -178,7 +178,7 @@ def choose_estimate(
     quicker: Callable[..., Array] | None = None,
     bundled: Callable[..., Array] | None = None,
     device: str = "cpu",
-) -> EstimateSource:
+) -> FirstPassSource:
     """Find the estimates that are asked for.
 
     Parameters
@@ -209,7 +209,7 @@ def choose_estimate(
 
     Returns
     -------
-    EstimateSource
+    FirstPassSource
 
     Raises
     ------
@@ -237,21 +237,21 @@ def _choose(
     quicker: Callable[..., Array] | None,
     bundled: Callable[..., Array] | None,
     device: str,
-) -> EstimateSource:
+) -> FirstPassSource:
     if spec == "auto":
         if shot.layers(shot.numbers[0]).estimate is not None:
-            return EstimateSource("file", PerFrame(_from_file), "the file holds a denoised picture")
+            return FirstPassSource("file", PerFrame(_from_file), "the file holds a denoised picture")
         if (lacking := why_no_oidn()) is None:
             if quicker is not None and find_device(device) == "cpu":
                 return _oidn(mode, keep, "OIDN is installed; its networks run in torch", "cpu", quicker)
             return _oidn(mode, keep, "OIDN is installed", device)
         if bundled is not None:
             return _bundled(mode, bundled, f"{lacking}; a network comes with ravg")
-        return EstimateSource("nlm", Classical(own), f"no denoised picture in the file, and {lacking}")
+        return FirstPassSource("nlm", Classical(own), f"no denoised picture in the file, and {lacking}")
     if spec == "none":
-        return EstimateSource("none", None, "asked for")
+        return FirstPassSource("none", None, "asked for")
     if spec == "nlm":
-        return EstimateSource("nlm", Classical(own), "asked for")
+        return FirstPassSource("nlm", Classical(own), "asked for")
     if spec == "bundled":
         if bundled is None:
             raise ImportError("estimate bundled: torch is needed, which this command does without; expected another")
@@ -272,12 +272,12 @@ def _choose(
         raise ValueError(f"estimate {spec}: it {grade.message}, expected pictures of the shot's own light")
     factors, why = (None, "asked for") if grade is None else (grade.factors, f"it {grade.message}: brought to that")
     read = PerFrame(partial(_read_sequence, sequence, factors), files=sequence)
-    return EstimateSource("sequence", read, why, sequence)
+    return FirstPassSource("sequence", read, why, sequence)
 
 
-def _bundled(mode: str, run: Callable[..., Array], reason: str) -> EstimateSource:
+def _bundled(mode: str, run: Callable[..., Array], reason: str) -> FirstPassSource:
     quality = OIDN_MODES[mode]["quality"]
-    return EstimateSource("bundled", PerFrame(partial(estimate_oidn, denoise=run, quality=quality)), reason)
+    return FirstPassSource("bundled", PerFrame(partial(denoise_frame_oidn, denoise=run, quality=quality)), reason)
 
 
 def _oidn(
@@ -286,7 +286,7 @@ def _oidn(
     reason: str,
     device: str,
     quicker: Callable[..., Array] | None = None,
-) -> EstimateSource:
+) -> FirstPassSource:
     device = find_device(device)
     run: Callable[..., Array] = partial(_run_mode, mode, denoise=quicker or partial(denoise_oidn, device=device))
     kept = None if keep is None else keep(mode, quicker is not None, device)
@@ -296,7 +296,7 @@ def _oidn(
     holds = most if quicker is None else 0  # networks in torch work on a strip at a time
     estimates = GuideAware(run, holds) if mode == "oidn-clean" else PerFrame(run, holds)
     places = () if kept is None else tuple(kept.places.values())
-    return EstimateSource(mode, estimates, reason, kept=places, device=device)
+    return FirstPassSource(mode, estimates, reason, kept=places, device=device)
 
 
 class Kept:
@@ -309,7 +309,7 @@ class Kept:
     spec : str
         Where they are: a pattern or a folder; those of one of several pictures in a folder of its own there.
     forced : str
-        As for `choose_estimate`.
+        As for `find_first_pass`.
     mode : str
         A key of `OIDN_MODES`.
     quicker : bool
@@ -365,7 +365,7 @@ def _folder_name(picture: str) -> str:
 def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array]) -> Array:
     """Run a mode of OIDN; guides without noise are declared clean as they are."""
     settings = OIDN_MODES[mode] if noisy_guides else {**OIDN_MODES[mode], "prefilter": None, "clean": True}
-    return estimate_oidn(frame, denoise, **settings)
+    return denoise_frame_oidn(frame, denoise, **settings)
 
 
 def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:
@@ -392,7 +392,7 @@ def _from_file(frame: Frame) -> Array | None:
     return frame.estimate
 
 
-def estimate_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
+def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
     """Run OIDN, or what stands for it, on a frame with what guides it has.
 
     Parameters

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from hybrid.beside import ReadAhead
 from hybrid.files.frame import Frame
+from hybrid.prefetch import Prefetcher
 from hybrid.runtime.timing import Timings
 
 
@@ -40,7 +40,7 @@ def thread():
 
 def test_the_next_one_is_read_without_being_asked_for_and_no_further(thread):
     told = Told()
-    frames = ReadAhead(told, thread, Timings())
+    frames = Prefetcher(told, thread, Timings())
     frames.expect([1, 2, 3, 4])
     assert frames.read(1).number == 1
     assert told.begun[2].wait(60)
@@ -53,7 +53,7 @@ def test_the_next_one_is_read_without_being_asked_for_and_no_further(thread):
 
 def test_what_was_asked_for_before_is_not_read_ahead_again(thread):
     told = Told()
-    frames = ReadAhead(told, thread, Timings())
+    frames = Prefetcher(told, thread, Timings())
     frames.expect([1, 2, 3])
     for number in (1, 2, 3):
         frames.read(number)
@@ -66,7 +66,7 @@ def test_what_was_asked_for_before_is_not_read_ahead_again(thread):
 def test_one_before_it_leaves_what_was_read_ahead(thread):
     """Fireflies of a frame are told by the one before it too."""
     told = Told()
-    frames = ReadAhead(told, thread, Timings())
+    frames = Prefetcher(told, thread, Timings())
     frames.expect([3, 4])
     assert [frames.read(number).number for number in (3, 2, 4)] == [3, 2, 4]
     assert told.read_so_far == [3, 4, 2]
@@ -74,7 +74,7 @@ def test_one_before_it_leaves_what_was_read_ahead(thread):
 
 def test_what_was_read_for_nothing_is_let_go(thread):
     told = Told()
-    frames = ReadAhead(told, thread, Timings())
+    frames = Prefetcher(told, thread, Timings())
     frames.expect([1, 2])
     frames.read(1)
     assert frames.read(6).number == 6
@@ -85,7 +85,7 @@ def test_what_was_read_for_nothing_is_let_go(thread):
 
 
 def test_an_error_comes_when_the_frame_is_asked_for_and_each_time(thread):
-    frames = ReadAhead(Told(damaged={2}), thread, Timings())
+    frames = Prefetcher(Told(damaged={2}), thread, Timings())
     frames.expect([1, 2, 3])
     assert frames.read(1).number == 1
     for _ in range(2):
@@ -96,7 +96,7 @@ def test_an_error_comes_when_the_frame_is_asked_for_and_each_time(thread):
 
 def test_it_is_the_shot_otherwise_and_says_what_it_costs(thread):
     timings = Timings()
-    frames = ReadAhead(Told(), thread, timings)
+    frames = Prefetcher(Told(), thread, timings)
     assert (frames.numbers, frames.step, frames.shape) == (Told.numbers, 1, (2, 2))
     assert frames.has(8)
     assert not frames.has(9)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid import estimates
+from hybrid import first_pass
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.estimates import Classical, GuideAware, PerFrame, choose_estimate
 from hybrid.files import sources
 from hybrid.files.reader import ShotReader
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import Classical, GuideAware, PerFrame, find_first_pass
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
 from hybrid.records import read_records
 from hybrid.stream import FrameStream, plan_shot
@@ -43,7 +43,7 @@ def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
 
     aligner = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(estimate))
     for number in aligner.shot.numbers:
-        assert aligner.align(number).estimate.shape == (5, SCENE.height, SCENE.width, 3)
+        assert aligner.align(number).first_pass.shape == (5, SCENE.height, SCENE.width, 3)
     assert sorted(asked) == list(aligner.shot.numbers)
 
 
@@ -52,7 +52,7 @@ def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_f
     sliding = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT))
     windows = [sliding.align(number) for number in shot.numbers]
     alone = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE)
-    np.testing.assert_array_equal(windows[2].estimate, alone.estimate)
+    np.testing.assert_array_equal(windows[2].first_pass, alone.first_pass)
     np.testing.assert_array_equal(gated_average(windows[2]), gated_average(alone))
 
 
@@ -89,8 +89,8 @@ def test_a_denoiser_is_told_whether_guides_hold_noise(tmp_path, stages):
 
 def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: calls.append(mode) or color)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **mode: calls.append(mode) or color)
     shot = open_shot(SCENE.write(tmp_path))
     best = {"quality": "high", "prefilter": "high"}
     for mode, noisy, clean in (
@@ -101,7 +101,7 @@ def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
     ):
         for stages, expected in ((STAGES | {"prefilter"}, noisy), (STAGES, clean)):
             calls.clear()
-            FrameStream(shot, only(stages), radius=0, first_pass=choose_estimate(mode, shot).estimates).align(MIDDLE)
+            FrameStream(shot, only(stages), radius=0, first_pass=find_first_pass(mode, shot).first_pass).align(MIDDLE)
             assert calls == [{**expected, "device": "cpu"}]
 
 
@@ -124,7 +124,7 @@ def test_frames_needed_are_those_that_are_read(tmp_path):
 def test_the_centres_estimate_comes_through_unchanged(tmp_path):
     window = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(flickering)).align(MIDDLE)
     given = flickering(open_shot(tmp_path).read(MIDDLE))
-    np.testing.assert_allclose(window.estimate[2] * window.modulation, given, rtol=1e-6)
+    np.testing.assert_allclose(window.first_pass[2] * window.modulation, given, rtol=1e-6)
 
 
 def test_where_colors_agree_geometry_cannot_take_all_trust_away(tmp_path):
@@ -158,7 +158,7 @@ def test_flicker_is_averaged_away(tmp_path):
         # Errors of one factor per frame are all that differs; the gate is wide, as the frames are noisy.
         window = aligner.align(MIDDLE)
         truth = SCENE.clean(2)["ViewLayer.Combined"]
-        before = np.mean((window.estimate[2] * window.modulation - truth) ** 2)
+        before = np.mean((window.first_pass[2] * window.modulation - truth) ** 2)
         gain.append((before, np.mean((gated_average(window) - truth) ** 2)))
     before, after = np.mean(gain, axis=0)
     assert after < before / 2.5
@@ -232,51 +232,51 @@ def denoised(index, layers):
 def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeypatch):
     plain = open_shot(SCENE.write(tmp_path / "plain"))
     cycles = open_shot(SCENE.write(tmp_path / "cycles", edit=denoised))
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    assert choose_estimate("auto", cycles).name == "file"
-    assert choose_estimate("auto", plain).name == "oidn-clean"
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: "pyoidn is not installed")
-    source = choose_estimate("auto", plain, own=STANDARD)
-    assert (source.name, source.estimates) == ("nlm", Classical(STANDARD))
-    assert choose_estimate("none", plain).estimates is None
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    assert find_first_pass("auto", cycles).name == "file"
+    assert find_first_pass("auto", plain).name == "oidn-clean"
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: "pyoidn is not installed")
+    source = find_first_pass("auto", plain, own=STANDARD)
+    assert (source.name, source.first_pass) == ("nlm", Classical(STANDARD))
+    assert find_first_pass("none", plain).first_pass is None
     with pytest.raises(ImportError, match="pyoidn is not installed"):
-        choose_estimate("oidn-fast", plain)
+        find_first_pass("oidn-fast", plain)
 
 
 def test_what_cycles_has_denoised_is_taken_and_stays_what_it_is_at_the_centre(tmp_path):
     shot = open_shot(SCENE.write(tmp_path, edit=denoised))
-    window = FrameStream(shot, only(STAGES), first_pass=choose_estimate("auto", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES), first_pass=find_first_pass("auto", shot).first_pass).align(MIDDLE)
     truth = SCENE.clean(2)["ViewLayer.Combined"]
-    np.testing.assert_allclose(window.estimate[2] * window.modulation, truth, rtol=1e-5)
+    np.testing.assert_allclose(window.first_pass[2] * window.modulation, truth, rtol=1e-5)
 
 
 def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     SCENE.write(tmp_path / "clean", clean=True, without={"Vector", "Depth"})
-    source = choose_estimate(str(tmp_path / "clean" / "shot.####.exr"), shot)
-    window = FrameStream(shot, only(STAGES), first_pass=source.estimates).align(MIDDLE)
+    source = find_first_pass(str(tmp_path / "clean" / "shot.####.exr"), shot)
+    window = FrameStream(shot, only(STAGES), first_pass=source.first_pass).align(MIDDLE)
     assert psnr(gated_average(window), SCENE.clean(2)["ViewLayer.Combined"]) > 50
     replace(SCENE, frames=2).write(tmp_path / "short", clean=True)
     with pytest.raises(ValueError, match=f"expected frame {MIDDLE}, which the shot has"):
-        choose_estimate(str(tmp_path / "short" / "shot.####.exr"), shot)
+        find_first_pass(str(tmp_path / "short" / "shot.####.exr"), shot)
     with pytest.raises(FileNotFoundError):
-        choose_estimate(str(tmp_path / "nothing.####.exr"), shot)
+        find_first_pass(str(tmp_path / "nothing.####.exr"), shot)
 
 
 def test_of_a_sequence_that_cycles_has_denoised_the_denoised_picture_is_taken(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     SCENE.write(tmp_path / "cycles", edit=denoised)
-    source = choose_estimate(str(tmp_path / "cycles"), shot)
-    np.testing.assert_array_equal(source.estimates.function(shot.read(MIDDLE)), SCENE.clean(2)["ViewLayer.Combined"])
+    source = find_first_pass(str(tmp_path / "cycles"), shot)
+    np.testing.assert_array_equal(source.first_pass.function(shot.read(MIDDLE)), SCENE.clean(2)["ViewLayer.Combined"])
 
 
 def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
-    sources = [choose_estimate("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
-    images = [source.estimates.function(shot.read(MIDDLE)) for source in sources]
+    sources = [find_first_pass("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
+    images = [source.first_pass.function(shot.read(MIDDLE)) for source in sources]
     assert len(made) == 1
     assert (tmp_path / f"kept.{MIDDLE}.exr").is_file()
     np.testing.assert_array_equal(images[0], images[1])
@@ -286,14 +286,14 @@ def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
 def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_path, monkeypatch):
     """Whatever file was there was taken: of another mode, of other frames, of other guides, or none of ours."""
     made = []
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: made.append(mode) or 0.5 * color)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **mode: made.append(mode) or 0.5 * color)
     folder, kept = SCENE.write(tmp_path / "noisy"), tmp_path / "kept"
 
     def run(mode="oidn", **more):
         before = len(made)
         shot = open_shot(folder, **more.pop("opened", {}))
-        choose_estimate(mode, shot, kept=str(kept), **more).estimates.function(shot.read(MIDDLE))
+        find_first_pass(mode, shot, kept=str(kept), **more).first_pass.function(shot.read(MIDDLE))
         return len(made) - before
 
     assert [run(), run()] == [1, 0]
@@ -317,8 +317,8 @@ def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_pa
 
 def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkeypatch, capfd):
     """They took the place of the output, frame by frame, and the output theirs."""
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(estimates, "denoise_oidn", lambda color, *_, **mode: 0.5 * color)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **mode: 0.5 * color)
     folder, out = SCENE.write(tmp_path / "noisy"), tmp_path / "out"
     words = ["pseudoref", str(folder), "-o", str(out), "--estimate", "oidn", "--keep-estimates"]
     for place in (out, tmp_path / "noisy" / ".." / "out", out / "shot.%04d.exr"):
@@ -331,27 +331,27 @@ def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkey
 
 def test_pictures_are_kept_in_a_file_each(tmp_path, monkeypatch):
     """Also where one frame was asked for: its neighbours are denoised as well."""
-    monkeypatch.setattr(estimates, "why_no_oidn", lambda: None)
+    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
     folder, one = SCENE.write(tmp_path), str(tmp_path / "kept.exr")
     with pytest.raises(ValueError, match=r"kept\.exr' names one file for 5 frames, expected OUT\.####\.exr"):
-        choose_estimate("oidn", open_shot(folder, frames=str(MIDDLE)), kept=one)
+        find_first_pass("oidn", open_shot(folder, frames=str(MIDDLE)), kept=one)
     alone = open_shot(folder / f"shot.{MIDDLE}.exr")
-    assert choose_estimate("oidn", alone, kept=one).reason == "asked for"
+    assert find_first_pass("oidn", alone, kept=one).reason == "asked for"
 
 
 def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy", edit=denoised))
     for spec in ("auto", "nlm", "none", str(tmp_path / "noisy")):
-        assert "nothing of it is kept" in choose_estimate(spec, shot, kept=str(tmp_path / "kept")).reason
-        assert "kept" not in choose_estimate(spec, shot).reason
+        assert "nothing of it is kept" in find_first_pass(spec, shot, kept=str(tmp_path / "kept")).reason
+        assert "kept" not in find_first_pass(spec, shot).reason
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_estimates_come_out_stable(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
-    window = FrameStream(shot, only(STAGES), first_pass=choose_estimate("oidn", shot).estimates).align(MIDDLE)
+    window = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn", shot).first_pass).align(MIDDLE)
     truth = SCENE.clean(2)["ViewLayer.Combined"]
-    alone, stable = psnr(window.estimate[2] * window.modulation, truth), psnr(gated_average(window), truth)
+    alone, stable = psnr(window.first_pass[2] * window.modulation, truth), psnr(gated_average(window), truth)
     assert stable > alone > psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)
 
 

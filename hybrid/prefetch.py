@@ -10,7 +10,7 @@ from hybrid.files.frame import Frame, Frames
 from hybrid.runtime.timing import Timings
 
 
-class ReadAhead:
+class Prefetcher:
     """The frames of a shot, of which one is read ahead in a thread.
 
     Parameters
