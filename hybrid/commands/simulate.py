@@ -1,9 +1,8 @@
-"""`ravg simulate`: make shots with Cycles."""
+"""`ravg simulate`: render shots with Cycles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,9 +11,9 @@ import typer
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import INPUT, OUTPUT, RESOURCES, WHAT, usage
-from hybrid.simulate.run import missing, parse_center, parse_numbers, parse_size, read_meta, shots_of
+from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
+from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
 
 
 def simulate(
@@ -36,18 +35,20 @@ def simulate(
     frames: Annotated[
         str, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2", rich_help_panel=INPUT)
     ] = "1-7",
-    size: Annotated[str, typer.Option(metavar="WxH", help="of what is rendered", rich_help_panel=WHAT)] = "320x180",
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="pixels of the rendered image", rich_help_panel=WHAT)
+    ] = "320x180",
     film: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="of the whole camera; what is rendered is a crop of it", rich_help_panel=WHAT),
+        typer.Option(metavar="WxH", help="pixels of the whole camera, of which --size is a crop", rich_help_panel=WHAT),
     ] = None,
     center: Annotated[
         str | None,
-        typer.Option(metavar="X,Y", help="of the crop, as fractions, y down", rich_help_panel=WHAT),
+        typer.Option(metavar="X,Y", help="center of the crop in the film, as fractions, y down", rich_help_panel=WHAT),
     ] = None,
     spp: Annotated[
         str,
-        typer.Option(metavar="N", help="samples per pixel, n; as LOW-HIGH drawn for each shot", rich_help_panel=WHAT),
+        typer.Option(metavar="N", help="samples per pixel, n; LOW-HIGH: drawn for each shot", rich_help_panel=WHAT),
     ] = "16",
     levels: Annotated[
         str, typer.Option(help="noise levels, such as n,n/e,4 or noisy=n", rich_help_panel=WHAT)
@@ -57,30 +58,34 @@ def simulate(
         typer.Option(min=0, metavar="SPP", help="samples per pixel of a reference; 0: none", rich_help_panel=WHAT),
     ] = 0,
     reference_frames: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="of these alone, such as 1,4,7", rich_help_panel=WHAT)
+        str | None,
+        typer.Option(
+            metavar="NUMBERS", help="frames with a reference, such as 1,4,7; default: all", rich_help_panel=WHAT
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="all that is random comes from it", rich_help_panel=INPUT)] = 1,
+    seed: Annotated[int, typer.Option(help="seed of all random numbers", rich_help_panel=INPUT)] = 1,
     shots: Annotated[
-        int, typer.Option(min=1, metavar="N", help="how many, with seeds that count up", rich_help_panel=INPUT)
+        int, typer.Option(min=1, metavar="N", help="number of shots, with seeds that count up", rich_help_panel=INPUT)
     ] = 1,
-    camera: Annotated[
-        str | None, typer.Option(help="which of the file's cameras, or random", rich_help_panel=INPUT)
-    ] = None,
+    camera: Annotated[str | None, typer.Option(help="a camera of the file, or random", rich_help_panel=INPUT)] = None,
     motion: Annotated[
         Literal["auto", "keep", "add"],
         typer.Option("--animate", help="auto: add motion to a file that has none", rich_help_panel=WHAT),
     ] = "auto",
-    movers: Annotated[
+    moving_objects: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", help="how many moving things to add, with added motion", rich_help_panel=WHAT),
+        typer.Option(min=0, metavar="N", help="number of moving objects in added motion", rich_help_panel=WHAT),
     ] = None,
-    motion_blur: Annotated[bool, typer.Option("--motion-blur", help="blur what moves", rich_help_panel=WHAT)] = False,
+    movers: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
+    motion_blur: Annotated[
+        bool, typer.Option("--motion-blur", help="render with motion blur", rich_help_panel=WHAT)
+    ] = False,
     halves: Annotated[
-        bool, typer.Option("--halves", help="half buffers, for the variance", rich_help_panel=WHAT)
+        bool, typer.Option("--halves", help="add half buffers, for the variance", rich_help_panel=WHAT)
     ] = False,
     effects: Annotated[
         Literal["auto", "all"],
-        typer.Option(help="auto: what the scene calls for; all: everything", rich_help_panel=WHAT),
+        typer.Option(help="auto: the effects that the scene needs; all: every effect", rich_help_panel=WHAT),
     ] = "auto",
     jobs: Annotated[
         int, typer.Option(min=1, metavar="N", help="Blender processes at a time", rich_help_panel=RESOURCES)
@@ -91,7 +96,7 @@ def simulate(
             min=1,
             metavar="N",
             envvar="RAVG_THREADS",
-            help="of each; without, the cores are shared out",
+            help="threads of each process; default: the cores divided by --jobs",
             rich_help_panel=RESOURCES,
         ),
     ] = None,
@@ -100,61 +105,62 @@ def simulate(
         typer.Option(
             metavar="FILE",
             envvar="RAVG_BLENDER_PYTHON",
-            help="an interpreter that has bpy, if this one has not",
+            help="Python interpreter with bpy; default: this one",
             rich_help_panel=RESOURCES,
         ),
     ] = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for."""
+    """Render shots with Cycles: noise levels, guides, motion vectors and references, with the effects a scene needs."""
     from hybrid.files.sequences import parse_frames
 
     known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]
     if scene not in known and not Path(scene).is_file():
         raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or one of {', '.join(known)}")
-    with usage():
-        first = ShotSettings(
+    if movers is not None:
+        LOG.warning("--movers is now --moving-objects; the old name works in this release only")
+
+    def settings(scene: str, seed: int) -> ShotSettings:
+        return ShotSettings(
             scene=scene,
             seed=seed,
             frames=tuple(parse_frames(frames)),
             size=parse_size(size, "size"),
-            levels={"noisy": 1},
+            levels=parse_levels(levels, parse_samples(spp, seed)),
             reference=reference,
             reference_frames=parse_numbers(reference_frames) if reference_frames else None,
             film=parse_size(film, "film") if film else None,
             center=parse_center(center) if center else None,
             camera=camera,
             motion=motion,
-            movers=movers,
+            moving_objects=movers if moving_objects is None else moving_objects,
             motion_blur=motion_blur,
-            halves=False,
+            halves=halves,
             effects=effects,
         )
-        several = shots_of(scene, output, shots, spp, levels, first)
-        # Half buffers last: they ask for levels of two samples, and the levels are only now read.
-        asked = [(replace(shot, halves=halves), folder) for shot, folder in several]
+
+    with usage():
+        asked = shots_of(scene, output, seed, shots, settings)
     for shot, folder in asked:
-        read_meta(shot, folder)  # pictures of another shot are not those that are asked for
-    if scheduler is not None:
-        chunks = {}
-        for shot, folder in asked:
-            own = {"scene": shot.scene, "seed": shot.seed, "shots": 1, "output": folder}
-            samples = sum(missing(shot, folder, frame) for frame in shot.frames)
-            if samples:
-                chunks[folder.name] = Chunk(arguments_of(context, own), samples)
-        run_on_cluster(scheduler, "rendering", chunks, "spp·frames")
+        read_meta(shot, folder)  # finished renders of another shot do not count
+    if scheduler is None:
+        _render(asked, jobs, threads, python)
         return
-    _run_with_progress(asked, jobs, threads, python)
+    chunks = {}
+    for shot, folder in asked:
+        samples = sum(samples_left(shot, folder, frame) for frame in shot.frames)
+        if samples:
+            changes = {"scene": shot.scene, "seed": shot.seed, "shots": 1, "output": folder}
+            chunks[folder.name] = Chunk(arguments_of(context, changes), samples)
+    run_on_cluster(scheduler, "rendering", chunks, "spp·frames")
 
 
-def _run_with_progress(
-    shots: Sequence[tuple[ShotSettings, Path]], jobs: int, threads: int | None, python: str | None
-) -> None:
-    # The bar counts samples, not frames: they tell the time that is left whatever the levels.
-    total = sum(missing(shot, out, frame) for shot, out in shots for frame in shot.frames)
-    pictures = sum(len(shot.pictures(frame)) for shot, _ in shots for frame in shot.frames)
+def _render(shots: Sequence[tuple[ShotSettings, Path]], jobs: int, threads: int | None, python: str | None) -> None:
+    """Render shots, and show progress in samples, which predict the remaining time whatever the levels."""
+    total = sum(samples_left(shot, out, frame) for shot, out in shots for frame in shot.frames)
     if total == 0:
-        LOG.info(f"all {pictures} pictures are there")
+        renders = sum(len(shot.pictures(frame)) for shot, _ in shots for frame in shot.frames)
+        LOG.info(f"all {renders} pictures are there")
         return
     bar = Progress("rendering", total, "spp·frames")
 
@@ -163,13 +169,9 @@ def _run_with_progress(
             bar.advance(message["samples"], f"{out.name}/{message['file']}")
             return
         plan = message["plan"]
-        LOG.info(f"{out}: {_one_line(plan['description'])}")
-        if len(shots) == 1:
-            for line in plan["printed"]:
-                LOG.info(f"  {line}")
+        found = [f"{key} {value}" for key, value in plan["description"].items() if value not in ([], {}, "still")]
+        LOG.info(f"{out}: {', '.join(found)}")
+        for line in plan["printed"] if len(shots) == 1 else ():
+            LOG.info(f"  {line}")
 
     render(shots, jobs=jobs, threads=threads, python=python, on_event=show)
-
-
-def _one_line(description: dict[str, Any]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in description.items() if value not in ([], {}, "still"))

@@ -1,8 +1,8 @@
-"""Render a shot with Cycles: the process that does the work, started by `hybrid.simulate.run`.
+"""Render a shot with Cycles: the worker process that `hybrid.simulate.run` starts.
 
-Blender keeps state between scenes and can fall over, so each shot is rendered in a process of its own:
-`python -m hybrid.simulate.cycles JOB`, JOB being JSON. It answers in lines of JSON on standard output: first
-the plan (unless the job brings one), then one line per finished frame.
+Blender keeps state between scenes and can crash, so each shot is rendered in a process of its own:
+`python -m hybrid.simulate.cycles JOB`, JOB being a JSON file. The worker answers in lines of JSON on standard output:
+first the plan (unless the job brings one), then one line per finished render.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import secrets
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,31 +28,21 @@ from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, ne
 from hybrid.simulate.fixed import fixed_shot
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, frame_seed
 
+ATTEMPTS = 8  # random shots of one seed that are tried
 PILOT_SAMPLES = 8
 PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
 PILOT_BOTH_ENDS = 30e6  # samples of a shot above which the pilot may take the time for two frames
-SAMPLES = "cycles.ViewLayer.samples"  # what Cycles writes in a header: of one rendering, which may be a part
+SAMPLES = "cycles.ViewLayer.samples"  # Cycles' header attribute; it counts one render, which may be a part
 GUIDE_SAMPLES = 16  # of the unblurred pass: edges are antialiased, and nothing is lit
 
 
 def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
-    """Set up Cycles for unbiased frames with the passes that denoising reads, and `settings` on top.
+    """Set up Cycles for unbiased frames with the passes that denoising reads, then `apply` the settings.
 
-    Denoising, adaptive sampling, clamping and glossy filtering are off: they would make levels of noise differ
-    by more than noise.
-
-    Passes are chosen here, once: in Blender 5.0.1 a change of passes between two renders with persistent data
-    leaves meshes with the wrong attributes, and pictures 5 to 15 % too bright or dark. The same care for motion
-    blur, which goes on and off within a frame: without persistent data there.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    settings : dict of str to object
-        As for `apply`.
-    threads : int
-        That Cycles may use.
+    Denoising, adaptive sampling, clamping and glossy filtering are off: they would make levels differ by more than
+    noise. Passes are chosen here, once: in Blender 5.0.1 a change of passes between two renders with persistent data
+    leaves meshes with the wrong attributes, and images 5 to 15 % too bright or dark. For the same reason a shot with
+    motion blur, which is switched on and off within a frame, is rendered without persistent data.
     """
     render, layer, cycles = scene.render, scene.view_layers[0], scene.cycles
     render.engine = "CYCLES"
@@ -73,15 +65,7 @@ def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
 
 
 def apply(scene: Any, settings: dict[str, Any]) -> None:
-    """Set properties named `cycles.x`, `render.x`, `layer.x`, `camera.x` or `world.x`.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    settings : dict of str to object
-        Values by name.
-    """
+    """Set properties named `cycles.x`, `render.x`, `layer.x`, `camera.x` or `world.x`."""
     roots = {"layer": scene.view_layers[0], "camera": scene.camera.data, "world": scene.world}
     for name, value in settings.items():
         root, *path, last = name.split(".")
@@ -94,21 +78,7 @@ def apply(scene: Any, settings: dict[str, Any]) -> None:
 
 
 def render_frame(scene: Any, path: Path, samples: int, seed: int, subset: tuple[int, int] | None = None) -> None:
-    """Render the scene's current frame to `path`; of its samples, only `subset` (offset, length) if given.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    path : Path
-        Of the file.
-    samples : int
-        Per pixel, of the whole frame.
-    seed : int
-        Of everything random.
-    subset : (int, int), optional
-        Offset and length of those that are rendered; all without.
-    """
+    """Render the current frame to `path`; of its samples, only the `subset` (offset, length) if given."""
     scene.cycles.samples, scene.cycles.seed = samples, seed
     scene.cycles.use_sample_subset = subset is not None
     if subset is not None:
@@ -124,24 +94,7 @@ def read_channels(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) -> dict[str, np.ndarray]:
-    """Render a pilot, at a scale at which the rendered region has about `PILOT_PIXELS`, with all passes.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    settings : dict of str to object
-        As for `configure`.
-    samples : int
-        Per pixel.
-    seed : int
-        Of everything random.
-
-    Returns
-    -------
-    dict of str to array
-        Passes by name.
-    """
+    """Render a pilot of about `PILOT_PIXELS` with `settings` applied; return its passes by name, (H, W, C) each."""
     render = scene.render
     fraction = 1.0
     if render.use_border:
@@ -164,54 +117,25 @@ def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) 
 
 
 def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) -> np.ndarray:
-    """Return small, quick pictures of some frames, one under the other: (H, W, 3) linear radiance.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    frames : list of int
-        Of the shot.
-    settings : dict of str to object
-        As for `configure`.
-    seed : int
-        Of everything random.
-
-    Returns
-    -------
-    (H, W, 3) array
-        Linear radiance, the frames one under the other.
-    """
-    pictures = []
+    """Return pilots of some frames, one below the other, (H, W, 3) linear radiance."""
+    images = []
     for frame in frames:
         scene.frame_set(frame)
-        pictures.append(render_small(scene, settings, PILOT_SAMPLES, seed)["Combined"][..., :3])
-    return np.concatenate(pictures).astype(np.float32)
+        images.append(render_small(scene, settings, PILOT_SAMPLES, seed)["Combined"][..., :3])
+    return np.concatenate(images).astype(np.float32)
 
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
-    """Make the scene of a shot in Blender, ready to be planned, and return its description.
+    """Make the scene of a shot in Blender, ready to be planned; return its description.
 
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    attempt : int
-        Which of the shots of one seed.
-    threads : int
-        That Cycles may use.
-
-    Returns
-    -------
-    dict
-        Its description.
+    `attempt` counts the random shots of one seed.
     """
     if shot.scene in RANDOM:
         description = scenes.random_shot(shot, attempt)
     elif shot.scene.partition(":")[0] in FIXED:
         description = fixed_shot(shot)
     else:
-        description = scenes.open_shot(shot)
+        description = scenes.file_shot(shot)
     settings = EVERYTHING if shot.effects == "all" else {**EVERYTHING, **dict.fromkeys(PASSES, False)}
     configure(bpy.context.scene, settings, threads)
     bpy.context.scene.render.use_persistent_data = not shot.motion_blur
@@ -219,38 +143,25 @@ def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
 
 
 def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
-    """Build the scene and decide what it calls for: description, facts, decisions, settings, for `meta.json`.
+    """Build the scene and decide its settings; return description, facts, decisions and settings for `meta.json`.
 
-    A random shot that shows next to nothing is drawn again, and its exposure is chosen here: the geometric mean of
-    the picture is put some stops around middle grey, since nobody lights a film by drawing watts.
-
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    threads : int
-        That Cycles may use.
-
-    Returns
-    -------
-    dict
-        Description, facts, decisions and settings, for `meta.json`.
+    A random shot that shows next to nothing is drawn again, and its exposure is chosen here: the geometric mean of the
+    image is put some stops around middle grey, as the power of random lamps means nothing.
     """
     started = time.perf_counter()
-    middle = shot.frames[len(shot.frames) // 2]
     exposure: dict[str, Any] = {}
-    for attempt in range(8):
+    for attempt in range(ATTEMPTS):
         description = build(shot, attempt, threads)
         scene = bpy.context.scene
-        scene.frame_set(middle)
+        scene.frame_set(shot.middle)
         if shot.scene not in RANDOM:
             break
         passes = render_small(scene, {}, PILOT_SAMPLES, 1)
-        worth = scenes.worth_rendering(passes)
-        if worth is None:
+        rejected = scenes.rejection(passes)
+        if rejected is None:
             exposure = {"cycles.film_exposure": scenes.exposure(shot, passes)}
             break
-        description["rejected"] = worth
+        description["rejected"] = rejected
     facts = facts_of(scene, shot.frames, shot.motion_blur)
     decisions = effects_of(facts)
     if shot.effects == "all":
@@ -258,12 +169,13 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
     else:
         settings = settings_of(decisions)
         apply(scene, {name: value for name, value in settings.items() if name.startswith("camera.")})
-        # The ends, if anything moves and there is much to render: what comes into view may need what the rest does not.
+        # Both ends, if something moves and there is much to render: what comes into view may need deeper paths.
         moves = facts.motion_pixels > 0 or facts.moving_lights
         work = shot.size[0] * shot.size[1] * sum(sum(shot.pictures(frame).values()) for frame in shot.frames)
-        looked_at = sorted({shot.frames[0], shot.frames[-1]}) if moves and work > PILOT_BOTH_ENDS else [middle]
+        both_ends = moves and work > PILOT_BOTH_ENDS
+        frames = sorted({shot.frames[0], shot.frames[-1]}) if both_ends else [shot.middle]
         cleanest = max([*shot.levels.values(), shot.reference])
-        bounces = needed_bounces(lambda s, seed: pilot(scene, looked_at, s, seed), settings, PILOT_SAMPLES, cleanest)
+        bounces = needed_bounces(lambda s, seed: pilot(scene, frames, s, seed), settings, PILOT_SAMPLES, cleanest)
         decisions += bounces
         settings = settings_of(bounces, settings)
     settings |= exposure
@@ -280,99 +192,78 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
     }
 
 
-def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
-    """Render the current frame to `path`, with half buffers and an unblurred guide pass where called for.
+@contextmanager
+def renamed_when_whole(path: Path) -> Iterator[Path]:
+    """Yield a new file beside `path` to render to, renamed to `path` at the end, or removed after an error.
 
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    shot : ShotSettings
-        What is asked for.
-    path : Path
-        Of the file.
-    samples : int
-        Per pixel.
-    seed : int
-        Of everything random.
+    The random name prevents Blender from writing through a link that somebody placed there.
     """
-    partial = _new_partial(path)
+    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}-{path.name}")
+    partial.touch(exist_ok=False)  # O_EXCL follows no link
     try:
-        if shot.halves:
-            first = samples - samples // 2
-            render_frame(scene, partial, samples, seed, (0, first))
-            header, half_a = read_channels(partial)
-            render_frame(scene, partial, samples, seed, (first, samples - first))
-            _, half_b = read_channels(partial)
-            share = np.float32(first / samples)  # of an odd number of samples, A has one more
-            channels = {name: share * half_a[name] + (1 - share) * half_b[name] for name in half_a}
-            channels = {name: values.astype(half_a[name].dtype) for name, values in channels.items()}
-            for letter, half in (("A", half_a), ("B", half_b)):
-                for c in "RGB":
-                    channels[f"ViewLayer.Half {letter}.{c}"] = half[f"ViewLayer.Combined.{c}"]
-        else:
-            render_frame(scene, partial, samples, seed)
-            header, channels = read_channels(partial) if scene.render.use_motion_blur else ({}, {})
-        if scene.render.use_motion_blur:
-            # Blurred, Cycles gives no vectors and smeared guides. Light does not matter in this pass, mirrors do.
-            lit = {"render.use_motion_blur": True, "cycles.diffuse_bounces": scene.cycles.diffuse_bounces}
-            apply(scene, {"render.use_motion_blur": False, "cycles.diffuse_bounces": 0})
-            render_frame(scene, partial, min(samples, GUIDE_SAMPLES), seed)
-            apply(scene, lit)
-            _, sharp = read_channels(partial)
-            lighting = {name: channels[name] for name in channels if ".Combined." in name or ".Half " in name}
-            channels = {**sharp, **lighting}
-        if channels:
-            OpenEXR.File({**header, SAMPLES: str(samples)}, channels).write(str(partial))
+        yield partial
         partial.rename(path)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _new_partial(path: Path) -> Path:
-    """A new file to render to, by a name that nobody can guess, so that Blender writes through nobody's link."""
-    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}-{path.name}")
-    partial.touch(exist_ok=False)  # O_EXCL follows no link
-    return partial
+def render_halves(scene: Any, path: Path, samples: int, seed: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Render two halves of the samples; return the header and the channels of their mean, with both halves' color."""
+    first = samples - samples // 2
+    render_frame(scene, path, samples, seed, (0, first))
+    header, half_a = read_channels(path)
+    render_frame(scene, path, samples, seed, (first, samples - first))
+    _, half_b = read_channels(path)
+    share = np.float32(first / samples)  # of an odd number of samples, A has one more
+    channels = {name: (share * half_a[name] + (1 - share) * half_b[name]).astype(half_a[name].dtype) for name in half_a}
+    for letter, half in (("A", half_a), ("B", half_b)):
+        channels |= {f"ViewLayer.Half {letter}.{c}": half[f"ViewLayer.Combined.{c}"] for c in "RGB"}
+    return header, channels
+
+
+def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
+    """Render the current frame to `path`, with half buffers and an unblurred guide pass where the shot needs them."""
+    blur = scene.render.use_motion_blur
+    with renamed_when_whole(path) as partial:
+        if shot.halves:
+            header, channels = render_halves(scene, partial, samples, seed)
+        else:
+            render_frame(scene, partial, samples, seed)
+            header, channels = read_channels(partial) if blur else ({}, {})
+        if blur:
+            # With blur, Cycles writes no vectors and smears guides. This pass needs no light but mirrors.
+            lit = {"render.use_motion_blur": True, "cycles.diffuse_bounces": scene.cycles.diffuse_bounces}
+            apply(scene, {"render.use_motion_blur": False, "cycles.diffuse_bounces": 0})
+            render_frame(scene, partial, min(samples, GUIDE_SAMPLES), seed)
+            apply(scene, lit)
+            lighting = {name: channels[name] for name in channels if ".Combined." in name or ".Half " in name}
+            channels = {**read_channels(partial)[1], **lighting}
+        if channels:
+            OpenEXR.File({**header, SAMPLES: str(samples)}, channels).write(str(partial))
 
 
 def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -> None:
-    """Render two independent halves of the reference, and their mean; of all only the colour is kept.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    shot : ShotSettings
-        What is asked for.
-    folder : Path
-        Where it goes.
-    frame : int
-        Its number.
-    """
+    """Render two halves of the reference with independent seeds, and write their mean; color only."""
     halves, half = [], max(shot.reference // 2, 1)
     for name in ("reference_a", "reference_b"):
         path = folder / f"{name}.{frame:04d}.exr"
         if not path.exists():
-            partial = _new_partial(path)
-            render_frame(scene, partial, half, frame_seed(shot.seed, name, frame))
-            header, channels = read_channels(partial)
-            color = {key: values for key, values in channels.items() if ".Combined." in key}
-            OpenEXR.File(header, color).write(str(partial))
-            partial.rename(path)
+            with renamed_when_whole(path) as partial:
+                render_frame(scene, partial, half, frame_seed(shot.seed, name, frame))
+                header, channels = read_channels(partial)
+                color = {key: values for key, values in channels.items() if ".Combined." in key}
+                OpenEXR.File(header, color).write(str(partial))
         halves.append(read_channels(path))
     (header, a), (_, b) = halves
-    path = folder / f"reference.{frame:04d}.exr"
-    partial = _new_partial(path)
     mean = {name: ((a[name].astype(np.float32) + b[name]) / 2).astype(np.float16) for name in a}
-    OpenEXR.File({**header, SAMPLES: str(2 * half)}, mean).write(str(partial))
-    partial.rename(path)
+    with renamed_when_whole(folder / f"reference.{frame:04d}.exr") as partial:
+        OpenEXR.File({**header, SAMPLES: str(2 * half)}, mean).write(str(partial))
 
 
 def main(job: dict[str, Any]) -> None:
-    """Do one job: `shot`, `out`, `frames`, `threads`, and `plan` where there is one already."""
+    """Do one job: `shot`, `out`, `frames`, `threads`, and `plan` where the shot is planned already."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # Blender talks on standard output; that goes to the log
+    os.dup2(2, 1)  # Blender prints to standard output; redirected to the log
 
     def answer(**message: Any) -> None:
         answers.write(json.dumps(message) + "\n")
@@ -402,4 +293,4 @@ def main(job: dict[str, Any]) -> None:
 if __name__ == "__main__":
     main(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
     sys.stderr.flush()
-    os._exit(0)  # all is written; taking Blender down in order now and then crashes it
+    os._exit(0)  # all is written; an orderly exit of Blender sometimes crashes

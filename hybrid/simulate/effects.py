@@ -1,8 +1,8 @@
-"""What is in a scene, and which of Cycles' effects that calls for.
+"""What a scene contains, and which of Cycles' effects it needs.
 
-`facts_of` reads a Blender scene into plain numbers, `effects_of` turns the numbers into decisions, each with
-its figure, threshold and reason, and `needed_bounces` measures with a few samples how deep the light paths
-have to be. Only `facts_of` needs Blender: the rules are plain functions of plain data.
+`facts_of` reads a Blender scene into plain numbers, `effects_of` turns the numbers into decisions, each with its
+figure, threshold and reason, and `needed_bounces` measures with a few samples how deep light paths have to be. Only
+`facts_of` needs Blender: the rules are functions of plain data.
 """
 
 from __future__ import annotations
@@ -13,62 +13,56 @@ from typing import Any
 
 import numpy as np
 
-# Cycles' own "Full Global Illumination" preset, and everything else that a scene might need, switched on.
-DEEP = 32
+DEEP = 32  # bounces, as in Cycles' own preset "Full Global Illumination"
+BOUNCE_KINDS = ("diffuse", "glossy", "transmission", "volume")
+PASSES = (
+    *(f"layer.use_pass_{name}" for name in ("position", "normal", "mist", "uv", "object_index")),
+    "layer.cycles.pass_debug_sample_count",
+)
+# All that a scene might need, switched on.
 EVERYTHING: dict[str, Any] = {
-    "cycles.max_bounces": DEEP,
-    "cycles.diffuse_bounces": DEEP,
-    "cycles.glossy_bounces": DEEP,
-    "cycles.transmission_bounces": DEEP,
-    "cycles.volume_bounces": DEEP,
+    **{f"cycles.{kind}_bounces": DEEP for kind in ("max", *BOUNCE_KINDS)},
     "cycles.transparent_max_bounces": DEEP,
     "cycles.caustics_reflective": True,
     "cycles.caustics_refractive": True,
     "cycles.use_light_tree": True,
-    "layer.use_pass_position": True,
-    "layer.use_pass_normal": True,
-    "layer.use_pass_mist": True,
-    "layer.use_pass_uv": True,
-    "layer.use_pass_object_index": True,
-    "layer.cycles.pass_debug_sample_count": True,
+    **dict.fromkeys(PASSES, True),
 }
-PASSES = tuple(name for name in EVERYTHING if name.startswith("layer."))
-BOUNCE_KINDS = ("diffuse", "glossy", "transmission", "volume")
 
 BLUR_PIXELS = 0.1  # a tenth of the pixel filter's width cannot be seen through it
-SMALL_LIGHT = 0.1  # radius over distance to what is seen: below, a reflection of it is a caustic
+SMALL_LIGHT = 0.1  # radius over distance to the camera: below, a reflection of the light is a caustic
 MIRROR_ROUGHNESS = 0.2  # at roughness 0.2 the lobe is some 5° wide: light it focuses is still sharp
 TREE_LIGHTS = 2  # with one light there is nothing to choose between
 
-# What a truncated path may cost: six figures of 0.05 % stay well within the 0.5 % that the whole may change the
-# mean; and a tenth of the noise is what a two-seed test of ten frames cannot tell from nothing.
+# The cost of truncated paths: six figures of 0.05 % stay well within the 0.5 % by which all of them together may
+# change the mean; a tenth of the noise is not significant in a two-seed test of ten frames.
 MEAN_FRACTION = 0.0005
 NOISE_FRACTION = 0.1
-PROBES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24)  # depths tried, the shallowest that is enough is taken
+PROBES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24)  # depths tried; the shallowest sufficient one is taken
+BLOCK = 8  # pixels
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What is in a scene, as seen by one camera over one range of frames.
+    """What a scene contains, as seen by one camera over one range of frames.
 
-    Materials are counted once each, and only if an object that renders uses them. Everything moves, blurs and
-    measures in pixels of the rendered picture.
+    Each material that a rendered object uses is counted once. Motion and blur are in pixels of the rendered image.
     """
 
-    motion_pixels: float = 0.0  # fastest, per frame, of what the camera sees
+    motion_pixels: float = 0.0  # fastest visible motion, per frame
     moving_lights: int = 0
     blur_asked: bool = False
     shutter: float = 0.5  # frames
-    aperture_pixels: float = 0.0  # largest circle of confusion in the picture
+    aperture_pixels: float = 0.0  # largest visible circle of confusion
     glossy: int = 0  # materials with any glossy lobe
-    mirrors: int = 0  # of these, those smoother than MIRROR_ROUGHNESS
+    mirrors: int = 0  # glossy or transmissive materials smoother than MIRROR_ROUGHNESS
     transmissive: int = 0
     transparent: int = 0  # alpha below one: leaves, curtains
     subsurface: int = 0
     volumes: int = 0  # materials, and the world
     hair: int = 0  # objects
-    lamps: int = 0  # with a size: an indirect ray that meets one goes on as through something transparent
-    lights: int = 0  # lamps, emissive objects, and the world where it shines
+    lamps: int = 0  # of nonzero size: indirect rays pass through a lamp as through a transparent surface
+    lights: int = 0  # lamps, emissive objects, and the world unless black
     small_lights: int = 0  # smaller than SMALL_LIGHT times their distance
     world: str = "none"  # none, constant, image, sky
 
@@ -81,8 +75,8 @@ class SceneFacts:
 
 
 @dataclass(frozen=True)
-class Decision:
-    """One effect, whether the scene calls for it, why, and what it sets in Cycles."""
+class EffectDecision:
+    """Whether a scene needs an effect, why, and the settings of Cycles that follow."""
 
     effect: str
     on: bool
@@ -96,124 +90,58 @@ class Decision:
         return f"{'+' if self.on else '-'} {self.effect:<15} {figure} (threshold {self.threshold}): {self.reason}"
 
 
-def effects_of(facts: SceneFacts) -> list[Decision]:
-    """Decide which effects a scene calls for.
+def effects_of(facts: SceneFacts) -> list[EffectDecision]:
+    """Decide which effects a scene needs; `settings_of` merges the settings of the decisions.
 
-    Parameters
-    ----------
-    facts : SceneFacts
-        What is in the scene.
-
-    Returns
-    -------
-    list of Decision
-        One per effect. Their settings, one after the other over `EVERYTHING`, configure Cycles; `needed_bounces`
-        then lowers the depths that are left.
-
-    Notes
-    -----
-    Every rule here leaves the picture as it is: a kind of bounce is given depth 0 only where no material could
-    cause it. Whether a *possible* bounce is worth its time is for `needed_bounces` to measure.
+    No rule changes the image: a kind of bounce gets depth 0 only if no material can cause it. Whether a *possible*
+    bounce is worth its time is measured by `needed_bounces`.
     """
-    blurred = facts.motion_pixels * facts.shutter
-    passes = dict.fromkeys(PASSES, False)
-    focusing = facts.mirrors + facts.transmissive
+    blurred = float(facts.motion_pixels * facts.shutter)
+    moves = blurred >= BLUR_PIXELS or facts.moving_lights > 0
+    opens, defocus = facts.blur_asked and moves, facts.aperture_pixels >= BLUR_PIXELS
+    blur_reason = ("moves while the shutter is open" if moves else "nothing moves") if facts.blur_asked else ""
+    surfaces, sharp = facts.glossy + facts.transmissive, facts.mirrors + facts.transmissive
+    caustics = {"cycles.caustics_reflective": facts.glossy > 0, "cycles.caustics_refractive": facts.transmissive > 0}
+    many, lit = facts.lights >= TREE_LIGHTS, facts.world != "none"
     return [
-        Decision(
-            "motion blur",
-            facts.blur_asked and (blurred >= BLUR_PIXELS or facts.moving_lights > 0),
-            float(blurred),
-            f"{BLUR_PIXELS:g} px",
-            ("moves while the shutter is open" if blurred >= BLUR_PIXELS or facts.moving_lights else "nothing moves")
-            if facts.blur_asked
-            else "not asked for",
-            {"render.use_motion_blur": facts.blur_asked and (blurred >= BLUR_PIXELS or facts.moving_lights > 0)},
+        EffectDecision("motion blur", opens, blurred, f"{BLUR_PIXELS:g} px", blur_reason or "not asked for",
+                       {"render.use_motion_blur": opens}),
+        EffectDecision("depth of field", defocus, float(facts.aperture_pixels), f"{BLUR_PIXELS:g} px",
+                       "largest circle of confusion in the image", {"camera.dof.use_dof": defocus}),
+        _counted("glossy paths", facts.glossy, "materials with a glossy lobe", "cycles.glossy_bounces"),
+        _counted("transmission", facts.transmissive, "transmissive materials", "cycles.transmission_bounces"),
+        EffectDecision(
+            "caustics", surfaces > 0, surfaces, 1,
+            f"{sharp} mirror-like or refractive materials, {facts.small_lights} small lights; kept, as a pilot of few "
+            "samples cannot find rare paths"
+            if surfaces
+            else "no surface reflects or refracts light onto another",
+            caustics,
         ),
-        Decision(
-            "depth of field",
-            facts.aperture_pixels >= BLUR_PIXELS,
-            float(facts.aperture_pixels),
-            f"{BLUR_PIXELS:g} px",
-            "circle of confusion of the most blurred thing in the picture",
-            {"camera.dof.use_dof": facts.aperture_pixels >= BLUR_PIXELS},
-        ),
-        _counted("glossy paths", facts.glossy, "materials with a glossy lobe", {"cycles.glossy_bounces": 0}),
-        _counted(
-            "transmission",
-            facts.transmissive,
-            "materials that light goes through",
-            {"cycles.transmission_bounces": 0},
-        ),
-        Decision(
-            "caustics",
-            facts.glossy + facts.transmissive > 0,
-            facts.glossy + facts.transmissive,
-            1,
-            "no surface reflects or refracts light onto another"
-            if facts.glossy + facts.transmissive == 0
-            else f"{focusing} mirror-like or refractive materials, {facts.small_lights} small lights; kept, as a "
-            "pilot of few samples cannot find rare paths",
-            {
-                "cycles.caustics_reflective": facts.glossy > 0,
-                "cycles.caustics_refractive": facts.transmissive > 0,
-            },
-        ),
-        # Depth 0 would also end every path that meets a lamp, and lose what is behind it.
-        _counted(
-            "transparency",
-            facts.transparent + facts.lamps,
-            "materials with alpha below one, or lamps that rays pass through",
-            {"cycles.transparent_max_bounces": 0},
-        ),
-        _counted("volumes", facts.volumes, "materials with a volume, or the world", {"cycles.volume_bounces": 0}),
-        _counted("subsurface", facts.subsurface, "materials; Cycles needs no switch for it", {}),
-        _counted("hair", facts.hair, "objects; Cycles needs no switch for it", {}),
-        Decision(
-            "light tree",
-            facts.lights >= TREE_LIGHTS,
-            facts.lights,
-            TREE_LIGHTS,
-            "lights to choose between",
-            {"cycles.use_light_tree": facts.lights >= TREE_LIGHTS},
-        ),
-        Decision(
-            "sky",
-            facts.world != "none",
-            facts.world,
-            "shines",
-            "the world is sampled as a light" if facts.world != "none" else "the world is black",
-            {"world.cycles.sampling_method": "NONE"} if facts.world == "none" else {},
-        ),
-        Decision(
-            "more passes",
-            False,
-            len(passes),
-            "asked for",
-            "colour, guides, depth and vectors are enough",
-            passes,
-        ),
-    ]
+        # Depth 0 would also end every path at the first lamp that it passes through, and lose the light behind.
+        _counted("transparency", facts.transparent + facts.lamps,
+                 "materials with alpha below one, or lamps that rays pass through", "cycles.transparent_max_bounces"),
+        _counted("volumes", facts.volumes, "materials with a volume, or the world", "cycles.volume_bounces"),
+        _counted("subsurface", facts.subsurface, "materials; Cycles needs no switch for it"),
+        _counted("hair", facts.hair, "objects; Cycles needs no switch for it"),
+        EffectDecision("light tree", many, facts.lights, TREE_LIGHTS, "lights to choose between",
+                       {"cycles.use_light_tree": many}),
+        EffectDecision("sky", lit, facts.world, "shines",
+                       "the world is sampled as a light" if lit else "the world is black",
+                       {} if lit else {"world.cycles.sampling_method": "NONE"}),
+        EffectDecision("more passes", False, len(PASSES), "asked for",
+                       "colour, guides, depth and vectors are enough", dict.fromkeys(PASSES, False)),
+    ]  # fmt: skip
 
 
-def _counted(effect: str, count: int, what: str, off: dict[str, Any]) -> Decision:
-    return Decision(effect, count > 0, count, 1, what if count else f"no {what}", {} if count else off)
+def _counted(effect: str, count: int, what: str, depth: str | None = None) -> EffectDecision:
+    """An effect that is on where something causes it; `depth` names the setting that is 0 otherwise."""
+    settings = {depth: 0} if depth and not count else {}
+    return EffectDecision(effect, count > 0, count, 1, what if count else f"no {what}", settings)
 
 
-def settings_of(decisions: Iterable[Decision], base: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return the Cycles settings that `decisions` ask for, over `base` (everything on).
-
-    Parameters
-    ----------
-    decisions : iterable of Decision
-        What the scene calls for.
-    base : dict, optional
-        What they change; everything on without.
-
-    Returns
-    -------
-    dict of str to object
-        Settings of Cycles by name.
-    """
+def settings_of(decisions: Iterable[EffectDecision], base: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return the Cycles settings of `decisions`, applied over `base` (None: `EVERYTHING`)."""
     settings = dict(EVERYTHING if base is None else base)
     for decision in decisions:
         settings.update(decision.settings)
@@ -225,37 +153,36 @@ def needed_bounces(
     settings: dict[str, Any],
     samples: int,
     target_samples: int,
-) -> list[Decision]:
-    """Measure how many bounces of each kind the picture needs.
+) -> list[EffectDecision]:
+    """Measure how many bounces of each kind an image needs.
 
     Parameters
     ----------
     render : callable
-        `render(settings, seed)` gives a small picture, (H, W, 3) float32 linear radiance, of `samples` samples per
+        `render(settings, seed)` returns a small image, (H, W, 3) float32 linear radiance, of `samples` samples per
         pixel. The same seed must give the same paths.
     settings : dict of str to object
         As `settings_of` returns them.
     samples, target_samples : int
-        Samples per pixel of the pilot, and of the cleanest picture that is going to be rendered.
+        Samples per pixel of the pilot, and of the cleanest image to be rendered.
 
     Returns
     -------
-    list of Decision
-        One per kind of bounce that is still possible, and one for paths as a whole.
+    list of EffectDecision
+        One for all bounces together, and one for each kind of bounce that is still possible.
 
     Notes
     -----
-    With one seed, a picture of depth d and one of unlimited depth share all paths up to d, so their difference Δ is
-    the light that comes from deeper, without the noise of the rest. A depth is enough if
+    With one seed, an image of depth d and one of unlimited depth share all paths up to d, so their difference Δ is the
+    light from deeper paths, without the noise of the rest. A depth is enough if
 
         |mean(Δ)| + 2 s(Δ)/√N ≤ MEAN_FRACTION · mean(I)   and
         mean_b |Δ_b| ≤ NOISE_FRACTION · mean |A − B| / √2 · √(m/n)
 
     with s(Δ) the standard deviation over the N pixels, Δ_b the means of 8×8 blocks, A and B two seeds, m and n the
-    samples of the pilot and of the picture. Light from deep paths comes rarely and strongly, so what a few samples
-    saw of it is not enough to go by: the bound includes what they may have missed. The second criterion takes first
-    moments, because one firefly would drown the second ones. Paths as a whole are judged first, which leaves few
-    depths to try for each kind.
+    samples of the pilot and of the image. Light from deep paths is rare and strong, so a few samples may have missed
+    most of it: hence the standard error in the bound. The second criterion uses first moments, because one firefly
+    would dominate second ones. All bounces together are decided first, which leaves few depths to try for each kind.
     """
     if samples < 1 or target_samples < 1:
         raise ValueError(f"samples: got {samples} and {target_samples}, expected at least 1")
@@ -264,28 +191,25 @@ def needed_bounces(
     mean = float(np.mean(full))
 
     def lost(complete: np.ndarray, trial: dict[str, Any]) -> tuple[float, float]:
-        """Return what the trial's picture may miss, as fractions of the mean and of the noise."""
+        """Return the light that the trial may lose, as fractions of the mean and of the noise."""
         missing = complete - render(trial, 1)
         pixels = missing.mean(axis=-1)
         bound = abs(float(pixels.mean())) + 2 * float(pixels.std()) / np.sqrt(pixels.size)
-        # A black picture has nothing to lose, and would give 0/0.
-        return (
-            bound / mean if mean > 0 else 0.0,
-            float(np.abs(_block_means(missing)).mean()) / noise if noise > 0 else 0.0,
-        )
+        blocks = float(np.abs(_block_means(missing)).mean())
+        return bound / mean if mean > 0 else 0.0, blocks / noise if noise > 0 else 0.0  # 0/0 of a black image
 
-    decisions: list[Decision] = []
+    decisions: list[EffectDecision] = []
     lean, complete = dict(settings), full
     for kind in ("max", *BOUNCE_KINDS, "transparent"):
         name = "cycles.transparent_max_bounces" if kind == "transparent" else f"cycles.{kind}_bounces"
         if settings[name] == 0:
             continue
-        # No kind of bounce can happen more often than all together; transparent ones are counted by themselves.
+        # No kind of bounce can happen more often than all together; transparent ones are counted separately.
         deepest = settings[name] if kind in ("max", "transparent") else lean["cycles.max_bounces"]
         depths = [depth for depth in PROBES if depth < deepest]
         base = {**settings, "cycles.max_bounces": lean["cycles.max_bounces"]}
         low, high, figures = 0, len(depths), (0.0, 0.0)
-        while low < high:  # what is missing falls with the depth: bisection
+        while low < high:  # bisection: the lost light falls with the depth
             middle = (low + high) // 2
             trial = lost(complete, {**base, name: depths[middle]})
             if trial[0] <= MEAN_FRACTION and trial[1] <= NOISE_FRACTION:
@@ -296,23 +220,17 @@ def needed_bounces(
         lean[name] = enough
         if kind == "max" and enough < deepest:
             complete = render(lean, 1)
-        decisions.append(
-            Decision(
-                f"{kind} bounces" if kind != "max" else "all bounces",
-                enough > 0,
-                enough,
-                f"{100 * MEAN_FRACTION:g} % of the mean, {NOISE_FRACTION:g} of the noise",
-                f"deeper paths bring at most {100 * figures[0]:.2g} % of the mean, {figures[1]:.2g} of the noise",
-                {name: enough},
-            )
-        )
+        effect = f"{kind} bounces" if kind != "max" else "all bounces"
+        threshold = f"{100 * MEAN_FRACTION:g} % of the mean, {NOISE_FRACTION:g} of the noise"
+        reason = f"deeper paths bring at most {100 * figures[0]:.2g} % of the mean, {figures[1]:.2g} of the noise"
+        decisions.append(EffectDecision(effect, enough > 0, enough, threshold, reason, {name: enough}))
     return decisions
 
 
-def _block_means(image: np.ndarray, size: int = 8) -> np.ndarray:
+def _block_means(image: np.ndarray) -> np.ndarray:
     """Return the means of whole blocks of an (H, W, C) image; of all of it where it is smaller than one."""
-    h, w = (max(n // size, 1) * size if n >= size else n for n in image.shape[:2])
-    bh, bw = min(size, h), min(size, w)
+    h, w = (n // BLOCK * BLOCK if n >= BLOCK else n for n in image.shape[:2])
+    bh, bw = min(BLOCK, h), min(BLOCK, w)
     return np.asarray(image[:h, :w].reshape(h // bh, bh, w // bw, bw, -1).mean(axis=(1, 3)))
 
 
@@ -321,33 +239,21 @@ def _block_means(image: np.ndarray, size: int = 8) -> np.ndarray:
 
 
 def facts_of(scene: Any, frames: Iterable[int], blur_asked: bool = False) -> SceneFacts:
-    """Read from a Blender scene what is in it.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        With a camera.
-    frames : iterable of int
-        The frames that will be rendered.
-    blur_asked : bool
-        Whether motion blur is wanted, if anything moves.
-    """
+    """Read what a Blender scene with a camera contains over the frames that will be rendered."""
     frames = list(frames)
     scene.frame_set(frames[len(frames) // 2])
     objects = [item for item in scene.objects if not item.hide_render]
-    kinds = ("glossy", "mirrors", "transmissive", "transparent", "subsurface", "volumes")
-    counts = dict.fromkeys(kinds, 0)
+    counts = dict.fromkeys(("glossy", "mirrors", "transmissive", "transparent", "subsurface", "volumes"), 0)
     emissive: set[str] = set()
     for material in {slot.material for item in objects for slot in item.material_slots if slot.material}:
         lobes = _lobes(material.node_tree)
         if "emission" in lobes:
             emissive.add(material.name)
-        for kind in kinds:
+        for kind in counts:
             counts[kind] += kind in lobes
     eye = scene.camera.matrix_world.translation
     lamps = [item for item in objects if item.type == "LIGHT" and item.data.energy > 0]
     glowing = [o for o in objects if any(s.material and s.material.name in emissive for s in o.material_slots)]
-    small = sum(_radius(item) < SMALL_LIGHT * (item.matrix_world.translation - eye).length for item in lamps)
     world = _world_kind(scene.world)
     if scene.world is not None and scene.world.node_tree is not None:
         counts["volumes"] += "volumes" in _lobes(scene.world.node_tree)
@@ -361,31 +267,22 @@ def facts_of(scene: Any, frames: Iterable[int], blur_asked: bool = False) -> Sce
         hair=sum(o.type == "CURVES" or len(getattr(o, "particle_systems", ())) > 0 for o in objects),
         lamps=sum(_radius(item) > 0 for item in lamps),
         lights=len(lamps) + len(glowing) + (world != "none"),
-        small_lights=small,
+        small_lights=sum(_radius(item) < SMALL_LIGHT * (item.matrix_world.translation - eye).length for item in lamps),
         world=world,
         **counts,
     )
 
 
-# What each shader node can do to light. The Principled one is looked at input by input.
-LOBES: dict[str, set[str]] = {
-    "BSDF_GLOSSY": {"glossy"},
-    "BSDF_METALLIC": {"glossy"},
-    "BSDF_GLASS": {"glossy", "transmissive"},
-    "BSDF_REFRACTION": {"transmissive"},
-    "BSDF_TRANSLUCENT": {"transmissive"},
-    "BSDF_TRANSPARENT": {"transparent"},
-    "BSDF_SHEEN": {"glossy"},
-    "BSDF_HAIR": {"glossy", "transmissive"},
-    "BSDF_HAIR_PRINCIPLED": {"glossy", "transmissive"},
-    "SUBSURFACE_SCATTERING": {"subsurface"},
-    "EMISSION": {"emission"},
-    "VOLUME_SCATTER": {"volumes"},
-    "VOLUME_ABSORPTION": {"volumes"},
-    "PRINCIPLED_VOLUME": {"volumes"},
-    "VOLUME_COEFFICIENTS": {"volumes"},
+# The shader nodes that have a lobe. The Principled shader has those whose input is above 0.
+NODES_OF_LOBE = {
+    "glossy": {"BSDF_GLOSSY", "BSDF_METALLIC", "BSDF_GLASS", "BSDF_SHEEN", "BSDF_HAIR", "BSDF_HAIR_PRINCIPLED"},
+    "transmissive": {"BSDF_GLASS", "BSDF_REFRACTION", "BSDF_TRANSLUCENT", "BSDF_HAIR", "BSDF_HAIR_PRINCIPLED"},
+    "transparent": {"BSDF_TRANSPARENT"},
+    "subsurface": {"SUBSURFACE_SCATTERING"},
+    "emission": {"EMISSION"},
+    "volumes": {"VOLUME_SCATTER", "VOLUME_ABSORPTION", "PRINCIPLED_VOLUME", "VOLUME_COEFFICIENTS"},
 }
-PRINCIPLED = {
+LOBE_OF_INPUT = {
     "Metallic": "glossy",
     "Specular IOR Level": "glossy",
     "Coat Weight": "glossy",
@@ -397,7 +294,7 @@ PRINCIPLED = {
 
 
 def _lobes(tree: Any) -> set[str]:
-    """Return what the shaders of a node tree, and of the groups in it, can do to light."""
+    """Return the lobes of the shaders of a node tree, and of the groups in it."""
     found: set[str] = set()
     for node in tree.nodes if tree is not None else ():
         if node.type == "GROUP":
@@ -405,9 +302,9 @@ def _lobes(tree: Any) -> set[str]:
             continue
         if node.mute or not any(output.is_linked for output in node.outputs):
             continue
-        lobes = set(LOBES.get(node.type, ()))
+        lobes = {lobe for lobe, types in NODES_OF_LOBE.items() if node.type in types}
         if node.type == "BSDF_PRINCIPLED":
-            lobes |= {lobe for name, lobe in PRINCIPLED.items() if _largest(node.inputs[name]) > 0}
+            lobes |= {lobe for name, lobe in LOBE_OF_INPUT.items() if _largest(node.inputs[name]) > 0}
             if node.inputs["Alpha"].is_linked or node.inputs["Alpha"].default_value < 1:
                 lobes.add("transparent")
         rough = node.inputs.get("Roughness")
@@ -419,31 +316,30 @@ def _lobes(tree: Any) -> set[str]:
 
 
 def _largest(socket: Any) -> float:
+    """Return the value of a socket; 1 if it is linked."""
     return 1.0 if socket.is_linked else float(socket.default_value)
 
 
 def _radius(lamp: Any) -> float:
     """Return the radius of a lamp; of a sun, as seen from a distance of one."""
     data = lamp.data
-    if data.type == "SUN":
-        return float(data.angle / 2)
-    if data.type == "AREA":
-        return float(data.size / 2)
+    if data.type in ("SUN", "AREA"):
+        return float((data.angle if data.type == "SUN" else data.size) / 2)
     return float(data.shadow_soft_size)
 
 
 def _world_kind(world: Any) -> str:
+    """Return which kind of light the world gives, as in `SceneFacts.world`."""
     if world is None:
         return "none"
     if world.node_tree is None:
         return "constant" if max(world.color) > 0 else "none"
-    types = {node.type for node in world.node_tree.nodes if any(output.is_linked for output in node.outputs)}
-    if "TEX_SKY" in types:
-        return "sky"
-    if "TEX_ENVIRONMENT" in types:
-        return "image"
-    for node in world.node_tree.nodes:
-        if node.type in ("BACKGROUND", "EMISSION") and node.outputs[0].is_linked:
+    linked = [node for node in world.node_tree.nodes if any(output.is_linked for output in node.outputs)]
+    for kind, type_ in (("sky", "TEX_SKY"), ("image", "TEX_ENVIRONMENT")):
+        if any(node.type == type_ for node in linked):
+            return kind
+    for node in linked:
+        if node.type in ("BACKGROUND", "EMISSION"):
             color, strength = node.inputs["Color"], node.inputs["Strength"]
             if _largest(strength) > 0 and (color.is_linked or max(color.default_value[:3]) > 0):
                 return "constant"
@@ -451,23 +347,9 @@ def _world_kind(world: Any) -> str:
 
 
 def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[Any, Any]]:
-    """Return where a grid of camera rays over the rendered region meets the scene, and which object it is.
+    """Return where a grid of camera rays over the rendered region first hits a surface, and the object hit.
 
-    Blender's rays meet surfaces; hair they pass.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    across : int
-        Rays in a row.
-    down : int
-        Rows.
-
-    Returns
-    -------
-    list of (Vector, Object)
-        Where a ray meets the scene, in metres, and what it meets.
+    The rays miss hair.
     """
     import bpy
 
@@ -492,20 +374,7 @@ def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[An
 
 
 def film_pixel(scene: Any, position: Any) -> np.ndarray:
-    """Return where a point in the world lies in the whole picture, in pixels; nan if behind the camera.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    position : Vector
-        In the world, in metres.
-
-    Returns
-    -------
-    (2,) array
-        Pixels, x right and y down; NaN behind the camera.
-    """
+    """Return the (x, y) of a world position in the whole image, in pixels; NaN behind the camera."""
     from bpy_extras.object_utils import world_to_camera_view
 
     render = scene.render
@@ -516,30 +385,16 @@ def film_pixel(scene: Any, position: Any) -> np.ndarray:
     return np.array([view.x * render.resolution_x * scale, view.y * render.resolution_y * scale])
 
 
-def point_motion(scene: Any, frame: int, step: int = 1) -> np.ndarray:
-    """Return how far what the camera sees at `frame` moves until `frame + step`: (N,) pixels.
+def point_motion(scene: Any, frame: int) -> np.ndarray:
+    """Return how far visible points move until the next frame: (N,) pixels.
 
-    Points are carried by their objects' transforms; what deforms inside an object is not seen by this.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Blender's scene.
-    frame : int
-        Where it begins.
-    step : int
-        Frames until it ends.
-
-    Returns
-    -------
-    (N,) array
-        Pixels.
+    Points follow the transforms of their objects; deformation is ignored.
     """
     scene.frame_set(frame)
     points = visible_points(scene)
     local = [item.matrix_world.inverted_safe() @ position for position, item in points]
     before = [film_pixel(scene, position) for position, _ in points]
-    scene.frame_set(frame + step)
+    scene.frame_set(frame + 1)
     after = [film_pixel(scene, item.matrix_world @ p) for p, (_, item) in zip(local, points, strict=True)]
     scene.frame_set(frame)
     moved = np.linalg.norm(np.array(after).reshape(-1, 2) - np.array(before).reshape(-1, 2), axis=1)
@@ -556,7 +411,7 @@ def _motion(scene: Any, frames: list[int]) -> tuple[float, int]:
         before = {lamp.name: (lamp.matrix_world.copy(), lamp.data.energy) for lamp in lamps}
         scene.frame_set(frame + 1)
         moving |= {lamp.name for lamp in lamps if (lamp.matrix_world, lamp.data.energy) != before[lamp.name]}
-        # A deforming mesh has no transform that tells: its keys do.
+        # The transform of a deforming mesh does not show its motion; its shape keys and modifiers do.
         for item in scene.objects:
             keys = getattr(item.data, "shape_keys", None) if item.type == "MESH" else None
             waves = any(modifier.type in ("WAVE", "ARMATURE", "CLOTH") for modifier in item.modifiers)
@@ -567,7 +422,7 @@ def _motion(scene: Any, frames: list[int]) -> tuple[float, int]:
 
 
 def _circle_of_confusion(scene: Any) -> float:
-    """Return the diameter of the largest circle of confusion in the picture, in pixels."""
+    """Return the diameter of the largest circle of confusion in the image, in pixels."""
     camera, data = scene.camera, scene.camera.data
     eye, forward = camera.matrix_world.translation, camera.matrix_world.to_3x3().col[2] * -1
     focus = data.dof.focus_distance

@@ -1,4 +1,4 @@
-"""`ravg simulate`: make shots with Cycles, in processes of their own, and go on where a killed run stopped.
+"""Run Blender processes that render shots with Cycles, and resume where an earlier run stopped.
 
 Nothing here imports Blender, so that the command's help works without it.
 """
@@ -14,14 +14,13 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 from hybrid.files.replace import write_file
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, spp_of
+from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
 
 NO_BLENDER = (
     'Blender\'s Python module (bpy) is not installed in {python}: `pip install "bpy==5.0.1"` with Python 3.11, '
@@ -30,14 +29,14 @@ NO_BLENDER = (
 
 
 class SimulationError(ChildProcessError):
-    """A renderer that is missing, or that failed; one line that says which and why."""
+    """Blender is missing, or failed; one line that says why."""
 
 
 def check_blender(python: str) -> None:
-    """Raise SimulationError if `python` has no bpy; quick, as bpy itself is not loaded."""
-    look = "import importlib.util as u, sys; sys.exit(0 if u.find_spec('bpy') else 3)"
+    """Raise SimulationError if `python` has no bpy, which is not loaded for this test."""
+    find = "import importlib.util as u, sys; sys.exit(0 if u.find_spec('bpy') else 3)"
     try:
-        found = subprocess.run([python, "-c", look], check=False).returncode
+        found = subprocess.run([python, "-c", find], check=False).returncode
     except OSError as error:
         raise SimulationError(f"python: cannot run {python}: {error.strerror}") from error
     if found != 0:
@@ -57,15 +56,14 @@ def simulate(
     Parameters
     ----------
     shots : sequence of (ShotSettings, Path)
-        Settings and folder of each. A folder holds `LEVEL.####.exr` and `meta.json`; frames that are there are left
-        alone, and a folder made with other settings is refused.
+        Settings and folder of each. A folder holds `LEVEL.####.exr` and `meta.json`; finished frames are skipped.
     jobs : int
-        Blender processes at a time. When there are fewer shots than jobs, the frames of a shot are shared out.
+        Blender processes at a time. With fewer shots than jobs, the frames of a shot are divided between processes.
     threads : int, optional
-        Of each process; None divides the machine's cores between the jobs.
+        Threads of each process; None divides the machine's cores between the jobs.
     python : str, optional
         An interpreter that has bpy; None: this one.
-    on_event : callable
+    on_event : callable, optional
         Called as `on_event(kind, shot folder, message)`, kind being `plan` or `frame`.
 
     Raises
@@ -84,7 +82,7 @@ def simulate(
     for shot, out in shots:
         metas[out] = read_meta(shot, out)
         out.mkdir(parents=True, exist_ok=True)
-        left = [frame for frame in shot.frames if missing(shot, out, frame)]
+        left = [frame for frame in shot.frames if samples_left(shot, out, frame)]
         for part in range(min(parts, len(left))):
             waiting.append((shot, out, left[part::parts]))
     running: list[_Worker] = []
@@ -96,11 +94,11 @@ def simulate(
                 shot, out, frames = waiting.popleft()
                 plan = metas[out].get("plan")
                 if plan is None and any(worker.out == out for worker in running):
-                    waiting.append((shot, out, frames))  # someone is planning this shot
+                    waiting.append((shot, out, frames))  # another process is planning this shot
                     continue
                 running.append(_Worker(shot, out, frames, plan, threads, python))
             for worker in list(running):
-                ended = worker.ended()  # asked first, so that nothing said before the end is missed
+                ended = worker.ended()  # before reading, so that no last message is missed
                 for message in worker.messages():
                     if "plan" in message:
                         metas[worker.out]["plan"] = message["plan"]
@@ -118,44 +116,16 @@ def simulate(
             worker.stop()
 
 
-def missing(shot: ShotSettings, out: Path, frame: int) -> int:
-    """Return how many samples per pixel of a frame are still to be rendered.
-
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    out : Path
-        Folder of the shot.
-    frame : int
-        Its number.
-
-    Returns
-    -------
-    int
-    """
+def samples_left(shot: ShotSettings, out: Path, frame: int) -> int:
+    """Return how many samples per pixel of a frame are still to be rendered, all levels together."""
     return sum(spp for name, spp in shot.pictures(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
 
 
 def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
-    """Read what a folder says of the shot in it.
+    """Read `meta.json` of a folder, which need not exist.
 
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    out : Path
-        The folder, which need not exist.
-
-    Returns
-    -------
-    dict
-        "shot", the settings as asked for; "seconds" by picture, and "plan" where there is one.
-
-    Raises
-    ------
-    ValueError
-        If the folder holds a shot with other settings, or its `meta.json` is not one.
+    Return "shot", the settings as asked for; "seconds" by render, and "plan" if the shot was planned. Raise ValueError
+    if the folder holds a shot with other settings, or an invalid `meta.json`.
     """
     path = out / "meta.json"
     asked = json.loads(json.dumps(shot.to_json()))
@@ -164,10 +134,11 @@ def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
     try:
         meta: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         there = meta["shot"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        there.setdefault("moving_objects", there.pop("movers", None))  # the name until version 0.2
+    except (AttributeError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: expected what ravg simulate writes, got {error!r}") from error
     for name, value in asked.items():
-        # More frames may be asked for; the ones there were rendered with the plan that is there.
+        # More frames may be asked for; the existing plan is kept.
         if name != "frames" and there.get(name) != value:
             raise ValueError(f"{out}: holds a shot with {name} {there.get(name)!r}, expected {value!r}")
     if there["frames"] != asked["frames"] and shot.scene in RANDOM:
@@ -180,19 +151,13 @@ def _write_meta(meta: dict[str, Any], out: Path) -> None:
 
 
 class _Worker:
-    """A Blender process, what it has said, and its end."""
+    """A Blender process and its messages."""
 
     def __init__(self, shot: ShotSettings, out: Path, frames: list[int], plan: Any, threads: int, python: str) -> None:
         self.out = out
         self._folder = tempfile.TemporaryDirectory(prefix="ravg-")
         job, log = Path(self._folder.name) / "job.json", Path(self._folder.name) / "log"
-        data = {
-            "shot": shot.to_json(),
-            "out": str(out.resolve()),
-            "frames": frames,
-            "plan": plan,
-            "threads": threads,
-        }
+        data = {"shot": shot.to_json(), "out": str(out.resolve()), "frames": frames, "plan": plan, "threads": threads}
         job.write_text(json.dumps(data), encoding="utf-8")
         self._log = log
         package = str(Path(__file__).parents[2])
@@ -207,7 +172,7 @@ class _Worker:
         if self._process.stdout is None:
             raise SimulationError("Blender: its output cannot be read")
         self._pipe = self._process.stdout
-        # A thread reads, as Python before 3.12 has no reading without waiting on Windows.
+        # A thread reads: Python before 3.12 has no non-blocking reads on Windows.
         self._lines: SimpleQueue[bytes] = SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -217,7 +182,7 @@ class _Worker:
             self._lines.put(line)
 
     def messages(self) -> list[dict[str, Any]]:
-        """Return what came since the last call."""
+        """Return the messages since the last call."""
         if self.ended():
             self._reader.join(5)  # seconds; it reads to the end of the pipe
         lines = [self._lines.get() for _ in range(self._lines.qsize())]
@@ -228,7 +193,7 @@ class _Worker:
         return self._process.poll() is not None
 
     def close(self) -> None:
-        """Clear up after the process; raise if it ended badly."""
+        """Remove the process's files; raise SimulationError if it failed."""
         self._pipe.close()
         lines = [line for line in self._log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         self._folder.cleanup()
@@ -237,7 +202,7 @@ class _Worker:
             raise SimulationError(f"{self.out}: Blender ended with {self._process.returncode}: {last}")
 
     def stop(self) -> None:
-        """End the process; what it was rendering is lost, what is finished stays."""
+        """End the process and remove unfinished renders; finished ones stay."""
         self._process.terminate()
         try:
             self._process.wait(5)
@@ -252,31 +217,11 @@ class _Worker:
 
 
 def shots_of(
-    scene: str, out: Path, count: int, spp: str, levels: str, first: ShotSettings
+    scene: str, out: Path, first_seed: int, count: int, settings: Callable[[str, int], ShotSettings]
 ) -> list[tuple[ShotSettings, Path]]:
-    """Return `count` shots with seeds that count up from that of `first`, and their folders.
+    """Return `count` shots, made by `settings(scene, seed)` with seeds that count up, and their folders.
 
     One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` and `test` into `out/NAME`.
-    Samples given as a range are drawn per shot.
-
-    Parameters
-    ----------
-    scene : str
-        Its name, or the path of a .blend file.
-    out : Path
-        Where the shots go.
-    count : int
-        How many.
-    spp : str
-        Samples per pixel, or LOW-HIGH.
-    levels : str
-        NAME=SAMPLES,…, where there are several.
-    first : ShotSettings
-        Of the first shot.
-
-    Returns
-    -------
-    list of (ShotSettings, Path)
     """
     if count < 1:
         raise ValueError(f"shots: got {count}, expected at least 1")
@@ -284,32 +229,15 @@ def shots_of(
     if kind in FIXED:
         if count > 1:
             raise ValueError(f"shots: got {count}, expected 1, as the {kind} shots are fixed")
-        chosen = parse_levels(levels, spp_of(spp, first.seed))
         if name:
-            return [(replace(first, levels=chosen), out)]
-        return [(replace(first, scene=f"{kind}:{name}", levels=chosen), out / name) for name in FIXED[kind]]
-    shots = []
-    for seed in range(first.seed, first.seed + count):
-        shot = replace(first, seed=seed, levels=parse_levels(levels, spp_of(spp, seed)))
-        shots.append((shot, out if count == 1 else out / f"{Path(scene).stem}_{seed:04d}"))
-    return shots
+            return [(settings(scene, first_seed), out)]
+        return [(settings(f"{kind}:{name}", first_seed), out / name) for name in FIXED[kind]]
+    seeds = range(first_seed, first_seed + count)
+    return [(settings(scene, seed), out if count == 1 else out / f"{Path(scene).stem}_{seed:04d}") for seed in seeds]
 
 
 def parse_size(text: str, name: str) -> tuple[int, int]:
-    """Read `WIDTHxHEIGHT`.
-
-    Parameters
-    ----------
-    text : str
-        What was given.
-    name : str
-        Of the option, for the error.
-
-    Returns
-    -------
-    (int, int)
-        Pixels across and down.
-    """
+    """Parse `WIDTHxHEIGHT` in pixels; `name` is the option's, for the error."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise ValueError(f"{name}: got {text!r}, expected WIDTHxHEIGHT")
@@ -317,7 +245,7 @@ def parse_size(text: str, name: str) -> tuple[int, int]:
 
 
 def parse_center(text: str) -> tuple[float, float]:
-    """Read `X,Y`, fractions of the camera's picture."""
+    """Parse `X,Y`, fractions of the film."""
     match = re.fullmatch(r"([01]?\.?\d+),([01]?\.?\d+)", text)
     if match is None or max(where := (float(match[1]), float(match[2]))) > 1:
         raise ValueError(f"center: got {text!r}, expected X,Y, both from 0 to 1")
@@ -325,7 +253,7 @@ def parse_center(text: str) -> tuple[float, float]:
 
 
 def parse_numbers(text: str) -> tuple[int, ...]:
-    """Read `1,4,7`, frames named one by one."""
+    """Parse frame numbers such as `1,4,7`."""
     if re.fullmatch(r"\d+(,\d+)*", text) is None:
         raise ValueError(f"reference frames: got {text!r}, expected numbers with commas between")
     return tuple(map(int, text.split(",")))

@@ -1,44 +1,52 @@
-"""Random shots, and shots of scenes from files. Every draw comes from the seed of the shot.
+"""Random shots, and shots of scenes from files. All random numbers come from the seed of the shot.
 
-A random shot is a *set* (room, studio, outdoors, night, wall), things in it, lights, a camera on a path, and a crop
-of its film-size picture. Units are metres, z is up. Brightness is left to `exposure`.
+A random shot is a *set* (room, studio, outdoors, night, wall), objects in it, lights, a camera on a path, and a crop
+of its film-size image. Lengths are metres, z is up. Brightness is left to `exposure`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 from mathutils import Vector
 
 from hybrid.simulate.effects import visible_points
-from hybrid.simulate.motion import MARGIN, add_motion, aim_crop, move_object, place_camera, set_crop, spawn
-from hybrid.simulate.props import fill_with_smoke, fur, hair_material
-from hybrid.simulate.shot import ShotSettings
-from hybrid.simulate.things import (
+from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera
+from hybrid.simulate.random_assets import (
+    add_bulb_sphere,
+    clutter,
+    color,
+    log_uniform,
+    material,
+    scatter,
+    set_emission,
+    set_world,
+    warm,
+    weighted_choice,
+)
+from hybrid.simulate.scene_assets import (
+    Point,
     Rng,
     add_box,
     add_lamp,
     add_mesh,
-    choose,
-    clutter,
-    color,
     fill_with_fog,
-    log_uniform,
-    material,
-    scatter,
-    set_world,
-    warm,
+    fill_with_smoke,
+    fur,
+    grid_faces,
+    hair_material,
 )
+from hybrid.simulate.shot import ShotSettings
+
+FOG_BOX = ((0, 0, 4), (28, 28, 9))  # center and size
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """A point worth looking at, and where the camera may stand."""
 
     focus: Vector
@@ -46,19 +54,15 @@ class View:
 
 
 def room_set(rng: Rng) -> View:
-    """Build a room with windows, furniture and things on it; lit from outside, by lamps, or both."""
+    """Build a room with windows, furniture and objects on it; lit from outside, by lamps, or both."""
     w, d, h = rng.uniform(3, 7), rng.uniform(4, 8), rng.uniform(2.4, 3.6)
-    walls, floor, ceiling = (
-        material(rng, "diffuse", True),
-        material(rng, None, True),
-        material(rng, "diffuse", True),
-    )
+    walls, floor, ceiling = (material(rng, surface, True) for surface in ("diffuse", None, "diffuse"))
     if floor.name.startswith(("glass", "emission", "mirror")):
         floor = material(rng, "plastic", True)
-    add_box((0, 0, -0.05), (w + 0.4, d + 0.4, 0.1), floor)
-    add_box((0, 0, h + 0.05), (w + 0.4, d + 0.4, 0.1), ceiling)
-    add_box((0, d / 2 + 0.1, h / 2), (w + 0.4, 0.2, h), walls)
-    add_box((0, -d / 2 - 0.1, h / 2), (w + 0.4, 0.2, h), walls)
+    for z, surface in ((-0.05, floor), (h + 0.05, ceiling)):
+        add_box((0, 0, z), (w + 0.4, d + 0.4, 0.1), surface)
+    for y in (d / 2 + 0.1, -d / 2 - 0.1):
+        add_box((0, y, h / 2), (w + 0.4, 0.2, h), walls)
     daylight = rng.random() < 0.7
     for side in (-1, 1):
         x = side * (w / 2 + 0.1)
@@ -79,14 +83,14 @@ def room_set(rng: Rng) -> View:
         else:
             add_box((x, 0, h / 2), (0.2, d, h), walls)
     if daylight:
-        set_world(rng, choose(rng, {"sky": 2, "image": 2, "constant": 1}), 1.0)
+        set_world(rng, weighted_choice(rng, {"sky": 2, "image": 2, "constant": 1}), 1.0)
         if rng.random() < 0.4:
             aim = Vector((rng.uniform(0.4, 1), rng.uniform(-0.5, 0.5), -rng.uniform(0.3, 0.9)))
             add_lamp("SUN", -10 * aim, log_uniform(rng, 2, 12), log_uniform(rng, 0.005, 0.05), (0, 0, 0), warm(rng))
     else:
         set_world(rng, "none", 0)
     for _ in range(int(rng.integers(0 if daylight else 1, 5))):
-        lamp = choose(rng, {"AREA": 2, "POINT": 2, "SPOT": 1})
+        lamp = weighted_choice(rng, {"AREA": 2, "POINT": 2, "SPOT": 1})
         position = (rng.uniform(-0.4, 0.4) * w, rng.uniform(-0.4, 0.4) * d, h - rng.uniform(0.05, 0.8))
         size = rng.uniform(0.2, 1.2) if lamp == "AREA" else log_uniform(rng, 0.01, 0.15)
         add_lamp(lamp, position, log_uniform(rng, 10, 80), size, (position[0], position[1], 0), warm(rng))
@@ -111,16 +115,8 @@ def room_set(rng: Rng) -> View:
     return View(Vector((x + rng.uniform(-0.3, 0.3) * tw, y, height + rng.uniform(-0.1, 0.4))), eye)
 
 
-def hang_picture(rng: Rng, position: Sequence[float]) -> None:
-    """Hang a framed picture, or now and then a mirror, on a wall that faces −y.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Where all chance comes from.
-    position : sequence of float
-        Of its middle, in metres.
-    """
+def hang_picture(rng: Rng, position: Point) -> None:
+    """Hang a framed picture, or now and then a mirror, around `position` on a wall that faces −y."""
     w, h = rng.uniform(0.3, 1.0), rng.uniform(0.3, 0.8)
     inside = material(rng, "mirror" if rng.random() < 0.2 else None)
     add_box(position, (w, 0.02, h), inside, "picture")
@@ -131,13 +127,10 @@ def hang_picture(rng: Rng, position: Sequence[float]) -> None:
 
 
 def studio_set(rng: Rng) -> View:
-    """Build a backdrop with a group of things on plinths, lit by area lamps, one perhaps behind slats."""
+    """Build a backdrop with a group of objects on plinths, lit by area lamps, one perhaps behind slats."""
     radius = log_uniform(rng, 0.5, 2.0)
-    add_box(
-        (0, 0, -0.05),
-        (30, 30, 0.1),
-        material(rng, choose(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True),
-    )
+    floor = material(rng, weighted_choice(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True)
+    add_box((0, 0, -0.05), (30, 30, 0.1), floor)
     if rng.random() < 0.7:
         add_box((0, radius * 2.5, 5), (30, 0.1, 10), material(rng, "diffuse", True))
     for _ in range(int(rng.integers(0, 4))):
@@ -145,11 +138,11 @@ def studio_set(rng: Rng) -> View:
         add_box((x, y, height / 2), (side, side, height), material(rng))
         clutter(rng, (x, y, height), (side / 3, side / 3), 4, (0.12 * radius, 0.4 * radius))
     clutter(rng, (0, 0, 0), (radius, radius), int(rng.integers(14, 36)), (0.08 * radius, 0.6 * radius))
-    set_world(rng, choose(rng, {"none": 2, "constant": 1, "image": 3}), log_uniform(rng, 0.05, 1))
+    set_world(rng, weighted_choice(rng, {"none": 2, "constant": 1, "image": 3}), log_uniform(rng, 0.05, 1))
     for k in range(int(rng.integers(1, 4))):
         angle, distance = rng.uniform(math.pi * 0.9, math.pi * 2.1), radius * rng.uniform(1.5, 3.5)
         position = Vector((distance * math.cos(angle), distance * math.sin(angle), radius * rng.uniform(0.8, 3)))
-        kind = choose(rng, {"AREA": 3, "SPOT": 1, "POINT": 1})
+        kind = weighted_choice(rng, {"AREA": 3, "SPOT": 1, "POINT": 1})
         size = radius * (rng.uniform(0.2, 1.5) if kind == "AREA" else log_uniform(rng, 0.01, 0.1))
         add_lamp(kind, position, 60 * distance**2 * log_uniform(rng, 0.3, 3), size, (0, 0, 0.2 * radius), warm(rng))
         if k == 0 and rng.random() < 0.3:
@@ -164,7 +157,7 @@ def studio_set(rng: Rng) -> View:
 
 
 def outdoor_set(rng: Rng) -> View:
-    """Build rough ground under a sky, with scattered instances, walls and things."""
+    """Build rough ground under a sky, with scattered instances, walls and objects."""
     side, n = 24.0, 160
     y, x = np.mgrid[:n, :n] / (n - 1) - 0.5
     height = np.zeros((n, n))
@@ -174,11 +167,10 @@ def outdoor_set(rng: Rng) -> View:
             height += 1.2 * 2.0 ** (-1.2 * octave) * np.sin(2 * np.pi * (kx * x + ky * y + rng.random()))
     height *= rng.uniform(0.1, 1.0) * np.clip(np.hypot(x, y) * 4, 0.1, 1)
     vertices = np.stack([x * side, y * side, height], -1).reshape(-1, 3)
-    k = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    ground = material(rng, choose(rng, {"diffuse": 4, "plastic": 1}), True)
-    add_mesh("ground", vertices, np.stack([k, k + 1, k + n + 1, k + n], -1), ground, smooth=True)
+    ground = material(rng, weighted_choice(rng, {"diffuse": 4, "plastic": 1}), True)
+    add_mesh("ground", vertices, grid_faces(n, n), ground, smooth=True)
 
-    def on_ground(spread: float, sizes: tuple[float, float]) -> tuple[Sequence[float], float]:
+    def on_ground(spread: float, sizes: tuple[float, float]) -> tuple[Point, float]:
         px, py = rng.normal(0, spread, 2).clip(-0.48 * side, 0.48 * side)
         size = log_uniform(rng, *sizes)
         i, j = int((py / side + 0.5) * (n - 1)), int((px / side + 0.5) * (n - 1))
@@ -190,8 +182,8 @@ def outdoor_set(rng: Rng) -> View:
     for _ in range(int(rng.integers(1, 6))):
         size = tuple(map(float, rng.uniform(1, 5, 3)))
         position = (rng.uniform(-8, 8), rng.uniform(3, 11), size[2] / 2 - 0.2)
-        add_box(position, size, material(rng, choose(rng, {"diffuse": 3, "plastic": 1}), True))
-    set_world(rng, choose(rng, {"sky": 3, "image": 2}), 1.0)
+        add_box(position, size, material(rng, weighted_choice(rng, {"diffuse": 3, "plastic": 1}), True))
+    set_world(rng, weighted_choice(rng, {"sky": 3, "image": 2}), 1.0)
     if rng.random() < 0.3:
         add_lamp("SUN", (0, 0, 9), log_uniform(rng, 1, 6), 0.01, (*rng.normal(0, 5, 2), 0.0), warm(rng))
     angle, distance = rng.uniform(-0.7, 0.7), rng.uniform(2.5, 6)
@@ -201,13 +193,10 @@ def outdoor_set(rng: Rng) -> View:
 
 def night_set(rng: Rng) -> View:
     """Build columns and blocks on a glossy floor, lit by many small bright lights."""
-    add_box(
-        (0, 0, -0.05),
-        (40, 40, 0.1),
-        material(rng, choose(rng, {"plastic": 2, "coated": 1, "metal": 1}), True),
-    )
+    floor = material(rng, weighted_choice(rng, {"plastic": 2, "coated": 1, "metal": 1}), True)
+    add_box((0, 0, -0.05), (40, 40, 0.1), floor)
     add_box((0, 8, 3), (30, 0.2, 8), material(rng, "diffuse", True))
-    stone = [material(rng, choose(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True) for _ in range(3)]
+    stone = [material(rng, weighted_choice(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True) for _ in range(3)]
     for _ in range(int(rng.integers(8, 24))):
         x, y = rng.uniform(-6, 6), rng.uniform(0.5, 7.5)
         size = (*rng.uniform(0.2, 1.0, 2), rng.uniform(0.3, 4))
@@ -216,16 +205,14 @@ def night_set(rng: Rng) -> View:
     hues = [color(rng, 1.0) for _ in range(4)]
     bulbs = int(log_uniform(rng, 8, 70))
     glow = [material(rng, "emission") for _ in hues]
-    for lamp, hue in zip(glow, hues, strict=True):
-        lamp.node_tree.nodes["Principled BSDF"].inputs["Emission Color"].default_value = hue
-        lamp.node_tree.nodes["Principled BSDF"].inputs["Emission Strength"].default_value = log_uniform(rng, 30, 300)
+    for surface, hue in zip(glow, hues, strict=True):
+        set_emission(surface, hue, log_uniform(rng, 30, 300))
     for number in range(bulbs):
         position = (rng.uniform(-5, 5), rng.uniform(-3, 7), rng.uniform(0.2, 3.5))
         if number % 2:
             add_lamp("POINT", position, log_uniform(rng, 2, 40), 0.03, (0, 0, 0), hues[number % 4][:3])
         else:
-            bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, radius=rng.uniform(0.015, 0.06), location=position)
-            bpy.context.active_object.data.materials.append(glow[number % 4])
+            add_bulb_sphere(rng.uniform(0.015, 0.06), position, glow[number % 4])
     set_world(rng, "constant", 0.02)
     eye = Vector((rng.uniform(-2, 2), -rng.uniform(3, 6), rng.uniform(0.5, 1.8)))
     return View(Vector((rng.uniform(-1, 1), rng.uniform(-0.5, 1), rng.uniform(0.1, 0.8))), eye)
@@ -238,22 +225,21 @@ def wall_set(rng: Rng) -> View:
     for _ in range(int(rng.integers(3, 9))):
         hang_picture(rng, (rng.uniform(-3, 3), -0.02, rng.uniform(0.5, 2.6)))
 
-    def on_wall() -> tuple[Sequence[float], float]:
+    def on_wall() -> tuple[Point, float]:
         return (rng.uniform(-3.5, 3.5), -rng.uniform(0, 0.15), rng.uniform(0.2, 3.2)), log_uniform(rng, 0.06, 0.5)
 
     scatter(rng, int(rng.integers(30, 120)), on_wall, 6)
     clutter(rng, (0, -0.6, 0), (3, 0.4), int(rng.integers(8, 20)), (0.15, 0.8))
-    set_world(rng, choose(rng, {"none": 1, "constant": 2, "image": 3}), log_uniform(rng, 0.1, 1))
+    set_world(rng, weighted_choice(rng, {"none": 1, "constant": 2, "image": 3}), log_uniform(rng, 0.1, 1))
     for _ in range(int(rng.integers(1, 4))):
         position = (rng.choice([-1, 1]) * rng.uniform(1, 5), -rng.uniform(0.5, 3), rng.uniform(1, 4))
-        kind = choose(rng, {"AREA": 2, "SPOT": 1, "POINT": 1})
+        kind = weighted_choice(rng, {"AREA": 2, "SPOT": 1, "POINT": 1})
         add_lamp(kind, position, log_uniform(rng, 100, 900), rng.uniform(0.05, 0.8), (0, 0, 1.2), warm(rng))
     x = rng.uniform(-2, 2)
     eye = Vector((x + rng.uniform(-1.5, 1.5), -rng.uniform(1.8, 4), rng.uniform(0.8, 2)))
     return View(Vector((x, -0.1, rng.uniform(0.5, 2))), eye)
 
 
-CREDIT = ("title", "author", "licence", "licence_url", "original")
 SETS: dict[str, tuple[float, Callable[[Rng], View]]] = {
     "room": (0.32, room_set),
     "studio": (0.26, studio_set),
@@ -261,33 +247,28 @@ SETS: dict[str, tuple[float, Callable[[Rng], View]]] = {
     "night": (0.12, night_set),
     "wall": (0.12, wall_set),
 }
-
-
 HARD = {"hair": 0.21, "glass": 0.21, "metal": 0.19, "lens": 0.19, "volume": 0.06, "dim": 0.14}
 HAIRY = {"sphere": 2.0, "monkey": 1.0, "blob": 1.0}
 SHAPES = {"turned": 4, "sphere": 1, "torus": 1.5, "monkey": 1.5, "box": 1, "cage": 1, "blob": 1, "text": 0.5}
+# The materials of what each of HARD adds; None is a random one.
+SURFACES: dict[str, tuple[str | None, ...]] = {
+    "hair": ("diffuse",),
+    "glass": ("glass",),
+    "metal": ("metal", "metal", "mirror"),
+    "lens": (None,),
+}
+FILMS = {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18}  # 0x0: no more than is rendered
+CREDIT = ("title", "author", "licence", "licence_url", "original")
 
 
 def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
-    """Build a random shot in an empty Blender scene; return what it came to be.
+    """Build a random shot in an empty Blender scene; return its description.
 
-    Every attempt with one seed is another shot: when the first shows nothing, the next is tried. A shot of `hard` is
-    one of `random` with one to three of `HARD` in it.
-
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    attempt : int
-        Which of the shots of one seed.
-
-    Returns
-    -------
-    dict
-        Its description.
+    Each attempt with one seed is another shot: when the first shows nothing, the next is tried. A shot of `hard` is
+    the one of `random` with one to three of `HARD` added.
     """
     rng = np.random.default_rng([shot.seed, attempt])
-    # Drawn apart, so that the same seeds give the same random shots with what is hard and without.
+    # A generator of its own, so that the same seeds give the same random shots with `HARD` and without.
     hard_rng = np.random.default_rng([shot.seed, attempt, 1])
     hard: list[str] = []
     if shot.scene == "hard":
@@ -295,16 +276,13 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
         hard = sorted(hard_rng.choice(list(HARD), count, replace=False, p=list(HARD.values())).tolist())
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
-    scene.frame_set(shot.frames[len(shot.frames) // 2])
-    kind = choose(rng, {name: weight for name, (weight, _) in SETS.items()})
+    scene.frame_start, scene.frame_end = shot.keyed[0], shot.keyed[-1]
+    scene.frame_set(shot.middle)
+    kind = weighted_choice(rng, {name: weight for name, (weight, _) in SETS.items()})
     view = SETS[kind][1](rng)
     camera = place_camera(rng, view.focus, view.eye)
     film = shot.film or draw_film(rng, shot.size)
-    set_crop(scene.render, film, shot.size, shot.center or (0.5, 0.5))
-    center = shot.center or (0.5, 0.5)
-    if shot.center is None and film != shot.size:
-        center = aim_crop(rng, shot, film)
+    center = frame_crop(rng, shot, film)
     added = [motion for name in hard for motion in make_hard(hard_rng, shot, name)]
     if rng.random() < 0.15 or "lens" in hard:
         points = visible_points(scene)
@@ -312,12 +290,12 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
         camera.data.dof.use_dof, camera.data.dof.focus_distance = True, focus
         camera.data.dof.aperture_fstop = log_uniform(rng, 0.7, 5.6)
         if "lens" in hard:
-            open_aperture(camera, [(position - camera.location).length for position, _ in points],
-                          log_uniform(hard_rng, 4, 25) / film[0])  # fmt: skip
+            distances = [(position - camera.location).length for position, _ in points]
+            open_aperture(camera, distances, log_uniform(hard_rng, 4, 25) / film[0])
     if rng.random() < 0.04:
-        density = log_uniform(rng, 0.1, 0.6) / (view.focus - view.eye).length  # so deep is the fog up to the focus
-        fill_with_fog((0, 0, 4), (28, 28, 9), density, rng.uniform(0, 0.7))
-    motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_things=True)
+        density = log_uniform(rng, 0.1, 0.6) / (view.focus - view.eye).length  # the optical depth up to the focus
+        fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
+    motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_objects=True)
     return {
         "set": kind,
         **({"hard": hard, "added": added} if hard else {}),
@@ -328,89 +306,77 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
     }
 
 
-def open_aperture(camera: Any, distances: Sequence[float], blur: float) -> None:
-    """Open the aperture until what is farthest out of focus is a disc of `blur` times the picture's width.
+def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
+    """Draw the size of the whole image, at least `size`: mostly that of a film."""
+    width, height = map(int, weighted_choice(rng, FILMS).split("x"))
+    return max(width, size[0]), max(height, size[1])
 
-    Parameters
-    ----------
-    camera : bpy.types.Object
-        The camera.
-    distances : sequence of float
-        Of what is seen, in metres.
-    blur : float
-        Share of the picture's width.
-    """
+
+def open_aperture(camera: Any, distances: list[float], blur: float) -> None:
+    """Set the aperture at which the most defocused of `distances` has a disc of `blur` times the image's width."""
     data = camera.data
     # The disc's diameter on the sensor is that of the aperture times lens · |1/focus − 1/distance|.
     apart = max((abs(1 / data.dof.focus_distance - 1 / distance) for distance in distances), default=0.0)
-    diameter = blur * data.sensor_width / data.lens / max(apart, 1e-3)  # metres; a flat picture has no blur to make
+    diameter = blur * data.sensor_width / data.lens / max(apart, 1e-3)  # metres; a flat scene has no defocus
     data.dof.aperture_fstop = max(data.lens / 1000 / diameter, 0.1)
 
 
 def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
-    """Put one of `HARD` into a scene whose camera stands; return how what was added moves.
+    """Add one of `HARD` to a scene with a camera; return the motion of the added objects.
 
-    An open aperture is up to `random_shot`; for it, things are added that float before and behind the focus.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Where all chance comes from.
-    shot : ShotSettings
-        What is asked for.
-    name : str
-        One of `HARD`.
-
-    Returns
-    -------
-    list of dict
-        How what was added moves.
+    The aperture of `lens` is opened by `random_shot`; here floating objects before and behind the focus are added.
     """
-    scene = bpy.context.scene
-    first, last = shot.frames[0] - MARGIN, shot.frames[-1] + MARGIN
     if name == "dim":
-        dim(rng)
+        light_by_bulbs(rng)
         return []
     if name == "volume":
-        points = visible_points(scene)
-        eye = scene.camera.matrix_world.translation
-        focus = points[int(rng.integers(len(points)))][0] if points else Vector((0, 0, 0.5))
-        distance = (focus - eye).length
-        deep = log_uniform(rng, 0.15, 1.0) / distance  # so deep up to what is looked at
-        if rng.random() < 0.5:
-            fill_with_fog((0, 0, 4), (28, 28, 9), deep, rng.uniform(0, 0.7))
-        else:
-            scale = log_uniform(rng, 1, 5) / distance
-            fill_with_smoke(range(first, last + 1), (0, 0, 4), (28, 28, 9), (0.2 * deep, 2 * deep), scale,
-                            rng.uniform(0, 0.7))  # fmt: skip
-        # A beam through it, from the side, between the camera and what it looks at.
-        aim = eye.lerp(focus, float(rng.uniform(0.5, 1)))
-        side = Vector(scene.camera.matrix_world.to_3x3().col[0]) * float(rng.choice([-1, 1]) * rng.uniform(0.4, 1))
-        source = aim + distance * (side + Vector((0, 0, rng.uniform(0.2, 0.9))))
-        beam = add_lamp("SPOT", source, 400 * distance**2 * log_uniform(rng, 0.3, 3), 0.02 * distance, aim, warm(rng))
-        beam.data.spot_size, beam.data.spot_blend = float(rng.uniform(0.12, 0.6)), float(rng.uniform(0, 0.4))
+        add_volume(rng, shot)
         return []
-    surfaces = {"hair": ("diffuse",), "glass": ("glass",), "metal": ("metal", "metal", "mirror"), "lens": (None,)}[name]
     motions = []
+    surfaces = SURFACES[name]
     for _ in range(int(rng.integers(2, 5))):
         surface = surfaces[int(rng.integers(len(surfaces)))]
-        item = spawn(rng, shot, surface, choose(rng, HAIRY if name == "hair" else SHAPES))
+        item = add_floating(rng, shot, surface, weighted_choice(rng, HAIRY if name == "hair" else SHAPES))
         if name == "hair":
-            if rng.random() < 0.7:
-                coat = hair_material(float(rng.uniform(0.05, 0.95)), float(rng.uniform(0, 1)), rng.uniform(0.15, 0.5))
-            else:
-                coat = material(rng, "diffuse")
-            lean, length = [*rng.normal(0, 0.3, 2), rng.normal(-0.4, 0.3)], log_uniform(rng, 0.06, 0.35)
-            fur(rng, item, int(log_uniform(rng, 3000, 16000)), length, coat, radius=log_uniform(rng, 0.0012, 0.005),
-                lean=lean, wave=rng.uniform(0, 0.6), clumps=int(log_uniform(rng, 40, 400)),
-                clump=rng.uniform(0, 0.8))  # fmt: skip
+            add_random_fur(rng, item)
         if rng.random() < 0.75:
             motions.append(move_object(rng, shot, item, "turn" if name == "metal" else None))
     return motions
 
 
-def dim(rng: Rng) -> None:
-    """Put out all lights of a scene, and light it by small bulbs instead, some of them in the picture."""
+def add_random_fur(rng: Rng, item: Any) -> None:
+    """Cover an object with hair of random color, length and curl."""
+    if rng.random() < 0.7:
+        coat = hair_material(float(rng.uniform(0.05, 0.95)), float(rng.uniform(0, 1)), rng.uniform(0.15, 0.5))
+    else:
+        coat = material(rng, "diffuse")
+    lean, length = [*rng.normal(0, 0.3, 2), rng.normal(-0.4, 0.3)], log_uniform(rng, 0.06, 0.35)
+    fur(rng, item, int(log_uniform(rng, 3000, 16000)), length, coat, radius=log_uniform(rng, 0.0012, 0.005), lean=lean,
+        wave=rng.uniform(0, 0.6), clumps=int(log_uniform(rng, 40, 400)), clump=rng.uniform(0, 0.8))  # fmt: skip
+
+
+def add_volume(rng: Rng, shot: ShotSettings) -> None:
+    """Fill the scene with fog or smoke, and add a spot light's beam from the side that crosses the view."""
+    scene = bpy.context.scene
+    points = visible_points(scene)
+    eye = scene.camera.matrix_world.translation
+    focus = points[int(rng.integers(len(points)))][0] if points else Vector((0, 0, 0.5))
+    distance = (focus - eye).length
+    density = log_uniform(rng, 0.15, 1.0) / distance  # the optical depth up to the focus
+    if rng.random() < 0.5:
+        fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
+    else:
+        scale = log_uniform(rng, 1, 5) / distance
+        fill_with_smoke(shot.keyed, *FOG_BOX, (0.2 * density, 2 * density), scale, rng.uniform(0, 0.7))
+    aim = eye.lerp(focus, float(rng.uniform(0.5, 1)))
+    side = Vector(scene.camera.matrix_world.to_3x3().col[0]) * float(rng.choice([-1, 1]) * rng.uniform(0.4, 1))
+    source = aim + distance * (side + Vector((0, 0, rng.uniform(0.2, 0.9))))
+    beam = add_lamp("SPOT", source, 400 * distance**2 * log_uniform(rng, 0.3, 3), 0.02 * distance, aim, warm(rng))
+    beam.data.spot_size, beam.data.spot_blend = float(rng.uniform(0.12, 0.6)), float(rng.uniform(0, 0.4))
+
+
+def light_by_bulbs(rng: Rng) -> None:
+    """Replace all lights of a scene by small bulbs, some of them visible."""
     scene = bpy.context.scene
     for item in [item for item in scene.objects if item.type == "LIGHT"]:
         bpy.data.objects.remove(item)
@@ -420,11 +386,9 @@ def dim(rng: Rng) -> None:
     distance = float(np.median([(position - eye).length for position in points]))
     shades = [material(rng, "emission") for _ in range(3)]
     for shade in shades:
-        inputs = shade.node_tree.nodes["Principled BSDF"].inputs
-        inputs["Emission Color"].default_value = (*warm(rng), 1)
-        inputs["Emission Strength"].default_value = log_uniform(rng, 50, 500)
+        set_emission(shade, (*warm(rng), 1), log_uniform(rng, 50, 500))
     for number in range(int(log_uniform(rng, 5, 40))):
-        # In front of what is seen and around it, as far as the picture is wide.
+        # In front of a visible point, spread by an eighth of the distance.
         behind = points[int(rng.integers(len(points)))]
         where = eye.lerp(behind, float(rng.uniform(0.6, 0.95))) + Vector(rng.normal(0, 0.12 * distance, 3))
         where.z = max(where.z, 0.03)
@@ -432,32 +396,11 @@ def dim(rng: Rng) -> None:
         if number % 2:
             add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
         else:
-            bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, radius=radius, location=where)
-            bpy.context.active_object.data.materials.append(shades[number // 2 % 3])
+            add_bulb_sphere(radius, where, shades[number // 2 % 3])
 
 
-def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
-    """Draw the size of the whole picture: mostly that of a film, sometimes no more than what is rendered.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Where all chance comes from.
-    size : (int, int)
-        Pixels that are rendered.
-
-    Returns
-    -------
-    (int, int)
-        Pixels across and down.
-    """
-    drawn = choose(rng, {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18})
-    width, height = map(int, drawn.split("x"))
-    return max(width, size[0]), max(height, size[1])
-
-
-def open_shot(shot: ShotSettings) -> dict[str, Any]:
-    """Open a .blend file, choose its camera and crop, and give it motion where it has none."""
+def file_shot(shot: ShotSettings) -> dict[str, Any]:
+    """Open a .blend file, choose its camera and crop, and add motion where it has none; return its description."""
     bpy.ops.wm.open_mainfile(filepath=str(Path(shot.scene).resolve()))
     scene = bpy.context.scene
     rng = np.random.default_rng([shot.seed, 0])
@@ -468,56 +411,45 @@ def open_shot(shot: ShotSettings) -> dict[str, Any]:
         scene.camera = scene.objects[str(rng.choice(cameras)) if shot.camera == "random" else shot.camera]
     if scene.camera is None:
         raise ValueError(f"scene: {shot.scene} has no camera")
-    scene.frame_set(shot.frames[len(shot.frames) // 2])
+    scene.frame_set(shot.middle)
     film = shot.film or shot.size
-    set_crop(scene.render, film, shot.size, shot.center or (0.5, 0.5))
-    center = shot.center or (0.5, 0.5)
-    if shot.center is None and film != shot.size:
-        center = aim_crop(rng, shot, film)
+    center = frame_crop(rng, shot, film)
     description: dict[str, Any] = {
         "camera_name": scene.camera.name, "film": list(film), "center": [round(c, 4) for c in center],
         "credit": {key: scene[key] for key in CREDIT if key in scene},
     }  # fmt: skip
     animated = any(item.animation_data is not None and item.animation_data.action for item in scene.objects)
     if shot.motion == "add" or (shot.motion == "auto" and not animated):
-        description |= add_motion(rng, shot, own_things=False)
+        description |= add_motion(rng, shot, own_objects=False)
     return description
 
 
-def worth_rendering(passes: dict[str, np.ndarray]) -> str | None:
-    """Return why a pilot's picture is not worth rendering, or None if it is."""
-    radiance = np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1)
+def rejection(passes: dict[str, np.ndarray]) -> str | None:
+    """Return why the pilot of a random shot is not worth rendering, or None if it is."""
+    radiance = _mean_radiance(passes)
     guides = np.concatenate([passes["Denoising Albedo"], passes["Denoising Normal"]], axis=-1).astype(np.float32)
     if (radiance <= 1e-3 * radiance.mean()).mean() > 0.4:
         return "most of it is black"
     if (passes["Depth"] > 1e9).mean() > 0.6:
         return "most of it is sky"
     if np.linalg.norm(guides.std(axis=(0, 1))) < 0.12:
-        return "there is next to nothing to see"
+        return "it shows next to nothing"
     if np.quantile(radiance, 0.98) > 300 * np.quantile(radiance, 0.3):
         return "one light drowns everything else"
     return None
 
 
 def exposure(shot: ShotSettings, passes: dict[str, np.ndarray]) -> float:
-    """Return a factor that puts the picture's geometric mean some stops (σ 1.1, at most 2.5) around middle grey.
-
-    Parameters
-    ----------
-    shot : ShotSettings
-        What is asked for.
-    passes : dict of str to array
-        Of a pilot, from `cycles.render_small`.
-
-    Returns
-    -------
-    float
-        The factor.
-    """
+    """Return a factor that puts a pilot's geometric mean some stops (σ 1.1, at most 2.5) around middle grey."""
     rng = np.random.default_rng([shot.seed, 99])
-    radiance = np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1)
+    radiance = _mean_radiance(passes)
     # Blocks, because single pixels of a few samples are black or very bright by chance.
     h, w = (n // 4 * 4 for n in radiance.shape)
     blocks = radiance[:h, :w].reshape(h // 4, 4, w // 4, 4).mean(axis=(1, 3)) if h and w else radiance
     middle = float(np.exp(np.log(blocks + 1e-3 * blocks.mean()).mean()))
     return 0.18 / middle * 2 ** float(np.clip(rng.normal(0, 1.1), -2.5, 2.5))
+
+
+def _mean_radiance(passes: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the mean of red, green and blue of a pilot, (H, W)."""
+    return np.asarray(np.nan_to_num(passes["Combined"][..., :3].astype(np.float32)).mean(axis=-1))

@@ -1,4 +1,4 @@
-"""What is asked for: one shot to simulate, in plain data."""
+"""The settings of one simulated shot, as plain data."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-RANDOM = ("random", "hard")  # shots that are drawn from the seed; the second kind holds what is hard to denoise
-# The fixed shots, by kind: to choose by, and to judge on.
+RANDOM = ("random", "hard")  # shots drawn from the seed; the second kind holds what is hard to denoise
+# Fixed shots by kind: to validate with, and to test on.
 FIXED = {
     "validation": ("table", "night", "garden"),
     "test": ("lens", "closeup", "lamps", "shadow", "volume"),
 }
+MARGIN = 4  # frames keyed before and after the shot, so that vectors are valid on its first and last frame
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class ShotSettings:
     """One shot: everything needed to render it again, given the scene.
 
     `size` is what is rendered, a crop around `center` of a camera of `film` pixels. `film`, `center` and `camera`
-    may be None: drawn from the seed for random shots, else the whole picture of the scene's own camera.
+    may be None: drawn from the seed for random shots, else the whole image of the scene's own camera.
     """
 
     scene: str  # a .blend file, one of RANDOM, or "KIND:NAME", a fixed shot
@@ -30,13 +31,13 @@ class ShotSettings:
     frames: tuple[int, ...]
     size: tuple[int, int]
     levels: dict[str, int]  # name → samples per pixel
-    reference: int = 0  # samples per pixel in all; 0: none
+    reference: int = 0  # samples per pixel of both halves together; 0: no reference
     reference_frames: tuple[int, ...] | None = None  # None: all
     film: tuple[int, int] | None = None
-    center: tuple[float, float] | None = None
+    center: tuple[float, float] | None = None  # fractions of the film, y down
     camera: str | None = None
     motion: str = "auto"  # auto: only where the scene has none; keep; add
-    movers: int | None = None  # objects to add; None: drawn, where motion is added
+    moving_objects: int | None = None  # objects to add; None: drawn, where motion is added
     motion_blur: bool = False
     halves: bool = False
     effects: str = "auto"  # or all
@@ -65,8 +66,18 @@ class ShotSettings:
         if self.effects not in ("auto", "all"):
             raise ValueError(f"effects: got {self.effects!r}, expected auto or all")
 
+    @property
+    def middle(self) -> int:
+        """The frame at which a scene is built."""
+        return self.frames[len(self.frames) // 2]
+
+    @property
+    def keyed(self) -> range:
+        """The frames that motion is keyed on: those of the shot and `MARGIN` on each side."""
+        return range(self.frames[0] - MARGIN, self.frames[-1] + MARGIN + 1)
+
     def pictures(self, frame: int) -> dict[str, int]:
-        """Return the pictures of a frame: name of the level, or `reference` → samples per pixel."""
+        """Return the renders of a frame: name of the level, or `reference` → samples per pixel."""
         referenced = self.reference and (self.reference_frames is None or frame in self.reference_frames)
         return {**self.levels, **({"reference": self.reference} if referenced else {})}
 
@@ -77,46 +88,21 @@ class ShotSettings:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> ShotSettings:
         """Return the settings that `to_json` wrote."""
-        pairs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-        return cls(**pairs)
+        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in data.items()}
+        return cls(**values)
 
 
 def frame_seed(seed: int, level: str, frame: int) -> int:
-    """Return the seed of one picture, in [0, 2³¹): unrelated to that of any other frame, level or shot.
-
-    Parameters
-    ----------
-    seed : int
-        Of the shot.
-    level : str
-        Its name.
-    frame : int
-        Its number.
-
-    Returns
-    -------
-    int
-        In [0, 2³¹).
-    """
+    """Return the seed of one render, in [0, 2³¹): unrelated to that of any other frame, level or shot."""
     digest = hashlib.sha256(f"{seed} {level} {frame}".encode()).digest()
     return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
 
 
 def parse_levels(text: str, samples: int) -> dict[str, int]:
-    """Read noise levels: `n,n/e,4`, or with names, `noisy=n,half=n/2`.
+    """Parse noise levels such as `n,n/e,4` or `noisy=n,half=n/2` into name → samples per pixel.
 
-    Parameters
-    ----------
-    text : str
-        Levels, with commas between; each a number, `n`, or `n/NUMBER` (`e` being Euler's), with or without a name.
-        Levels without a name are called `noisy` if there is one, `a`, `b`, `c`, … otherwise.
-    samples : int
-        n, samples per pixel.
-
-    Returns
-    -------
-    dict
-        Name → samples per pixel, rounded down, at least 1.
+    Each level is a number, `n` (= `samples`), or `n/NUMBER` (`e` is Euler's), rounded down, at least 1. A single level
+    without a name is called `noisy`, several are called `a`, `b`, `c`, …
     """
     parts = text.replace(" ", "").split(",")
     levels: dict[str, int] = {}
@@ -135,21 +121,8 @@ def parse_levels(text: str, samples: int) -> dict[str, int]:
     return levels
 
 
-def spp_of(text: str, seed: int) -> int:
-    """Read samples per pixel: a number, or `LOW-HIGH`, from which the seed draws (uniformly in the logarithm).
-
-    Parameters
-    ----------
-    text : str
-        A number, or `LOW-HIGH`.
-    seed : int
-        Of the draw.
-
-    Returns
-    -------
-    int
-        Samples per pixel.
-    """
+def parse_samples(text: str, seed: int) -> int:
+    """Parse samples per pixel: a number, or `LOW-HIGH`, from which the seed draws uniformly in the logarithm."""
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
     if match is None or int(match[1]) < 1 or (match[2] is not None and int(match[2]) < int(match[1])):
         raise ValueError(f"spp: got {text!r}, expected a number or LOW-HIGH, from 1 up")

@@ -238,7 +238,7 @@ def test_vectors_follow_what_bends_and_hair(blur, scene, tmp_path):
     """A sheet whose shape key moves every vertex by a known amount a frame, and fur that flies: 10 px are a unit."""
     import bpy
 
-    from hybrid.simulate import cycles, things
+    from hybrid.simulate import cycles, random_assets
 
     shot = ShotSettings(str(scene), 1, (1, 2), SIZE, {"n": 16}, motion_blur=blur)
     cycles.build(shot, 0, 2)
@@ -251,7 +251,7 @@ def test_vectors_follow_what_bends_and_hair(blur, scene, tmp_path):
         x, y, _ = vertex.co
         point.co = (x + 0.2 * np.sin(2 * y), y + 0.1 * x, 0)
     bent.slider_min, bent.slider_max = -5, 5
-    fur = things.add_fur(np.random.default_rng(1), sheet.active_material)
+    fur = random_assets.hair_ball(np.random.default_rng(1), sheet.active_material)
     fur.scale = (3, 3, 3)
     for frame in range(-3, 6):
         bent.value = frame - 1

@@ -12,14 +12,15 @@ from hybrid.cli import main
 from hybrid.simulate.run import (
     SimulationError,
     check_blender,
-    missing,
     parse_center,
     parse_numbers,
     parse_size,
+    read_meta,
+    samples_left,
     shots_of,
     simulate,
 )
-from hybrid.simulate.shot import ShotSettings, frame_seed, parse_levels, spp_of
+from hybrid.simulate.shot import ShotSettings, frame_seed, parse_levels, parse_samples
 
 ROOT = Path(__file__).parents[3]
 SHOT = ShotSettings("random", 3, (1, 2, 3), (64, 36), {"a": 8, "b": 8, "c": 2})
@@ -74,16 +75,16 @@ def test_levels_that_are_none_are_refused(text):
 
 
 def test_samples_are_drawn_from_a_range_by_the_seed():
-    drawn = [spp_of("8-64", seed) for seed in range(400)]
-    assert drawn == [spp_of("8-64", seed) for seed in range(400)]
+    drawn = [parse_samples("8-64", seed) for seed in range(400)]
+    assert drawn == [parse_samples("8-64", seed) for seed in range(400)]
     assert min(drawn) == 8
     assert max(drawn) <= 64
     # Uniform in the logarithm: the median of 8 … 64 is √(8·65) ≈ 22.8; of 400 draws within ±3 with 99 %.
     assert abs(sorted(drawn)[200] - 22.8) < 4
-    assert spp_of("16", 5) == 16
+    assert parse_samples("16", 5) == 16
     for wrong in ("0", "8-4", "x"):
         with pytest.raises(ValueError, match="spp"):
-            spp_of(wrong, 1)
+            parse_samples(wrong, 1)
 
 
 def test_seeds_differ_between_frames_levels_and_shots():
@@ -136,12 +137,19 @@ def test_only_the_frames_that_are_named_get_a_reference():
     assert SHOT.pictures(1) == SHOT.levels, "no reference was asked for"
 
 
+def settings(spp, levels):
+    """Return what makes settings of a scene and a seed, as the command does."""
+    return lambda scene, seed: replace(
+        SHOT, scene=scene, seed=seed, levels=parse_levels(levels, parse_samples(spp, seed))
+    )
+
+
 def test_a_data_set_is_many_seeds_each_in_its_folder(tmp_path):
-    shots = shots_of("random", tmp_path, 3, "8-64", "n,n,n/e", SHOT)
+    shots = shots_of("random", tmp_path, 3, 3, settings("8-64", "n,n,n/e"))
     assert [folder.name for _, folder in shots] == ["random_0003", "random_0004", "random_0005"]
     assert all(shot.levels["a"] == shot.levels["b"] > shot.levels["c"] for shot, _ in shots)
-    assert shots_of("random", tmp_path, 1, "8", "n", SHOT)[0][1] == tmp_path
-    hard = shots_of("hard", tmp_path, 2, "8", "n", replace(SHOT, scene="hard"))
+    assert shots_of("random", tmp_path, 3, 1, settings("8", "n"))[0][1] == tmp_path
+    hard = shots_of("hard", tmp_path, 3, 2, settings("8", "n"))
     assert [(shot.scene, folder.name) for shot, folder in hard] == [("hard", "hard_0003"), ("hard", "hard_0004")]
 
 
@@ -153,14 +161,14 @@ def test_a_data_set_is_many_seeds_each_in_its_folder(tmp_path):
     ],
 )
 def test_fixed_shots_come_all_together_or_one_by_one(kind, names, tmp_path):
-    shots = shots_of(kind, tmp_path, 1, "32", "noisy=n,half=n/e", SHOT)
+    make = settings("32", "noisy=n,half=n/e")
+    shots = shots_of(kind, tmp_path, 3, 1, make)
     assert [(shot.scene, folder) for shot, folder in shots] == [(f"{kind}:{name}", tmp_path / name) for name in names]
-    first = replace(SHOT, scene=f"{kind}:{names[0]}")
-    assert shots_of(first.scene, tmp_path, 1, "32", "noisy=n,half=n/e", first) == [(shots[0][0], tmp_path)]
+    assert shots_of(f"{kind}:{names[0]}", tmp_path, 3, 1, make) == [(shots[0][0], tmp_path)]
     assert shots[0][0].levels == {"noisy": 32, "half": 11}
-    for scene in (kind, first.scene):
+    for scene in (kind, f"{kind}:{names[0]}"):
         with pytest.raises(ValueError, match=f"shots: got 2, expected 1, as the {kind} shots are fixed"):
-            shots_of(scene, tmp_path, 2, "8", "n", first)
+            shots_of(scene, tmp_path, 3, 2, make)
 
 
 def test_a_shot_is_rendered_and_described(tmp_path, stub):
@@ -179,7 +187,7 @@ def test_going_on_leaves_finished_frames_untouched(tmp_path, stub):
     simulate([(SHOT, out)], python=python)
     before = {path.name: path.read_text() for path in out.glob("*.exr")}
     (out / "b.0002.exr").unlink()
-    assert [missing(SHOT, out, frame) for frame in SHOT.frames] == [0, 8, 0]
+    assert [samples_left(SHOT, out, frame) for frame in SHOT.frames] == [0, 8, 0]
     simulate([(SHOT, out)], python=python)
     after = {path.name: path.read_text() for path in out.glob("*.exr")}
     assert before.pop("b.0002.exr") != after.pop("b.0002.exr")
@@ -200,6 +208,38 @@ def test_a_folder_of_another_shot_is_refused(tmp_path, stub):
     other = ShotSettings(**{**SHOT.to_json(), "seed": 4})
     with pytest.raises(ValueError, match=r"seed 3, expected 4"):
         simulate([(other, tmp_path)], python=python)
+
+
+def test_a_folder_of_an_earlier_version_is_continued(tmp_path, stub):
+    """Until 0.2 the setting `moving_objects` was called `movers`."""
+    shot = replace(SHOT, moving_objects=2)
+    simulate([(shot, tmp_path)], python=stub())
+    path = tmp_path / "meta.json"
+    path.write_text(path.read_text().replace('"moving_objects": 2', '"movers": 2'))
+    assert read_meta(shot, tmp_path)["shot"] == json.loads(json.dumps(shot.to_json()))
+    with pytest.raises(ValueError, match="moving_objects 2, expected None"):
+        read_meta(SHOT, tmp_path)
+
+
+def test_options_reach_the_settings_of_the_shot(tmp_path, stub, capsys):
+    """`--movers`, the name until 0.2, still counts, and the command says what it is called now."""
+    words = ["simulate", "random", "-o", str(tmp_path), "--frames", "1-2", "--levels", "n", "--spp", "2", "--python"]
+    words += [stub(), "--film", "640x360", "--center", "0.25,0.5", "--seed", "7", "--halves", "--motion-blur"]
+    words += ["--effects", "all", "--animate", "add", "--camera", "random", "--reference", "4"]
+    assert main([*words, "--reference-frames", "2", "--movers", "3"]) == 0
+    assert "--movers is now --moving-objects" in capsys.readouterr().err
+    found = ShotSettings.from_json(json.loads((tmp_path / "meta.json").read_text())["shot"])
+    assert found == ShotSettings(
+        "random", 7, (1, 2), (320, 180), {"noisy": 2}, reference=4, reference_frames=(2,), film=(640, 360),
+        center=(0.25, 0.5), camera="random", motion="add", moving_objects=3, motion_blur=True, halves=True,
+        effects="all",
+    )  # fmt: skip
+
+
+def test_half_buffers_need_two_samples_of_each_level(tmp_path, capsys):
+    assert main(["simulate", "random", "-o", str(tmp_path), "--spp", "2", "--levels", "n,n/2", "--halves"]) == 2
+    error = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "level b: got 1 sample per pixel, expected at least 2 for half buffers" in error
 
 
 def test_finished_pictures_of_another_shot_are_not_those_asked_for(tmp_path, stub, capsys):
