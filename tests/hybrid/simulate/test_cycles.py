@@ -144,6 +144,46 @@ def test_noise_levels_are_independent(rendered):
     assert apart[1] == pytest.approx(variance[0] + variance[2], rel=0.15)
 
 
+def test_the_halves_of_a_reference_have_seeds_of_their_own(rendered):
+    """Their mean squared difference is that of two levels, by samples; halves of one seed would be equal."""
+    half_a, half_b = (layer(read(rendered / f"reference_{half}.0002.exr"), "Combined") for half in "ab")
+    a, b = (layer(read(rendered / f"{level}.0002.exr"), "Combined") for level in "ab")
+    # 16 samples against 8: half of it if the samples were not stratified, a little less as they are.
+    assert 0.3 < ((half_a - half_b) ** 2).mean() / ((a - b) ** 2).mean() < 0.6
+
+
+def test_measured_depth_limits_are_in_the_plan_and_in_the_scene(scene, monkeypatch):
+    import bpy
+
+    from hybrid.simulate import cycles, effects
+
+    measured = effects.EffectDecision("diffuse bounces", True, 1, "", "", {"cycles.diffuse_bounces": 1})
+    monkeypatch.setattr(cycles, "needed_bounces", lambda *_: [measured])
+    plan = cycles.make_plan(ShotSettings(str(scene), 1, (1,), SIZE, {"n": 1}), 2)
+    assert plan["cycles"]["cycles.diffuse_bounces"] == bpy.context.scene.cycles.diffuse_bounces == 1
+    assert str(measured) in plan["printed"]
+
+
+def test_frames_have_the_settings_of_the_plan_in_the_process_that_plans_and_in_a_worker(tmp_path):
+    """The exposure of a random shot is one of them, and the only one that shows in all pixels alike."""
+    shot = ShotSettings("random", 1, (1,), SIZE, {"noisy": 4}, film=(480, 270), effects="all")
+    simulate([(shot, tmp_path / "planned")], threads=2)
+    meta = json.loads((tmp_path / "planned" / "meta.json").read_text())
+    exposure = meta["plan"]["cycles"]["cycles.film_exposure"]
+    assert abs(exposure - 1) > 0.1
+    pictures = [layer(read(tmp_path / "planned" / "noisy.0001.exr"), "Combined")]
+    for factor in (1, 2):
+        meta["plan"]["cycles"]["cycles.film_exposure"] = factor * exposure
+        folder = tmp_path / f"worker{factor}"
+        folder.mkdir()
+        (folder / "meta.json").write_text(json.dumps(meta))
+        simulate([(shot, folder)], threads=2)
+        pictures.append(layer(read(folder / "noisy.0001.exr"), "Combined"))
+    planned, same, brighter = pictures
+    np.testing.assert_array_equal(planned, same)
+    np.testing.assert_allclose(brighter, 2 * same, rtol=1e-3, atol=1e-6)  # half floats
+
+
 def test_half_buffers_average_to_the_picture_and_tell_its_variance(rendered):
     channels = read(rendered / "a.0002.exr")
     color, half_a, half_b = (layer(channels, name) for name in ("Combined", "Half A", "Half B"))
