@@ -1,7 +1,7 @@
-"""Profiles: what each renderer calls its layers, what its vectors and its variance mean, and how its files are known.
+"""Profiles: a renderer's names of layers, its conventions of vectors and variance, and how its files are recognized.
 
 A profile is a TOML file. Those in `profiles/` come with ravg; the user's own are in the folder `profiles` of ravg's
-configuration folder, or given with `--profile`. docs/renderers.md tells how to write one.
+configuration folder, or given with `--profile`. docs/renderers.md explains how to write one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from flow.motion import CYCLES, DIRECTIONS, ENCODINGS, UNITS, VERTICAL, MotionConvention
 from hybrid.files.exr import ExrImage
 
-# What a layer may be to a denoiser.
+# Roles of layers.
 ROLES = (
     "color",
     "albedo",
@@ -33,7 +33,7 @@ ROLES = (
     "estimate",
 )
 _SHIPPED = Path(__file__).parent / "profiles"
-# What layers are called where no profile is found, and after what a profile calls them.
+# Names of layers if no profile is found, and after a profile's own names.
 COMMON = "common"
 _PARTS = tuple(part.name for part in fields(MotionConvention))
 _MEANINGS = ("mean", "sample")
@@ -41,34 +41,31 @@ _MEANINGS = ("mean", "sample")
 
 @dataclass(frozen=True)
 class Profile:
-    """What one renderer writes.
+    """Names and conventions of one renderer.
 
     Attributes
     ----------
     name : str
-        Of the renderer.
     attributes : tuple of str
-        Header attributes that its files have, as ``name`` or ``name=value``; ``*`` stands for anything.
+        Header attributes of its files, as ``name`` or ``name=value``; ``*`` matches anything.
     known_layers : tuple of str
         Names of layers that hardly any other renderer writes.
     layers : mapping of str to tuple of str
         Role → names, the preferred first; "" for the bare channels of a file.
     affixes : tuple of str
-        What may stand before or after these names.
+        Text before or after these names.
     files : mapping of str to str
-        Role → name of the sequence that holds it, where that is not the color's: ``{name}`` stands for the color's.
-    motion : mapping of str to object
-        Parts of `flow.motion.MotionConvention` that are documented.
-    motion_assumed : mapping of str to object
-        Parts that were only inferred.
+        Role → name of its sidecar sequence; ``{name}`` stands for the color's name.
+    motion, motion_assumed : mapping of str to object
+        Parts of `flow.motion.MotionConvention` that are documented, and that are inferred.
     variance : str or None
-        "mean": the variance of a pixel; "sample": of its samples; None where that is not known.
+        "mean": the variance of a pixel; "sample": of its samples; None if unknown.
     samples : str or None
-        The header attribute that holds the samples of a pixel; ``*`` stands for anything.
+        Header attribute of the samples per pixel; ``*`` matches anything.
     why : str
-        Why it was taken.
+        Why the profile was chosen.
     typed : frozenset of str
-        The parts of `motion` that the user has stated.
+        Parts of `motion` that the user states.
     """
 
     name: str
@@ -85,27 +82,21 @@ class Profile:
     typed: frozenset[str] = frozenset()
 
     def convention(self, channels: int) -> MotionConvention:
-        """What vectors of so many channels mean, as far as is known or assumed."""
+        """Return the convention of vectors with so many channels, as far as documented or assumed."""
         stated = {**self.motion_assumed, **self.motion}
         if channels >= 4 and "direction" not in stated:
-            # Two vectors a pixel; Blender writes them so, and nobody else is known to.
+            # Two vectors a pixel; only Blender is known to write them.
             stated = {"direction": CYCLES.direction, "y": CYCLES.y, **stated}
         return MotionConvention(**stated)
 
     @property
     def settled(self) -> frozenset[str]:
         """The parts of the convention that are documented."""
-        # Nobody is known to shift vectors otherwise than their encoding tells, and MoonRay alone to multiply them.
+        # No renderer is known to shift vectors otherwise than by their encoding, and only MoonRay premultiplies them.
         return frozenset({*self.motion, "offset", "premultiplied"})
 
     def with_motion(self, words: str) -> Profile:
-        """The same with motion as the user says it (`parse_motion`); with "auto", nothing of it is settled.
-
-        Raises
-        ------
-        ValueError
-            If the words are none of a convention.
-        """
+        """Return the profile with the user's motion convention (`parse_motion`); "auto" settles no part of it."""
         if words == "auto":
             return replace(self, motion={}, motion_assumed={**self.motion_assumed, **self.motion})
         parts = parse_motion(words)
@@ -113,24 +104,21 @@ class Profile:
         return replace(self, motion={**self.motion, **parts}, typed=frozenset(parts))
 
     def own_names(self, role: str) -> tuple[str, ...]:
-        """What the renderer calls layers of a role, plain (`plain_name`), the preferred first."""
+        """Return the renderer's names of a role, plain (`plain_name`), the preferred first."""
         own = self.layers.get(role, ())
         affixed = [text for name in own if name for affix in self.affixes for text in (affix + name, name + affix)]
         return tuple(dict.fromkeys(plain_name(name) for name in (*own, *affixed)))
 
     def names(self, role: str) -> tuple[str, ...]:
-        """The same, and after that what others call them."""
+        """Return `own_names`, and after them the common names."""
         common = read_profiles()[COMMON].layers.get(role, ())
         return tuple(dict.fromkeys((*self.own_names(role), *map(plain_name, common))))
 
 
 def parse_motion(words: str) -> dict[str, Any]:
-    """Parts of a `flow.motion.MotionConvention`, from words such as ``next,ndc,y-up,scale=2``.
+    """Return parts of a `flow.motion.MotionConvention` from words such as ``next,ndc,y-up,scale=2``.
 
-    Raises
-    ------
-    ValueError
-        If a word is unknown, or says what another has said.
+    Raises ValueError if a word is unknown, or contradicts another.
     """
     tables = {"direction": DIRECTIONS, "unit": UNITS, "encoding": ENCODINGS}
     known: dict[str, tuple[str, Any]] = {word: (part, word) for part, table in tables.items() for word in table}
@@ -148,26 +136,17 @@ def parse_motion(words: str) -> dict[str, Any]:
         if part in parts:
             raise ValueError(f"motion says its {part} twice, expected one of {parts[part]} and {value}")
         parts[part] = value
-    MotionConvention(**parts)  # refuses numbers that are none of a convention
+    MotionConvention(**parts)  # refuses invalid numbers
     return parts
 
 
 def plain_name(name: str) -> str:
-    """A name without what differs from one exporter to the next: case, blanks, hyphens and underscores."""
+    """Return a name in lower case without blanks, hyphens and underscores, which differ between exporters."""
     return "".join(c for c in name.lower() if c not in " _-")
 
 
 def read_profile(path: str | Path) -> Profile:
-    """Read a profile.
-
-    Raises
-    ------
-    OSError
-        If there is no such file.
-    ValueError
-        If it is no TOML, is nested too deeply, or has a key, a role or a value that profiles do not have; names the
-        file.
-    """
+    """Read a profile; raise ValueError if it is no TOML, too deeply nested, or has an unknown key, role or value."""
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -197,7 +176,7 @@ def _profile(stem: str, table: dict[str, Any]) -> Profile:
     _refuse_rest(variance, "[variance]", ("of", "samples"))
     if of is not None and of not in _MEANINGS:
         raise ValueError(f"variance is of {of!r}, expected one of {', '.join(_MEANINGS)}")
-    MotionConvention(**{**assumed, **motion})  # refuses what is no convention
+    MotionConvention(**{**assumed, **motion})  # refuses invalid conventions
     return Profile(
         name=str(name),
         attributes=attributes,
@@ -232,7 +211,7 @@ def _refuse_rest(table: Mapping[str, Any], where: str, known: Iterable[str]) -> 
 
 
 def user_folder() -> Path:
-    """Where the user's own profiles are looked for."""
+    """Return the folder of the user's own profiles."""
     import typer
 
     return Path(typer.get_app_dir("ravg")) / "profiles"
@@ -240,19 +219,13 @@ def user_folder() -> Path:
 
 @lru_cache(maxsize=1)
 def read_profiles() -> dict[str, Profile]:
-    """All profiles by the names of their files: the user's own, then those that come with ravg."""
+    """Return all profiles by the names of their files; the user's own replace those that come with ravg."""
     own, shipped = (sorted(folder.glob("*.toml")) for folder in (user_folder(), _SHIPPED))
     return {path.stem: read_profile(path) for path in [*shipped, *own]}
 
 
 def open_profile(spec: str) -> Profile:
-    """The profile with this name, or in this file.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or the file is no profile.
-    """
+    """Return the profile with this name, or in this file; raise ValueError if there is none."""
     if spec in read_profiles():
         return read_profiles()[spec]
     if Path(spec).is_file():
@@ -261,15 +234,13 @@ def open_profile(spec: str) -> Profile:
 
 
 def find_profile(image: ExrImage) -> Profile:
-    """The profile that fits a file best; it says why.
+    """Return the profile that fits a file best, with the reason in `why`.
 
-    Notes
-    -----
-    An attribute of the header counts most, then the names of layers that only one renderer writes. Among equals it is
-    the one that knows what more of the layers are, then the user's own.
+    A header attribute counts most, then the names of layers that only one renderer writes. Among equals the profile
+    that knows more of the roles wins, then the user's own.
     """
     header = {name: f"{name}={value}" for part in image.parts for name, value in part.header.items()}
-    names = {plain_name(token) for layer in image.layers for token in _tails(layer.name)}
+    names = {plain_name(tail) for layer in image.layers if (tail := layer.name.rpartition(".")[2])}
     names |= {plain_name(channel.rpartition(".")[2]) for channel in image.channel_names}
     best, why, score = read_profiles()[COMMON], "no renderer is known by its header or its layers", (0, 0, 0)
     for profile in read_profiles().values():
@@ -285,8 +256,3 @@ def find_profile(image: ExrImage) -> Profile:
             best, score = profile, this
             why = f"header attribute {known[0]}" if known else f"layer {typical[0]}"
     return replace(best, why=why)
-
-
-def _tails(name: str) -> list[str]:
-    tail = name.rpartition(".")[2]
-    return [tail] if tail else []

@@ -1,6 +1,6 @@
-"""Files that are whole or not there at all, and never somebody else's.
+"""Atomic writes: a file appears whole or not at all, and never replaces an input.
 
-Whatever a command writes goes through here: `check_outputs` before anything is made, `replace_file` when it is.
+All that a command writes is checked by `check_outputs` at its start, and written by `replace_file`.
 """
 
 from __future__ import annotations
@@ -16,48 +16,46 @@ from pathlib import Path
 
 from hybrid.runtime.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
 
-# What this process is writing to just now.
+# Temporary files and folders of this process.
 _unfinished: set[Path] = set()
-# Of a file's name so much is kept in its temporary name that folders which take 255 bytes take that too.
+# Length of a file's name that its temporary name repeats, so that this stays within the 255 bytes that folders allow.
 _KEPT = 24
 _TEMPORARY = re.compile(r"\..+\.ravg-[0-9a-f]{16}\.tmp", re.DOTALL)
 _LOCK = ".lock"
 
 
 def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[str, Path]]) -> None:
-    """Refuse to write over anything that is read, over what is no file, or to one place twice.
+    """Raise an error if an output would overwrite an input or another output, or is not a regular file.
 
     Parameters
     ----------
-    outputs : iterable of (str, Path)
-        What is to be written: what to call it (``output``, ``preview``), and where.
-    inputs : iterable of (str, Path)
-        What is read, whether or not in this very run: what to call it, and where.
+    outputs, inputs : iterable of (str, Path)
+        Name for the message (``output``, ``preview``), and file. Inputs may be read by another run.
 
     Raises
     ------
     ValueError
-        If an output is an input by whatever name (links, another spelling), or another output.
+        If an output is an input by any name (links, another spelling), or another output.
     OSError
         If an output is a folder, a device, a pipe or a socket.
     """
     names: dict[object, str] = {}
-    for what, path in inputs:
-        names |= dict.fromkeys(identities(path), f"{what} {str(path)!r}")
+    for name, path in inputs:
+        names |= dict.fromkeys(identities(path), f"{name} {str(path)!r}")
     written: dict[object, str] = {}
-    for what, path in outputs:
+    for name, path in outputs:
         refuse_other_kinds(path)
-        own = set(identities(path))
-        for name in own:
-            if name in names:
-                raise ValueError(f"{what} {str(path)!r} would overwrite an input: {names[name]}")
-            if name in written:
-                raise ValueError(f"{what} {str(path)!r} would overwrite {written[name]}")
-        written |= dict.fromkeys(own, f"{what} {str(path)!r}")
+        known = set(identities(path))
+        for identity in known:
+            if identity in names:
+                raise ValueError(f"{name} {str(path)!r} would overwrite an input: {names[identity]}")
+            if identity in written:
+                raise ValueError(f"{name} {str(path)!r} would overwrite {written[identity]}")
+        written |= dict.fromkeys(known, f"{name} {str(path)!r}")
 
 
 def identities(path: Path) -> Iterator[object]:
-    """All that a file may be recognized by: its path without links, and what the operating system knows it by."""
+    """Yield the identities of a file: its path without links, and its device and inode."""
     # Not Path.resolve, which raises RuntimeError for a loop of links.
     yield os.path.realpath(path)
     yield os.path.join(os.path.realpath(path.parent), path.name)  # a link itself, which would be replaced
@@ -68,7 +66,7 @@ def identities(path: Path) -> Iterator[object]:
 
 
 def refuse_other_kinds(path: Path) -> None:
-    """Raise OSError for what is there and no file: a pipe would be waited for, a device has no end."""
+    """Raise OSError for a path that is no regular file: reading a pipe would block, a device has no end."""
     if is_reserved(path):
         raise OSError(f"{path}: Windows does not take {path.name!r} as a name of a file, expected another")
     try:
@@ -82,24 +80,11 @@ def refuse_other_kinds(path: Path) -> None:
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside `path` to write to; rename it to `path` when the block ends without error.
+    """Yield an empty temporary file in the same folder; rename it to `path` if the block ends without error.
 
-    Parameters
-    ----------
-    path : Path
-        The file to be written, in a folder that exists. If it is a link, the link is replaced, not what it leads to.
-
-    Yields
-    ------
-    Path
-        An empty file, which only this process knows of. It is removed where the block raises, a keyboard interrupt
-        included.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written to, `path` is there and no file, or somebody has put another file in the
-        place of the temporary one. It names `path`, not the temporary file.
+    The temporary file is removed if the block raises, KeyboardInterrupt included. If `path` is a link, the link is
+    replaced, not its target. Raises OSError, which names `path`, if the folder cannot be written to, `path` is no
+    regular file, or another process has replaced the temporary file.
     """
     refuse_other_kinds(path)
     temporary, descriptor = _create(path)
@@ -113,7 +98,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             if _is(temporary, descriptor):
                 temporary.unlink()
-        # What fails in the middle of writing, as on a full disk, names no file at all.
+        # An error in the middle of writing, as on a full disk, names no file.
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from None
         raise
@@ -123,16 +108,12 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all.
-
-    Errors are those of `replace_file`.
+    """Write a file by `replace_file`; text as UTF-8.
 
     Parameters
     ----------
     path : Path
-        The file to be written, in a folder that exists.
     content : str or bytes
-        Text is written as UTF-8.
     """
     with replace_file(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -140,21 +121,13 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """Make a folder beside `path` to work in; it goes, with all that is in it, when the block ends.
+    """Yield a temporary folder named after `path`, in the same folder; it is removed when the block ends.
 
-    Parameters
-    ----------
-    path : Path
-        What the folder is named after. The folder it is in is made, and cleared of what killed processes have left.
-
-    Yields
-    ------
-    Path
-        The folder.
+    The parent folder is made, and cleared of the leftovers of killed processes.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
-    # Folders cannot be locked everywhere (NFS), so the lock is a file beside it, which is there for longer.
+    # Folders cannot be locked everywhere (NFS), so the lock is a file in the same folder that outlives it.
     lock, descriptor = _create(path, _LOCK)
     folder = lock.with_name(lock.name.removesuffix(_LOCK))
     _unfinished.add(folder)
@@ -170,17 +143,17 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove what this process is writing to, because it is about to end in the midst of it."""
+    """Remove the temporary files of this process, which is about to end."""
     for temporary in tuple(_unfinished):
         _remove(temporary)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of processes that are no more.
+    """Remove temporary files and folders of processes that have ended.
 
-    Each is locked by who writes it, and the kernel drops the lock with the process. That holds across containers,
-    which may give two processes one number, and where the folder's file system locks for all its clients (NFS), across
-    machines. Where it does not lock at all, nothing is removed.
+    Each is locked by its writer, and the kernel drops the lock with the process. The lock works across containers,
+    which may give two processes one number, and across machines if the file system locks for all its clients (NFS).
+    Without locks nothing is removed.
     """
     for path in folder.iterdir():
         if not _TEMPORARY.fullmatch(path.name.removesuffix(_LOCK)):
@@ -193,9 +166,9 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
-    """A new file with a name beside `path` that nobody can guess, open and locked."""
+    """Make a file with an unguessable name in the folder of `path`; return it, open and locked."""
     while True:
-        # Unguessable, and never opened where something is: nobody can have put a link there to be written through.
+        # Unguessable, and never opened if it exists: nobody can have placed a link there to write through.
         name = f".{path.name[:_KEPT]}.ravg-{secrets.token_hex(8)}.tmp{suffix}"
         temporary = path.with_name(name)
         _unfinished.add(temporary)
@@ -209,9 +182,9 @@ def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
         locked = True
         try:
             lock_file(descriptor)
-        except BlockingIOError:  # somebody who clears up was faster
+        except BlockingIOError:  # another process that clears up was faster
             locked = False
-        except OSError:  # this file system has no locks: then nobody clears up
+        except OSError:  # this file system has no locks: then no process clears up
             pass
         if locked and _is(temporary, descriptor):
             return temporary, descriptor
@@ -221,7 +194,7 @@ def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
 
 
 def _is(path: Path, descriptor: int) -> bool:
-    """Whether a path still leads to an open file."""
+    """Whether a path is still that of an open file."""
     try:
         here = path.lstat()
     except FileNotFoundError:
@@ -231,7 +204,7 @@ def _is(path: Path, descriptor: int) -> bool:
 
 @contextmanager
 def _abandoned(lock: Path) -> Iterator[bool]:
-    """Tell whether nobody holds the lock on a file, or the file is gone; nobody can take it within the block."""
+    """Yield whether no process holds the lock on a file, or the file is gone; the lock is held within the block."""
     try:
         descriptor = open_file(lock, new=False)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Numbered files: patterns such as ``shot.####.exr``, as any program writes them, folders, and ranges of frames."""
+"""Numbered files: patterns such as ``shot.####.exr`` in the notation of any program, folders, and frame ranges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from fileseq.frameset import FrameSet
 
-# Where a number goes: #### (Nuke, RV), @@@@, %04d (ffmpeg, Nuke), $F4 (Houdini), <frame04> and <F4> (Maya, Karma).
+# Place of the number: #### (Nuke, RV), @@@@, %04d (ffmpeg, Nuke), $F4 (Houdini), <frame04> and <F4> (Maya, Karma).
 _PLACE = re.compile(r"(#+|@+)|%(\d*)d|\$(?:F(\d*)|\{F(\d*)\})|<(?:frame|f)(\d*)>", re.IGNORECASE)
 _RANGE = r"\d+(?:--?\d+(?:[x:y]\d+)?)?(?:,-?\d+(?:--?\d+(?:[x:y]\d+)?)?)*"
 
@@ -31,28 +31,24 @@ class Pattern:
     after: str = ""
 
     def path(self, number: int) -> Path:
-        """The file of a frame."""
+        """Return the file of a frame."""
         return self._names(number)[0] if self.digits else self.single
 
     def _names(self, number: int) -> list[Path]:
-        """The names that a frame can have: the sign is one of the digits (``%04d``: -002), or not (Blender: -0002)."""
+        """The possible names of a frame: the sign counts as a digit (``%04d``: -002), or not (Blender: -0002)."""
         texts = [f"{number:0{self.digits}d}", f"{'-' * (number < 0)}{abs(number):0{self.digits}d}"]
         return [self.folder / f"{self.before}{text}{self.after}" for text in dict.fromkeys(texts)]
 
     @property
     def single(self) -> Path:
-        """The file where there is no place for a number."""
+        """The file of a pattern without a number."""
         return self.folder / self.before
 
     def files(self) -> dict[int, Path]:
-        """Frame number → file, of those that are there, whatever the width of their numbers.
+        """Return frame number → existing file. If their numbers differ in width, the pattern's width decides.
 
-        Where widths are mixed, that of the pattern decides. A name without a number is frame 1.
-
-        Raises
-        ------
-        ValueError
-            If two files have one number, or a hyphen may be a sign or a part of the name.
+        A name without a number is frame 1. Raises ValueError if two files have one number, or if a hyphen may be a sign
+        or a part of the name.
         """
         if not self.digits:
             return {1: self.single} if self.single.is_file() else {}
@@ -77,17 +73,14 @@ class Pattern:
         return files
 
     def number(self, name: str) -> int | None:
-        """The number in a file's name; None where it has none, or is of another sequence."""
+        """Return the number in a file's name; None if it does not fit the pattern."""
         if not self.digits:
             return None
         match = re.fullmatch(f"{re.escape(self.before)}({_sign(self.before)}[0-9]+){re.escape(self.after)}", name)
         return int(match[1]) if match else None
 
     def _spelled(self, names: list[Path]) -> Iterator[tuple[int, Path]]:
-        """Files that the file system finds under names of this pattern although its own for them differ.
-
-        Windows and macOS ignore case, macOS how accents are composed.
-        """
+        """Files whose names the file system takes for this pattern's, as Windows and macOS ignore case and accents."""
         before, after = _fold(self.before), _fold(self.after)
         for name in names:
             match = re.fullmatch(f"{re.escape(before)}({_sign(before)}[0-9]+){re.escape(after)}", _fold(name.name))
@@ -99,27 +92,20 @@ class Pattern:
 
 
 def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
-    """Find a sequence.
+    """Find a sequence: return frame number → file of all existing frames, and the range in `spec`, if any.
 
     Parameters
     ----------
     spec : str
         A pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), a folder that holds one sequence, a file, or a
-        glob. With the range in it, as programs copy it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
-
-    Returns
-    -------
-    dict of int to Path
-        Frame number → file; all that are there.
-    str or None
-        The range of frames that is named along with them.
+        glob. A range may be part of it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
 
     Raises
     ------
     FileNotFoundError
-        If nothing matches; says what the folder has.
+        If nothing matches; lists the sequences of the folder.
     ValueError
-        If several sequences do, it is both a file and the pattern of others, or a hyphen in it would be a sign.
+        If several sequences match, `spec` is both a file and the pattern of others, or its hyphen would be a sign.
     """
     path = Path(spec)
     if path.is_dir():
@@ -136,7 +122,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
             raise ValueError(f"{spec}: the hyphen is the sign of negative numbers, expected the pattern {bare}")
         if files := pattern.files():
             return files, frames
-        # The range within the name, unless that is the name.
+        # A range within the name, unless a file has that name.
         match = re.fullmatch(rf"(.*?)((?:(?<![^._])-)?{_RANGE})", pattern.before)
         if match and "-" in match[2]:
             bare = Pattern(pattern.folder, match[1], pattern.digits, pattern.after)
@@ -153,7 +139,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
 
 
 def parse_pattern(spec: str) -> tuple[Pattern, str | None]:
-    """Split a pattern at the last place for a number in its name; and from the range that stands behind it."""
+    """Split a pattern at the last place for a number in its name; return also the range that follows it."""
     match = re.fullmatch(rf"(.*\S)\s+(-?{_RANGE})", spec)
     frames = match[2] if match and _PLACE.search(Path(match[1]).name) else None
     path = Path(match[1] if match and frames else spec)
@@ -180,12 +166,9 @@ def _names(folder: Path) -> list[Path]:
 
 
 def find_views(spec: str) -> list[str]:
-    """The stereo views whose files are there for a pattern with %V (left) or %v (l) in it; left first, [] without.
+    """Return the stereo views with files for a pattern with %V (left) or %v (l), left first; [] for other patterns.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
+    Raises FileNotFoundError if no view has files.
     """
     if name_view(spec, "xx") == spec:
         return []
@@ -207,25 +190,17 @@ def find_views(spec: str) -> list[str]:
 
 
 def name_view(text: str, view: str) -> str:
-    """Put the name of a view into a pattern.
+    """Replace %V in a pattern by the name of a view, %v by its first letter.
 
     Parameters
     ----------
-    text : str
-        A pattern.
-    view : str
-        The name of the view.
-
-    Returns
-    -------
-    str
-        The pattern with the name for %V, and its first letter for %v.
+    text, view : str
     """
     return text.replace("%V", view).replace("%v", view[0])
 
 
 def list_patterns(folder: Path) -> list[Pattern]:
-    """The sequences, and single files, that lie in a folder."""
+    """Return the sequences and single files of a folder."""
     return _patterns(_names(folder))
 
 
@@ -245,7 +220,7 @@ def _patterns(paths: Iterable[Path]) -> list[Pattern]:
 
 
 def pattern_of(path: Path) -> Pattern:
-    """The sequence that a file belongs to: its number is the last one in its name."""
+    """Return the sequence of a file: its number is the last one in its name."""
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.name)
     if match is None:
         return Pattern(path.parent, path.name, 0)
@@ -269,7 +244,7 @@ def _only(patterns: list[Pattern], spec: str, folder: Path) -> Pattern:
 
 
 def _listing(folder: Path) -> str:
-    """What a folder has, for an error message; shortened if there is much of it."""
+    """The sequences of a folder for an error message, at most 8."""
     if not folder.is_dir():
         return f"there is no folder {str(folder)!r}"
     names = [_describe(pattern) for pattern in _patterns(_names(folder))]
@@ -278,14 +253,14 @@ def _listing(folder: Path) -> str:
 
 
 def _describe(pattern: Pattern) -> str:
-    """A pattern with the range of its frames; without it where their numbers are ambiguous."""
+    """A pattern with the range of its frames, unless their numbers are ambiguous."""
     with suppress(ValueError):
         return f"{pattern} {format_frames(pattern.files())}" if pattern.digits else str(pattern)
     return str(pattern)
 
 
 def parse_frames(frames: str) -> list[int]:
-    """Ascending frame numbers of a range like 1001-1010x2."""
+    """Return the frame numbers of a range like 1001-1010x2, ascending; raise ValueError if it is none."""
     try:
         numbers = list(FrameSet(frames))
     except (ValueError, ArithmeticError):  # the latter for numbers of hundreds of digits
@@ -297,25 +272,19 @@ def parse_frames(frames: str) -> list[int]:
 
 
 def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
-    """The range of some frame numbers, such as 1001-1010x2."""
+    """Return the range of some frame numbers, such as 1001-1010x2."""
     return str(FrameSet(sorted(numbers)))
 
 
 def name_holes(numbers: Iterable[int], step: int) -> str:
-    """Name the frames that are not there between those that are.
+    """Name the frames missing between existing ones, `step` apart; "" if none is missing.
+
+    Only the ends of holes are computed: between two files that are numbered by dates lie millions.
 
     Parameters
     ----------
     numbers : iterable of int
-        Of the frames that are there.
     step : int
-        From one to the next.
-
-    Returns
-    -------
-    str
-        "" where none are missing. Only the ends of holes are looked at: between two files that dates have numbered lie
-        millions.
     """
     holes = [range(a + step, b, step) for a, b in pairwise(sorted(numbers)) if b - a > step]
     names = [f"{h[0]}-{h[-1]}{f'x{step}' if step > 1 else ''}" if len(h) > 1 else f"{h[0]}" for h in holes]

@@ -121,15 +121,7 @@ class Shot:
         return replace(self, numbers=tuple(sorted(numbers)))
 
     def reopened(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Shot:
-        """Return the same frames from files that `write` made: the denoised picture is the color.
-
-        Parameters
-        ----------
-        files : mapping of int to Path
-            Frame number → file, for all or some frames.
-        aovs : sequence of str, optional
-            Names of the AOVs to read instead of this shot's.
-        """
+        """Return the same frames, all or some, from files that `write` made: the denoised picture is the color."""
         reader = self.reader
         numbers = tuple(n for n in self.numbers if n in files) or tuple(sorted(files))
         reopened = replace(
@@ -156,10 +148,7 @@ class Shot:
     def views(self) -> tuple[Shot, ...]:
         """This shot once for each view layer and stereo view of its files; itself if the color was chosen.
 
-        Raises
-        ------
-        ExrError
-            If there are several, and sidecars: which view these belong to is unknown.
+        Raises ExrError if there are several, and sidecars: which view these belong to is unknown.
         """
         reader = self.reader
         if "color" in reader.files.layers:
@@ -186,13 +175,7 @@ class Shot:
         return self.reader.headers.header(number)
 
     def layers(self, number: int) -> Layers:
-        """Return the layers of a frame; read its header unless they are known.
-
-        Raises
-        ------
-        ExrError
-            If the file cannot be read, lacks a layer, or has other layers than the first frame.
-        """
+        """Return the layers of a frame; raise ExrError if a layer is missing, or is not that of the first frame."""
         return self.reader.layers(number)
 
     def layer_summary(self, number: int) -> str:
@@ -271,10 +254,7 @@ class Shot:
     def recompressed_parts(self, others: Iterable[Shot] = ()) -> list[str]:
         """Name each part of the first file that `write` stores with ZIP, to keep its layers to the bit.
 
-        Parameters
-        ----------
-        others : iterable of Shot
-            Other `views` of the same files that are written.
+        `others` are the other `views` of the same files that are written.
         """
         first = self.numbers[0]
         image, views = self.header(first), [shot.layers(first) for shot in (self, *others)]

@@ -1,4 +1,4 @@
-"""Layers that lie in sequences of their own: a file for each AOV, a folder for each, RenderMan's variance file."""
+"""Sidecar sequences that hold one layer each: a file or a folder for each AOV, RenderMan's variance file."""
 
 from __future__ import annotations
 
@@ -14,25 +14,13 @@ from hybrid.files.layers import find_layers, fit_sidecar
 from hybrid.files.profile import COMMON, ROLES, Profile, find_profile, plain_name, read_profiles
 from hybrid.files.sequences import Pattern, find_files, format_frames, list_patterns, pattern_of
 
-# What is taken from a sequence that the user has not named: no other picture of the frame.
+# Roles that are read from a sequence that the user has not named: no other picture of the frame.
 GUIDES = ("albedo", "normal", "depth", "motion", "motion_next", "variance")
 
 
 @dataclass(frozen=True)
 class SidecarSequence:
-    """A sequence that holds one layer of the shot.
-
-    Attributes
-    ----------
-    role : str
-        What the layer is to a denoiser.
-    spec : str
-        What names the sequence.
-    files : mapping of int to Path
-        Frame number → file.
-    layer : str or None
-        Name of the layer, where the files have several.
-    """
+    """A sequence, named by `spec`, that holds the layer of one role; `layer` is its name if the files have several."""
 
     role: str
     spec: str
@@ -40,13 +28,7 @@ class SidecarSequence:
     layer: str | None = None
 
     def find(self, image: ExrImage, profile: Profile) -> Layer:
-        """The layer in one of the files.
-
-        Raises
-        ------
-        ExrError
-            If there is none, or several could be it.
-        """
+        """Return the layer in one of the files (`fit_sidecar`)."""
         return replace(fit_sidecar(image, self.role, self.layer, profile), file=self.spec)
 
     def expect(self, numbers: Sequence[int]) -> None:
@@ -57,30 +39,20 @@ class SidecarSequence:
 
 
 def names_sequence(value: str) -> bool:
-    """Whether a layer that the user names is a sequence: ``path/alb.####.exr``, with ``:layer``, or a folder's path."""
+    """Whether a layer named by the user is a sequence: ``path/alb.####.exr``, also with ``:layer``, or a folder."""
     return re.search(r"\.exr(:|\s|$)", value, re.IGNORECASE) is not None or (
         len(Path(value).parts) > 1 and Path(value).is_dir()
     )
 
 
 def open_sidecar(role: str, value: str) -> SidecarSequence:
-    """Find the sequence that the user names for a layer.
+    """Find the sequence that the user names for a role; raise FileNotFoundError if there is none.
 
     Parameters
     ----------
     role : str
-        Of the layer.
     value : str
         ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
-
-    Returns
-    -------
-    SidecarSequence
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
     """
     match = re.fullmatch(r"(.*\.exr):(.+)", value, re.IGNORECASE)
     spec, layer = (match[1], match[2]) if match else (value, None)
@@ -90,34 +62,34 @@ def open_sidecar(role: str, value: str) -> SidecarSequence:
 def find_companions(
     files: Mapping[int, Path], named: Collection[str] = ()
 ) -> tuple[Profile | None, list[SidecarSequence]]:
-    """Sequences that a renderer writes beside the color's, under names made from its name.
+    """Find the sidecars that a renderer writes next to the color, under names made from the color's name.
 
     Parameters
     ----------
     files : mapping of int to Path
-        Those of the color.
+        Files of the color.
     named : collection of str
-        Roles whose layers the user names, which are not searched for.
+        Roles whose layers the user names; these are not searched for.
 
     Returns
     -------
     Profile or None
-        The renderer, which its other file tells where the color's may not.
+        The renderer, which a sidecar may reveal although the color's header does not.
     list of SidecarSequence
-        A layer each; those that the other files do not have, or that the color's files have themselves, are left out.
+        Without the layers that the color's files hold themselves.
 
     Raises
     ------
     ValueError
         If several sequences have the name of one layer.
     """
-    own = pattern_of(files[min(files)])
-    stem = own.before.rstrip("._-")
-    for profile in read_profiles().values() if own.digits and stem else ():
+    color = pattern_of(files[min(files)])
+    stem = color.before.rstrip("._-")
+    for profile in read_profiles().values() if color.digits and stem else ():
         found: list[SidecarSequence] = []
         for name in dict.fromkeys(profile.files.values()):
-            beside = replace(own, before=name.replace("{name}", stem) + own.before[len(stem) :])
-            numbered = beside.files()
+            pattern = replace(color, before=name.replace("{name}", stem) + color.before[len(stem) :])
+            numbered = pattern.files()
             if not numbered:
                 continue
             image = read_exr(numbered[min(numbered)], pixels=False)
@@ -125,61 +97,49 @@ def find_companions(
                 continue
             for role in [role for role, own_name in profile.files.items() if own_name == name]:
                 with suppress(ExrError):  # not every file has every layer
-                    apart = SidecarSequence(role, str(beside), numbered)
-                    apart.find(image, profile)
-                    found.append(apart)
+                    sidecar = SidecarSequence(role, str(pattern), numbered)
+                    sidecar.find(image, profile)
+                    found.append(sidecar)
         if found:
             return replace(profile, why=f"{found[0].spec} beside it"), found
-    return _find_elements(own, files, named)
+    return _find_elements(color, files, named)
 
 
 def _find_elements(
-    own: Pattern, files: Mapping[int, Path], named: Collection[str]
+    color: Pattern, files: Mapping[int, Path], named: Collection[str]
 ) -> tuple[Profile | None, list[SidecarSequence]]:
-    """Guides that lie beside the color, a sequence each, under its name and their own (``view.normals.####.exr``)."""
-    beside = [(plain_name(rest), p) for p in list_patterns(own.folder) if (rest := _rest(p, own))]
-    if not own.digits or not beside:
+    """Guides in the color's folder, a sequence each, under its name and their own (``view.normals.####.exr``)."""
+    elements = [(plain_name(rest), p) for p in list_patterns(color.folder) if (rest := _rest(p, color))]
+    if not color.digits or not elements:
         return None, []
     try:
         image = read_exr(files[min(files)], pixels=False)
         known = find_layers(image)
-    except (ExrError, OSError):  # said where the layers are needed
+    except (ExrError, OSError):  # raised again when the layers are needed
         return None, []
-    assigned = _assign([("", own), *beside])
+    assigned = _assign([("", color), *elements])
     if assigned is None:
         return None, []
     profile, roles = assigned
     wanted = {role for role in GUIDES if role not in named and getattr(known, role) is None}
     missing = {role: found for role, found in roles.items() if role in wanted}
-    apart = _only_each(own.folder, missing)
-    why = f"{', '.join(other.spec for other in apart)} beside it"
-    return (_told_by(image, profile, why) if apart else None), apart
+    sidecars = _only_each(color.folder, missing)
+    why = f"{', '.join(other.spec for other in sidecars)} beside it"
+    return (_profile_of(image, profile, why) if sidecars else None), sidecars
 
 
 def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[SidecarSequence]] | None:
-    """Gather a shot that lies in a folder as a sequence, or a folder, for each AOV, known by their names.
+    """Find a shot in a folder that holds a sequence, or a folder, for each AOV, known by their names.
 
-    Parameters
-    ----------
-    folder : Path
-        Of files.
-
-    Returns
-    -------
-    tuple of dict, Profile and list of SidecarSequence, optional
-        Its files, whose names they are, and the others. None where no sequence is known as the color by its name.
-
-    Raises
-    ------
-    ValueError
-        If several sequences have the name of one layer.
+    Returns the color's files, the profile with these names, and the sidecars; None if no sequence has a name of the
+    color. Raises ValueError if several sequences have the name of one layer.
     """
     direct = list_patterns(folder)
     if len(direct) == 2:
         for color, other in (direct, direct[::-1]):
-            profile, apart = find_companions(color.files())
-            if profile is not None and {companion.spec for companion in apart} == {str(other)}:
-                return color.files(), profile, apart
+            profile, sidecars = find_companions(color.files())
+            if profile is not None and {companion.spec for companion in sidecars} == {str(other)}:
+                return color.files(), profile, sidecars
     assigned = _assign(_label(folder, direct))
     if assigned is None:
         return None
@@ -187,11 +147,11 @@ def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[SidecarS
     first, *others = _only_each(folder, roles)  # the color, as in `ROLES`
     image = read_exr(first.files[min(first.files)], pixels=False)
     names = ", ".join(other.spec for other in (first, *others))
-    return dict(first.files), _told_by(image, profile, f"sequences {names}"), others
+    return dict(first.files), _profile_of(image, profile, f"sequences {names}"), others
 
 
 def _assign(sequences: Sequence[tuple[str, Pattern]]) -> tuple[Profile, dict[str, list[Pattern]]] | None:
-    """The sequences by their roles, as the profile has them that knows most; None without a color and another."""
+    """The sequences by role, with the profile that knows most of them; None unless a color and another are known."""
     best: tuple[Profile, dict[str, list[Pattern]]] | None = None
     score = (0, 0)
     for profile in read_profiles().values():
@@ -207,26 +167,26 @@ def _assign(sequences: Sequence[tuple[str, Pattern]]) -> tuple[Profile, dict[str
 
 
 def _only_each(folder: Path, roles: Mapping[str, Sequence[Pattern]]) -> list[SidecarSequence]:
-    """The one sequence of each role; raise ValueError where there are several."""
+    """The only sequence of each role; raise ValueError if there are several."""
     for role, several in roles.items():
         if len(several) > 1:
             raise ValueError(f"{folder}: {role} can be {', '.join(map(str, several))}, expected one sequence")
     return [SidecarSequence(role, str(pattern), pattern.files()) for role, (pattern,) in roles.items()]
 
 
-def _told_by(image: ExrImage, profile: Profile, why: str) -> Profile:
-    """The profile that the color's header tells, or else the one that knows the names, and why."""
+def _profile_of(image: ExrImage, profile: Profile, why: str) -> Profile:
+    """The profile that fits the color's header, or else the one that knows the names."""
     known = find_profile(image)
     return known if known.name != read_profiles()[COMMON].name else replace(profile, why=why)
 
 
 def _stem(pattern: Pattern) -> str:
-    """The name of a sequence, without its number and without what separates them."""
+    """The name of a sequence without number and separator."""
     return pattern.before.removesuffix(".exr").rstrip("._-")
 
 
 def _rest(pattern: Pattern, other: Pattern) -> str:
-    """What the name of a sequence has beyond that of another, before or behind the number; "" where that has more."""
+    """The part of a sequence's name that another lacks, before or after the number; "" if the other is no prefix."""
     name, stem = _stem(pattern), _stem(other)
     if pattern.after == other.after and stem and name.startswith((f"{stem}.", f"{stem}_", f"{stem}-")):
         return name[len(stem) :].lstrip("._-")
@@ -236,11 +196,11 @@ def _rest(pattern: Pattern, other: Pattern) -> str:
 
 
 def _label(folder: Path, direct: Sequence[Pattern]) -> list[tuple[str, Pattern]]:
-    """The sequences in a folder, or in its folders, each with the part of its name that tells it from the others."""
+    """The sequences in a folder, or in its folders, each with the part of its name that differs."""
     if len(direct) > 1:
         stems = [_stem(pattern) for pattern in direct]
         for color in direct:
-            # It has no name of its own: view.####.exr beside view.normals.####.exr.
+            # The color may have no name of its own: view.####.exr beside view.normals.####.exr.
             rests = {pattern: _rest(pattern, color) for pattern in direct if pattern != color}
             if all(rests.values()):
                 return [("", color), *((plain_name(rest), pattern) for pattern, rest in rests.items())]

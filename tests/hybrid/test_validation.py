@@ -15,10 +15,9 @@ import pytest
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
-from hybrid.files.frame import Frame
 from hybrid.files.shots import Shot, open_shot
 from hybrid.stream import plan_shot
-from hybrid.validation import _judge_alpha, _judge_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
+from hybrid.validation import _check_alpha, _check_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 
@@ -130,7 +129,7 @@ def test_right_vectors_are_kept_in_moving_shadows_and_wrong_ones_are_not(tmp_pat
         return " ".join(validate_layers(open_shot(write(tmp_path / name, edit))).warnings)
 
     assert judged("right") == ""
-    left_out = "no reading of the vectors explains the pictures"
+    left_out = "no convention explains the pictures"
     for kind in ("black", "constant", "noise", "transposed"):
         assert left_out in judged(kind, vector(WRONG[kind])), kind
     # Guides that make no sense themselves have no say.
@@ -153,7 +152,7 @@ def fill(name: str, components: str, make: Callable[[Truth, int], np.ndarray]) -
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 IMPLAUSIBLE = {
     "black albedo": (fill(*ALBEDO, lambda t, i: 0), ALBEDO[0], "is black: left out"),
-    "albedo of one color": (fill(*ALBEDO, lambda t, i: 0.5), ALBEDO[0], "is the same everywhere: left out"),
+    "albedo of one color": (fill(*ALBEDO, lambda t, i: 0.5), ALBEDO[0], "is constant: left out"),
     "negative albedo": (fill(*ALBEDO, lambda t, i: t.normal), ALBEDO[0], "is negative in"),
     "light as albedo": (fill(*ALBEDO, lambda t, i: 50 * t.color), ALBEDO[0], "is above 2 in"),
     "albedo of the previous frame": (
@@ -162,12 +161,12 @@ IMPLAUSIBLE = {
     "albedo of the next frame": (
         fill(*ALBEDO, lambda t, i: FRAMES[min(i + 1, 3)].albedo), ALBEDO[0], "belongs to the next frame"
     ),
-    "constant normal": (fill(*NORMAL, lambda t, i: [0, 0, 1]), NORMAL[0], "is the same everywhere: left out"),
+    "constant normal": (fill(*NORMAL, lambda t, i: [0, 0, 1]), NORMAL[0], "is constant: left out"),
     "position as normal": (fill(*NORMAL, lambda t, i: t.normal * t.depth[..., None]), NORMAL[0], "is longer than 1 in"),
     "normal of the previous frame": (
         fill(*NORMAL, lambda t, i: FRAMES[max(i - 1, 0)].normal), NORMAL[0], "belongs to the previous frame"
     ),
-    "constant depth": (fill("Depth", "Z", lambda t, i: 7), "Depth", "depth (ViewLayer.Depth.Z) is the same everywhere"),
+    "constant depth": (fill("Depth", "Z", lambda t, i: 7), "Depth", "depth (ViewLayer.Depth.Z) is constant"),
     "no variance": (fill("variance", "RGB", lambda t, i: 0), "variance", "is 0 everywhere: left out"),
     "negative variance": (fill("variance", "RGB", lambda t, i: t.normal), "variance", "is negative in"),
     "variance times 500": (fill("variance", "RGB", lambda t, i: 500 * t.variance), "variance", "times what"),
@@ -237,11 +236,10 @@ def test_equal_zeros_are_no_evidence() -> None:
     color[30:34, 40:44] = rng.uniform(0.2, 1, (4, 4, 3))
     alpha[30:34, 40:44] = 1
     estimate = color * np.float32(1.1)
-    frame = Frame(1, color, alpha=alpha, estimate=estimate)
-    assert _judge_estimate(frame) is None
-    assert _judge_alpha(frame) is None
-    assert _judge_estimate(replace(frame, estimate=color)) == "is the noisy picture"
-    assert _judge_alpha(replace(frame, alpha=color[..., 1])) == "is the color"
+    assert _check_estimate(estimate, color) is None
+    assert _check_alpha(alpha, color) is None
+    assert _check_estimate(color, color) == "is the noisy picture"
+    assert _check_alpha(color[..., 1], color) == "is the color"
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.8])
@@ -377,8 +375,8 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
     spec = write(tmp_path, edit)
     assert main(["inspect", str(spec), "--motion", "none", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert "frames 10 and 11 show something else" in " ".join(err.split())
-    assert "frames 10 and 11 show something else" in json.loads(out)["judged"][-1]["message"]
+    assert "cut between frames 10 and 11" in " ".join(err.split())
+    assert "cut between frames 10 and 11" in json.loads(out)["judged"][-1]["message"]
     assert main(["inspect", str(spec), "--motion", "none", "--strict"]) == 1
     assert main(["pseudoref", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"]) == 1
     assert not list((tmp_path / "o").glob("*.exr"))  # not even what comes before the cut
@@ -387,7 +385,7 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
 def test_the_table_has_the_reading_that_is_taken_and_no_crowd_of_fitted_scales() -> None:
     rows = validate_layers(open_shot(SHOT / "noisy.####.exr")).readings()
     assert [said for taken, said, _ in rows if taken] == ["cycles,pixels,y-up"]
-    assert rows[-1][1] in ("no motion", "found in the pictures")
+    assert rows[-1][1] in ("no motion", "optical flow of the pictures")
     assert len([said for _, said, _ in rows if said.startswith("cycles,pixels,y-up,scale=0.9")]) <= 1
 
 

@@ -102,7 +102,7 @@ def test_a_cut_is_said_before_methods_run(tmp_path: Path, capsys: pytest.Capture
     clean = scene.write(tmp_path / "clean", edit=cut, without=bare, clean=True)
     words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1"]
     assert main([*words, "--strict"]) == 1
-    said = "frames 1001 and 1002 show something else: nothing is averaged over this cut"
+    said = "cut between frames 1001 and 1002: nothing is averaged across it"
     assert said in " ".join(capsys.readouterr().err.split())
     assert main(words) == 0
     assert said in " ".join(capsys.readouterr().err.split())

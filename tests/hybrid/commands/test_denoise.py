@@ -154,10 +154,10 @@ def test_options_that_contradict_each_other_are_refused_before_a_file_is_opened(
 
 
 def test_a_layer_that_makes_no_sense_ends_a_strict_run_and_is_on_record(tmp_path, capsys):
-    folder = Scene().write(tmp_path / "in")  # whose normal is the same everywhere
+    folder = Scene().write(tmp_path / "in")  # whose normal is constant
     words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
     assert main([*words, "--strict"]) == 1
     ((_, record),) = read_records(tmp_path / "out")
     assert record["state"] == "failed"
-    assert "is the same everywhere" in record["error"]
+    assert "is constant" in record["error"]
     assert main(words) == 0

@@ -90,7 +90,7 @@ def test_a_cut_is_said_of_the_shot_that_has_it(shot, tmp_path, capsys):
     words = ("prepare", tmp_path / "one", tmp_path / "cut", "-o", tmp_path / "clips", *options)
     assert run(*words) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "cut: frames 1002 and 1003 show something else" in said
+    assert "cut: cut between frames 1002 and 1003" in said
     assert "one: frames" not in said
     shutil.rmtree(tmp_path / "clips")
     assert run(*words, "--strict") == 1
