@@ -477,7 +477,7 @@ def _check_depth(layer: Array, _: Array) -> str | None:
 def _check_alpha(layer: Array, color: Array) -> str | None:
     if layer.min() == layer.max():
         return None  # opaque everywhere, or empty
-    if any(_equal_share(layer, color[..., c], np.equal(layer, color[..., c])) > EQUAL for c in range(3)):
+    if any(_equal_share(layer, color[..., c], np.asarray(layer == color[..., c], bool)) > EQUAL for c in range(3)):
         return "is the color"
     outside = float(np.mean((layer < -STRAY) | (layer > 1 + STRAY)))
     return f"is not between 0 and 1 in {outside:.1%} of the picture" if outside > STRAY else None
@@ -492,7 +492,7 @@ def _check_variance(layer: Array, _: Array) -> str | None:
 
 def _check_estimate(layer: Array, color: Array) -> str | None:
     # Half floats are rounded by 5e-4 of their value.
-    same = np.isclose(layer, color, rtol=SAME, atol=0).all(axis=-1)
+    same = np.asarray(np.isclose(layer, color, rtol=SAME, atol=0).all(axis=-1), bool)
     return "is the noisy picture" if _equal_share(layer, color, same) > EQUAL else None
 
 

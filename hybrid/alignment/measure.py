@@ -1,7 +1,6 @@
-"""What frames and pairs of frames show: the figures that decisions are made of (`hybrid.plan`).
+"""Measurements of frames and of pairs of neighbouring frames, from which stages are chosen (`hybrid.plan`).
 
-Each figure depends on its frame, or on its two neighbouring frames, and on nothing else: so what is decided for a
-window is the same whatever part of a shot is denoised.
+Each depends only on its frame or pair: the stages of a window are the same whatever part of a shot is denoised.
 """
 
 from __future__ import annotations
@@ -23,56 +22,55 @@ from nlm.gate import color_gate
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Frames are looked at about this small: a mean of k×k pixels has a k-th of their noise, and a k²-th of their cost.
-# No smaller than the whole frame below twice this.
+# Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
+# cost. Frames below twice this are not reduced.
 SHORT_SIDE = 270
-# Where the noise is compared that stands still: enough pixels to tell a correlation of 0.02.
+# Side of the crop in which fixed noise is measured: enough pixels to detect a correlation of 0.02.
 CROP = 512
-# Below half of this many pixels of motion a pixel counts as still, above one and a half its noise is another's.
+# Pixels of motion below which a pixel is static, and above which its noise is that of another pixel.
 STILL_NOISE, MOVED_NOISE = 0.05, 1.5
-# Half floats are rounded by 2^-11 of their value: what differs by less is the same sample.
+# Half floats are rounded by 2^-11 of their value: values that differ by less are the same sample.
 SAME = 2.0**-10
-# Means of 9×9 of guides that differ by more, in units of albedo, show something else; a lens leaves noise of 0.05 in a
-# pixel, and a tenth of it in these.
+# Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
+# noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
-# Noise hides in 9×9 pixels what means of larger areas show: where they differ by more than a twentieth, and by eight
-# times what noise makes them differ by; samples that a pixel filter spreads are alike in several pixels.
+# Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
+# standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
-# Noise is one for two frames where more than this share of it is the same at equal pixels.
+# Two frames have fixed noise where more than this share of it is the same at equal pixels.
 FIXED_NOISE_ABOVE = 0.25
-# A frame repeats another where no less than this share is: all but what is burned into the picture.
+# A frame repeats another where at least this share is equal: all but burned-in text.
 REPEATED = 0.99
-# Noise around a place is that of so many pixels on a side, or that of the whole frame where so few of them hold any.
+# Side of the area in which noise is compared around a pixel; the whole frame if fewer than `FEW` pixels hold noise.
 NOISE_AROUND, FEW = 33, 32
-# A tile that differs from its own smoothed self by less than this, relative to exposure, has no noise.
+# A tile that differs from its smoothed version by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32
-# Neighbours are two shots where more than this share of the picture changes, at equal pixels and along the vectors, and
-# a flow that is found in the pictures leaves more than this share of that. Another light does as much, but leaves the
-# guides as they are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
+# Neighbours are a cut where more than this share of the picture changes, at equal pixels and along the vectors, and
+# optical flow leaves more than this share of the change. A change of light does as much, but leaves the guides as they
+# are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
 CUT = 0.5
 
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """Figures of one frame.
+    """Measurements of one frame.
 
     Attributes
     ----------
     number : int
-        Of the frame.
     albedo_spread : float or None
-        Standard deviation of the albedo over the frame; None without one.
+        Standard deviation of the albedo over the frame.
     guides : bool
-        Whether there is an albedo or a normal.
+        Whether the frame has albedo or normal.
     fireflies : int
-        Single bright samples that were taken out.
+        Number of fireflies that were removed.
     outliers : float
-        Share of the pixels that stand far above all their neighbours, in [0, 1].
+        Share of the pixels far above all their neighbours, in [0, 1].
     transparent : float or None
-        Share of the pixels whose alpha is below 0.999; None without alpha.
+        Share of the pixels whose alpha is below 0.999.
     noise_free : float
-        Share of the tiles that hold no noise, in [0, 1].
+        Share of the tiles without noise, in [0, 1].
     """
 
     number: int
@@ -86,28 +84,28 @@ class FrameFacts:
 
 @dataclass(frozen=True)
 class PairFacts:
-    """Figures of two neighbouring frames.
+    """Measurements of two neighbouring frames.
 
     Attributes
     ----------
     numbers : (int, int)
-        Of the frames, ascending.
+        Ascending.
     vectors : bool
-        Whether the renderer says where pixels move.
+        Whether the frames have motion vectors.
     speed : float
-        Pixels per frame of the fastest thousandth by these vectors; 0 without.
+        Pixels per frame, the 0.999 quantile of the vectors; 0 without vectors.
     changed : float
         Share of the picture that changes at equal pixels by more than noise, in [0, 1].
     unexplained : float
         Share of the picture whose light changes along the vectors by more than noise; `changed` without vectors.
     fixed_noise : float
-        How much of the noise stands still on the screen, in [-1, 1]: about 1 with one seed for all frames, else 0.
+        Share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0.
     guide_noise : float
-        Upper quartile of what albedo and normal differ by between the frames, along the vectors.
+        Upper quartile of the difference of albedo and normal between the frames, along the vectors.
     cut : bool
-        Whether the frames show something else, so that nothing of one helps the other.
+        Whether the frames are of different scenes, so that they must not be averaged.
     repeated : bool
-        Whether one is the other once more, so that it holds no samples of its own.
+        Whether the later frame repeats the earlier one, and has no samples of its own.
     """
 
     numbers: tuple[int, int]
@@ -123,16 +121,14 @@ class PairFacts:
 
 @dataclass(frozen=True)
 class SmallFrame:
-    """A frame as it is looked at: reduced by a whole factor, with its light.
+    """A frame reduced by a whole `factor` for measuring.
 
     Attributes
     ----------
-    factor : int
-        Pixels of the frame on a side of one here.
     irradiance, light : (h, w, 3) array
-        Means over these pixels, and the same without most of the noise.
+        Means over factor × factor pixels, noisy and without most of the noise.
     albedo : (h, w, 3) array or None
-        What the irradiance was divided by.
+        Divisor of the irradiance.
     valid : (h, w) bool array
         Where the frame has been rendered.
     """
@@ -144,7 +140,7 @@ class SmallFrame:
     valid: Mask
 
     def textured(self) -> SmallFrame:
-        """Multiply by the albedo again: what moves shows in its texture first."""
+        """Return the frame times its albedo: motion shows in texture first."""
         if self.albedo is None:
             return self
         irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
@@ -152,7 +148,7 @@ class SmallFrame:
 
 
 def shrink(frame: PreparedFrame) -> SmallFrame:
-    """Reduce a frame for looking at it; its size decides by how much."""
+    """Reduce a frame to about `SHORT_SIDE` rows."""
     height, width = frame.irradiance.shape[:2]
     factor = round(min(height, width) / SHORT_SIDE)
     if min(height, width) < 2 * SHORT_SIDE:
@@ -171,9 +167,8 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
     Parameters
     ----------
     frame : PreparedFrame
-        The frame.
     small : SmallFrame
-        The same, from `shrink`.
+        From `shrink`.
     """
     _, rejected = reject_outliers(frame.irradiance[None], frame.valid[None].astype(np.float32))
     return FrameFacts(
@@ -193,13 +188,13 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
     Parameters
     ----------
     here, there : PreparedFrame
-        The frames, in order of time.
+        In order of time.
     smalls : (SmallFrame, SmallFrame)
-        The same, from `shrink`.
+        From `shrink`.
     """
     vectors = rendered_flow(here, there)
     changed = _changed(smalls[0].textured(), smalls[1].textured(), None)
-    if vectors is None:  # what moves shows in the guides first, which have next to no noise
+    if vectors is None:  # motion shows in the guides first, which have next to no noise
         changed = max(changed, _guide_change(here, there))
     speed = 0.0
     if vectors is not None:
@@ -227,7 +222,7 @@ def _is_cut(
     smalls: tuple[SmallFrame, SmallFrame],
     vectors: tuple[Array, Mask] | None,
 ) -> bool:
-    """Whether neither the vectors nor a flow found in the pictures connects two frames that differ much."""
+    """Whether neither vectors nor optical flow connect two frames that differ much."""
     shown = smalls[0].textured(), smalls[1].textured()
     if vectors is not None and _changed(*shown, _reduced(vectors, smalls[0])) <= CUT:
         return False
@@ -239,40 +234,35 @@ def _is_cut(
 
 
 def _search(here: Array, there: Array) -> tuple[Array, Mask]:
-    """A flow between two pictures (H, W, 3), found in them."""
+    """Optical flow between two pictures (H, W, 3), valid everywhere."""
     exposure = measure_exposure(here)
     flow = rough_flow(tone_map(there, exposure), tone_map(here, exposure))
     return flow, np.ones(flow.shape[:2], bool)
 
 
 def _guides(here: PreparedFrame, there: PreparedFrame) -> list[tuple[Array, Array]]:
-    """The guides that both frames have."""
+    """Pairs of the guides that both frames have."""
     pairs = (here.albedo, there.albedo), (here.normal, there.normal)
     return [(guide, other) for guide, other in pairs if guide is not None and other is not None]
 
 
 def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> float:
-    """Tell how much of the noise of two frames is the same at equal pixels.
+    """Measure the share of the noise of two frames that is the same at equal pixels, in [-1, 1]; 0 without noise.
 
     Parameters
     ----------
     here, there : PreparedFrame
         Neighbouring frames of one size.
     moves : bool
-        Whether the picture changes at equal pixels; asked only where no vectors tell: then the motion is searched for.
-
-    Returns
-    -------
-    float
-        In [-1, 1]; 0 where there is no noise.
+        Whether the picture changes at equal pixels: without vectors, motion is then searched for.
 
     Notes
     -----
-    Detail correlates at equal pixels as a fixed noise does, so it is taken out first. Where the picture moves, each
-    frame is compared with the other one, warped to it: d_a = a - b(x + v), d_b = b - a(x - v). With a seed for each
-    frame their covariance at equal pixels is 0, detail or not; with one seed it is half of their variance. Where the
-    picture stands still, samples of one seed are equal to the bit, and samples of two seeds are not. Both are relative
-    to the light, without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
+    Detail correlates at equal pixels as fixed noise does, so it is removed first. In moving parts each frame is
+    compared with the other one, warped to it: d_a = a - b(x + v), d_b = b - a(x - v). With a seed for each frame their
+    covariance at equal pixels is 0, with and without detail; with one seed it is half of their variance. In static
+    parts samples of one seed are equal to the bit, and samples of two seeds are not. Both are relative to the light,
+    without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
     block = _middle(here.irradiance.shape[:2])
     a, b = (_level(frame.irradiance[block]) for frame in (here, there))
@@ -282,7 +272,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > 4 * SAME
     forth, back, slowest = rendered_flow(here, there), rendered_flow(there, here), STILL_NOISE
     if (forth is None or back is None) and moves:
-        # What is found is right to some tenths of a pixel: more than that is as good as still, which asks for equality.
+        # Optical flow is exact to some tenths of a pixel: slower motion may be none, and static pixels must be equal.
         forth, back = _search(here.radiance, there.radiance), _search(there.radiance, here.radiance)
         slowest = MOVED_NOISE
     if forth is None or back is None:
@@ -307,7 +297,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
 
 
 def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
-    """Find where two frames hold noise or detail, and where that is the same sample at equal pixels.
+    """Find pixels at which two frames have noise or detail, and those at which it is the same sample.
 
     Parameters
     ----------
@@ -317,9 +307,9 @@ def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
     Returns
     -------
     grainy : (H, W) array
-        1 where both differ from the median of the 5×5 pixels around by more than half floats are rounded, else 0.
+        1 where both differ from the median of 5×5 pixels by more than the rounding of half floats, else 0.
     equal : (H, W) array
-        1 where also their values are equal to that rounding, else 0.
+        1 where their values also agree to that rounding, else 0.
     """
     a, b = _level(here), _level(there)
     most = np.maximum(np.abs(a), np.abs(b))
@@ -329,7 +319,7 @@ def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
 
 
 def repeats(grainy: Array, equal: Array) -> bool:
-    """Tell whether a frame is another once more; never where there is hardly any noise or detail.
+    """Return whether a frame repeats another; False if hardly any pixel has noise or detail.
 
     Parameters
     ----------
@@ -341,7 +331,7 @@ def repeats(grainy: Array, equal: Array) -> bool:
 
 
 def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
-    """Tell around which pixels two frames have the same noise.
+    """Return whether two frames have the same noise around each of some pixels, (K,) bool.
 
     Parameters
     ----------
@@ -349,10 +339,6 @@ def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask
         From `equal_noise`.
     pixels : (K, 2) array
         Rows and columns.
-
-    Returns
-    -------
-    (K,) array of bool
     """
     share = float(equal.sum() / max(grainy.sum(), 1))
     rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))
@@ -368,7 +354,7 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     if vectors is not None:
         other, inside = warp(other, vectors[0])
         inside &= vectors[1]
-    inside &= _seen(here, there)
+    inside &= _coverage(here, there)
     window = np.stack([other, here.light, other])
     weight = color_gate(window, here.irradiance, exposure)[0]
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
@@ -379,21 +365,22 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Share of the picture in areas whose mean light differs by more than noise, along `vectors`.
 
-    Areas are of 32×32 pixels, or the whole picture at once. Differences are relative to the light of both, or to a
-    twentieth of the exposure in the dark. They are not tone-mapped: of less noise, as after warping, that makes light.
+    Areas are of 32×32 pixels, or the whole picture. Differences are relative to the light of both, or to a twentieth of
+    the exposure in the dark. They are not tone-mapped: the mean of tone-mapped noise depends on its variance, which
+    warping reduces.
     """
     shape = here.light.shape[:2]
     both, light, inside = [here.irradiance, there.irradiance], there.light, np.ones(shape, bool)
     if vectors is not None:
         (both[1], inside), (light, _) = warp(there.irradiance, vectors[0]), warp(there.light, vectors[0])
         inside &= vectors[1]
-    inside &= _seen(here, there)
+    inside &= _coverage(here, there)
     floor = np.float32(0.05 * measure_exposure(here.light))
     level = 0.5 * (_level(here.light) + _level(light)) + floor
     difference = np.where(inside, (_level(both[1]) - _level(both[0])) / level, np.float32(0))
     sums = np.stack([difference, np.square(difference), inside.astype(np.float32)], axis=-1)
     shares = [0.0]
-    for side in {min(AREA, *shape), min(shape)} - {*range(8)}:  # of fewer pixels nobody knows the noise
+    for side in {min(AREA, *shape), min(shape)} - {*range(8)}:  # fewer pixels give no estimate of the noise
         mean, square, known = np.moveaxis(_means(sums, side).astype(np.float64), 2, 0)
         full = known > 0.5
         mean, square = mean[full] / known[full], square[full] / known[full]
@@ -403,12 +390,13 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
     return max(shares)
 
 
-def _seen(here: SmallFrame, there: SmallFrame) -> Mask:
-    """Where the first of two frames shows anything; all that either shows, where the first is much emptier.
+def _coverage(here: SmallFrame, there: SmallFrame) -> Mask:
+    """Where the first of two frames is lit; where either is, if the first is lit in less than half as many pixels.
 
-    Beside a render region, and behind an object, nothing is seen: what an object uncovers there is no change of light.
+    Outside a render region, and behind an object, frames are black: background that an object uncovers there is no
+    change of light.
     """
-    # Closed: noise leaves single pixels of what is seen black.
+    # Closed: noise leaves single pixels of lit surfaces black.
     lit = ((frame.valid & (_level(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
     shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]
     if 2 * np.count_nonzero(shown[0]) > np.count_nonzero(shown[1]):
@@ -417,7 +405,7 @@ def _seen(here: SmallFrame, there: SmallFrame) -> Mask:
 
 
 def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mask]:
-    """Vectors of the small frame: the means of those that are known, in its pixels."""
+    """Vectors of the small frame: means of the valid ones, in its pixels."""
     flow, valid = vectors
     if small.factor == 1:
         return vectors
@@ -428,7 +416,7 @@ def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mas
 
 
 def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int) -> float:
-    """Upper quartile over every `factor`-th pixel; smaller guides would have less noise."""
+    """Upper quartile of guide differences over every `factor`-th pixel; reduced guides would have less noise."""
     grid = slice(factor // 2, None, factor), slice(factor // 2, None, factor)
     differences = []
     for guide, other in _guides(here, there):
@@ -438,7 +426,7 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
 
 
 def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:
-    """Share of the picture whose guides differ along the vectors, in means of 9×9, by more than noise, in [0, 1]."""
+    """Share of the picture whose guides differ along the vectors, in means of 9×9 pixels, by more than noise."""
     shares = [0.0]
     for guide, other in _guides(here, there):
         moved = other if vectors is None else warp(other, vectors[0])[0]
@@ -448,7 +436,7 @@ def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Arra
 
 
 def _warp_block(image: Array, flow: Array, block: tuple[slice, slice]) -> Array:
-    """Some pixels of an image, warped along a flow of the whole frame; the border's value outside."""
+    """A block of an image, warped along a flow of the whole frame; outside, the value of the border."""
     rows, columns = (np.arange(size, dtype=np.float32)[part] for size, part in zip(flow.shape, block, strict=False))
     moved = flow[block]
     x, y = columns[None, :] + moved[..., 0], rows[:, None] + moved[..., 1]
@@ -482,7 +470,7 @@ def _middle(shape: tuple[int, int]) -> tuple[slice, slice]:
 
 def _high_pass(image: Array) -> Array:
     noise = image - cv2.blur(image, (5, 5))
-    limit = 3 * float(np.median(np.abs(noise[::2, ::2])))  # of a quarter of the pixels, in a quarter of the time
+    limit = 3 * float(np.median(np.abs(noise[::2, ::2])))  # a quarter of the pixels takes a quarter of the time
     return np.asarray(np.clip(noise, -limit, limit), np.float32)
 
 
@@ -493,7 +481,7 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _means(layer: Array, factor: int) -> Array:
-    """Means over blocks of factor × factor pixels; rows and columns that fill none at the end are left out."""
+    """Means over blocks of factor × factor pixels; incomplete blocks at the end are left out."""
     height, width = (size // factor for size in layer.shape[:2])
     cut = np.ascontiguousarray(layer[: height * factor, : width * factor])
     small = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)

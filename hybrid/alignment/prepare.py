@@ -1,4 +1,4 @@
-"""Frames made safe to filter: finite, divided by their albedo, with the renderer's vectors in our convention."""
+"""Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
 from __future__ import annotations
 
@@ -21,19 +21,15 @@ from nlm.guided import guided_filter, measure_guide
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Name of the alpha channel among the AOVs; unlike the others it is not light, and is not demodulated.
+# Name of the alpha channel among the AOVs; unlike the others it is no light, and is not demodulated.
 ALPHA = "alpha"
 
 
 class Brightness(NamedTuple):
-    """How bright a frame is.
+    """Exposure of a frame's irradiance (`measure_exposure`), and moments.
 
-    Attributes
-    ----------
-    exposure : float
-        Of the irradiance (`hybrid.alignment.transfer.measure_exposure`).
-    moments : (2, G + 1) array
-        Mean and deviation over the frame of `PreparedFrame.guide`'s channels, and of the tone-mapped irradiance.
+    `moments` (2, G + 1) are mean and deviation over the frame of `PreparedFrame.guide`'s channels, and of the
+    tone-mapped irradiance.
     """
 
     exposure: float
@@ -42,47 +38,46 @@ class Brightness(NamedTuple):
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, made safe to filter: finite, and divided by its albedo.
+    """One frame, finite and divided by its albedo.
 
     Attributes
     ----------
     number : int
-        The frame's number.
     irradiance : (H, W, 3) array
         Color divided by albedo (`hybrid.alignment.transfer.demodulate`), or the color itself if not `demodulated`.
     albedo, normal : (H, W, 3) array or None
-        Guides, finite.
+        Finite.
     valid : (H, W) bool array
         False where the renderer's color was not finite.
-    unfiltered : Unfiltered
-        What no filter takes, to be put back into the picture.
     repaired : int
-        How many pixels of any layer were not finite and have been filled in.
+        Number of pixels, of any layer, that were not finite and have been filled in.
     motion : Motion or None
-        The renderer's vectors in our convention.
+        In our convention.
     depth : (H, W) array or None
-        Distance; only its order is used, and only where vectors go one way.
+        Distance; only its order is used, and only with vectors of one direction.
     variance : (H, W, 3) array or None
-        Of the irradiance, where the renderer gave one of the color.
+        Of the irradiance.
     alpha : (H, W, 1) array or None
         Coverage, finite.
     aovs : dict of str to (H, W, C) array
-        Further layers to be warped along, demodulated like the color where they are textured.
-    pass_colors : dict of str to (H, W, 3) array
-        Of those the color, finite and at least 0.
-    passes : Passes
-        What `aovs` are to the picture, in this frame.
+        Demodulated if they are textured.
     demodulated : bool
         Whether the albedo has been divided out.
+    pass_colors : dict of str to (H, W, 3) array
+        Colors of AOVs, finite and at least 0.
+    passes : Passes
+        How `aovs` add up to the beauty in this frame.
+    unfiltered : Unfiltered
+        Light that is restored in the finished picture.
     fireflies : int
-        Single bright samples that were taken out.
+        Number of fireflies that were removed.
     removed_radiance : float
-        Mean radiance that went with them: what fireflies carry belongs to the picture in expectation.
+        Their mean radiance, which belongs to the picture in expectation.
     removed_samples : (tuple of index arrays, (K, 3) array) or None
-        Where `irradiance` is not as rendered as fireflies were taken out, and what was there.
+        Where fireflies were removed from `irradiance`, and its values there as rendered.
     highlights : Lights or None
-        Lights of a pixel that other frames show as well, in the mean of these frames: they are not in `irradiance`, and
-        are added to the picture once it is finished. None where there are none.
+        Persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are
+        not in `irradiance`, and are added to the finished picture.
     """
 
     number: int
@@ -107,17 +102,17 @@ class PreparedFrame:
 
     @cached_property
     def light(self) -> Array:
-        """Irradiance without most of its noise (H, W, 3): what the gate compares where nothing better is given."""
+        """Irradiance without most of its noise (H, W, 3), which the gate compares if there is no first pass."""
         return rough_light(self.irradiance, self.albedo, self.normal)
 
     @cached_property
     def as_rendered(self) -> Brightness:
-        """Exposure and moments with the irradiance as it was rendered."""
+        """Exposure and moments of the noisy irradiance."""
         return self._brightness(self.irradiance)
 
     @cached_property
     def as_light(self) -> Brightness:
-        """Exposure and moments with its light."""
+        """Exposure and moments of `light`."""
         return self._brightness(self.light)
 
     def _brightness(self, shown: Array) -> Brightness:
@@ -128,13 +123,13 @@ class PreparedFrame:
 
     @property
     def guide(self) -> Array | None:
-        """Albedo and normal side by side (H, W, G), or None."""
+        """Channels of albedo and normal (H, W, G), or None."""
         guides = [layer for layer in (self.albedo, self.normal) if layer is not None]
         return np.concatenate(guides, axis=-1) if guides else None
 
     @property
     def divisor(self) -> Array | None:
-        """The radiance that an irradiance of 1 is (H, W, 3); None where that is 1 as well."""
+        """Radiance per irradiance (H, W, 3); None if both are the same."""
         if self.albedo is None or not self.demodulated:
             return None
         return remodulate(np.ones_like(self.irradiance), self.albedo)
@@ -151,7 +146,7 @@ class PreparedFrame:
 
     @property
     def rendered(self) -> Array:
-        """The noisy radiance (H, W, 3), with fireflies, without highlights: right in the mean but for these."""
+        """The noisy radiance (H, W, 3), with fireflies, without highlights: unbiased but for these."""
         if self.removed_samples is None:
             return self.radiance
         whole, (places, light) = self.irradiance.copy(), self.removed_samples
@@ -160,7 +155,7 @@ class PreparedFrame:
 
     @property
     def radiance_variance(self) -> Array | None:
-        """Variance of `radiance` (H, W, 3), where the renderer gave one."""
+        """Variance of `radiance` (H, W, 3), or None."""
         return None if self.variance is None else self._as_radiance(self._as_radiance(self.variance))
 
     def _as_radiance(self, irradiance: Array) -> Array:
@@ -175,14 +170,13 @@ class PreparedFrame:
 
 
 def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
-    """Make one frame safe to filter, and divide it by its albedo.
+    """Fill non-finite pixels of a frame, set light apart that is not filtered, and divide by the albedo.
 
     Parameters
     ----------
     frame : Frame
-        As read.
     demodulated : bool
-        Whether to divide by the albedo, where there is one.
+        Divide by the albedo if there is one.
     """
     color, unfiltered = split_unfiltered(frame)
     color, bad = replace_nonfinite(color)
@@ -232,19 +226,14 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
 
 
 def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
-    """Estimate the light of one frame, cheaply: what the gate compares must not be noise.
+    """Denoise the irradiance of one frame by a guided filter, cheaply, for the gate.
 
     Parameters
     ----------
     irradiance : (H, W, 3) array
         Finite.
     albedo, normal : (H, W, 3) array or None
-        Guides, finite.
-
-    Returns
-    -------
-    (H, W, 3) array
-        Irradiance.
+        Finite.
     """
     clean, _ = reject_outliers(irradiance[None], np.ones((1, *irradiance.shape[:2]), np.float32))
     guides = [layer for layer in (albedo, normal) if layer is not None]
@@ -255,19 +244,19 @@ def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -
 
 
 def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
-    """Give the flow between neighbouring frames as the renderer gave it.
+    """Return the renderer's flow between neighbouring frames, or None without vectors.
 
     Parameters
     ----------
     here, there : PreparedFrame
-        Neighbours. Vectors span one frame; where only every n-th frame was rendered they are taken n times as long.
+        Neighbours. Vectors span one frame; if only every n-th frame was rendered they are multiplied by n.
 
     Returns
     -------
     flow : (H, W, 2) array
-        Pixels, from `here` to `there`. None, and no mask, where the renderer gave none.
+        Pixels, from `here` to `there`.
     valid : (H, W) array of bool
-        True where it is known.
+        Where the flow is known.
     """
     step = abs(there.number - here.number)
     forward = there.number > here.number
@@ -276,7 +265,7 @@ def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mas
         return _times(direct.flow, step), direct.valid
     reverse = there.motion and (there.motion.to_previous if forward else there.motion.to_next)
     if reverse is not None:
-        # The other frame knows where each of its pixels is in this one.
+        # The other frame's vectors lead from its pixels to this frame.
         return invert_flow(_times(reverse.flow, step), valid=reverse.valid, depth=there.depth)
     return None
 

@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-# Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely
-# specular surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a
-# neighbour's light can get by crossing an edge between materials; KPCN's 0.00316 allows a factor of 300.
+# Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely specular
+# surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a neighbour's light
+# gets across an edge between materials; KPCN's 0.00316 allows a factor of 300.
 ALBEDO_FLOOR = 0.1
-# Mean radiance that counts as none: far below any render's, and a spark of 1e8 over it is still a float32.
+# Mean radiance that counts as no light: far below any render's, and 1e8 divided by it is still a float32.
 NO_LIGHT = 1e-30
-# Share of an image's exposure below which a part of it is not lit. Denoisers leave 1e-10 to 1e-4 on black beside an
-# object; the darkest hundredth of a lit picture hardly changes its mean.
+# Share of an image's exposure below which a part is not lit. Denoisers leave 1e-10 to 1e-4 on black next to an object;
+# the darkest hundredth of a lit picture hardly changes its mean.
 LIT = 1e-2
 
 
@@ -28,32 +28,21 @@ def demodulate(radiance: Array, albedo: Array) -> Array:
     albedo : (H, W, 3) array
         Reflectance, finite, >= 0. Its mean over channels is used where C is not 3.
 
-    Returns
-    -------
-    (H, W, C) array
-        ``radiance / (albedo + ALBEDO_FLOOR)``.
-
-    References
-    ----------
-    Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1, doi:10.1145/3072959.3073708.
+    Notes
+    -----
+    ``radiance / (albedo + ALBEDO_FLOOR)``; Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1,
+    doi:10.1145/3072959.3073708.
     """
     return radiance / _divisor(albedo, radiance.shape[-1])
 
 
 def remodulate(irradiance: Array, albedo: Array) -> Array:
-    """Inverse of `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``.
+    """Invert `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``.
 
     Parameters
     ----------
     irradiance : (H, W, C) array
-        From `demodulate`.
     albedo : (H, W, 3) array
-        In [0, 1]; its mean where C is not 3.
-
-    Returns
-    -------
-    (H, W, C) array
-        Linear radiance.
     """
     return irradiance * _divisor(albedo, irradiance.shape[-1])
 
@@ -69,19 +58,14 @@ def compress(radiance: Array, exposure: float) -> Array:
 
     Parameters
     ----------
-    radiance : (...) array
-        Linear radiance; negative values count as 0.
+    radiance : array
+        Linear; negative values count as 0.
     exposure : float
-        Radiance that becomes 1/2.
+        Radiance that is mapped to 1/2.
 
-    Returns
-    -------
-    (...) array of float32
-        In [0, 1): ``x / (1 + x)`` with ``x = radiance / exposure``.
-
-    References
-    ----------
-    Reinhard et al. 2002, doi:10.1145/566654.566575, eq. 3
+    Notes
+    -----
+    ``x / (1 + x)`` with ``x = radiance / exposure``; Reinhard et al. 2002, doi:10.1145/566654.566575, eq. 3.
     """
     light = np.asarray(np.maximum(radiance, 0), np.float32)
     # Not x / (1 + x): a spark over next to no exposure would be infinite.
@@ -89,55 +73,41 @@ def compress(radiance: Array, exposure: float) -> Array:
 
 
 def expand(compressed: Array, exposure: float) -> Array:
-    """Inverse of `compress`.
+    """Invert `compress`.
 
     Parameters
     ----------
-    compressed : (...) array
-        In [0, 1), from `compress`.
+    compressed : array
+        In [0, 1).
     exposure : float
-        The same.
-
-    Returns
-    -------
-    (...) array
-        Linear radiance.
     """
     return compressed / (1 - compressed) * np.float32(exposure)
 
 
 def measure_exposure(radiance: Array) -> float:
-    """Measure the brightness of an image: the mean of what is lit, without its brightest hundredth.
+    """Return the mean radiance of the lit part of an image (H, W, C), with its brightest hundredth clipped.
 
-    Parameters
-    ----------
-    radiance : (H, W, C) array
-        Linear radiance; values that are not finite are left out.
-
-    Returns
-    -------
-    float
-        Positive, and proportional to the image, so that what is divided by it does not depend on the image's
-        scale. 1 for an image without light, or with less than `NO_LIGHT`.
+    Positive, and proportional to the image; 1 for an image with less light than `NO_LIGHT`. Non-finite values are
+    excluded.
 
     Notes
     -----
     The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times the result,
-    so that an object on black has the exposure of the object alone. Single pixels cannot tell: in noisy images many
-    pixels of a lit surface are black.
+    so that an object on black has the exposure of the object alone. Single pixels do not show whether a surface is lit:
+    in noisy images many of its pixels are black.
     """
     if radiance.size == 0:
         return 1.0
     level = np.einsum("...c->...", radiance, dtype=np.float32) / np.float32(radiance.shape[-1])
     level = np.where(np.isfinite(level), level, np.float32(np.nan))
     means = _bin_means(level)
-    # Far below any surface beside the brightest lamp that a half float holds, and far above what a denoiser leaves on
-    # black: the first guess has to come without an exposure.
+    # Far below any surface next to the brightest lamp that a half float holds, and far above the residue of a denoiser
+    # on black: the first guess needs no exposure.
     brightest = float(np.nanmax(means, initial=0.0))
     lit = means > max(1e-9 * brightest, NO_LIGHT)
     exposure = 0.0
     while lit.any():
-        # Lamps, sky seen through a window and fireflies are few and bright; they must not decide the exposure.
+        # Lamps, sky in a window and fireflies are few and bright; they must not decide the exposure.
         inside = level[_spread(lit, level.shape)]
         inside = inside[np.isfinite(inside)]
         bright = np.partition(inside, -1 - inside.size // 100)[-1 - inside.size // 100]
@@ -150,36 +120,23 @@ def measure_exposure(radiance: Array) -> float:
 
 
 def measure_gain(picture: Array) -> float:
-    """Factor that a denoised picture is multiplied by before OIDN's transfer curve: `autoexposure` of what is lit.
+    """Return the factor of a denoised picture (H, W, 3) before OIDN's transfer curve: `autoexposure` of its lit part.
 
-    Parameters
-    ----------
-    picture : (H, W, 3) array
-        Linear radiance, finite. Denoisers leave tiny values on black, which are no light.
-
-    Returns
-    -------
-    float
-        Positive; ``measure_gain(a·x) = measure_gain(x) / a``.
+    ``measure_gain(a·x) = measure_gain(x) / a``. Denoisers leave tiny values on black, which are no light.
     """
     exposure = measure_exposure(picture)
     return autoexposure(picture / np.float32(exposure), dark=LIT) / exposure
 
 
 def autoexposure(radiance: Array, *, dark: float = 1e-8) -> float:
-    """Factor that OIDN multiplies an image by, so that all of its parts can be given that of the whole.
+    """Return OIDN's factor of an image; ``autoexposure(a·x) = autoexposure(x) / a``; 1 without light.
 
     Parameters
     ----------
     radiance : (H, W, 3) array
-        Linear radiance, finite; negative values count as 0.
+        Linear, finite; negative values count as 0.
     dark : float
-        Bins of at most this luminance are left out.
-
-    Returns
-    -------
-    float
-        Positive; ``autoexposure(a·x) = autoexposure(x) / a``. 1 for an image without light.
+        Bins of at most this luminance are excluded.
 
     Notes
     -----
@@ -199,7 +156,7 @@ def _edges(length: int) -> NDArray[np.intp]:
 
 
 def _bin_means(level: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Means over bins of at most 16×16 pixels, without NaN; NaN where a bin has nothing else."""
+    """Means over bins of at most 16×16 pixels, without NaN; NaN for a bin without other values."""
     known = np.isfinite(level)
     sums, counts = np.where(known, level, 0).astype(np.float64), known.astype(np.float64)
     for axis in (0, 1):
@@ -209,7 +166,7 @@ def _bin_means(level: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _spread(bins: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Give each pixel the value of its bin."""
+    """Repeat the value of each bin over its pixels."""
     for axis in (0, 1):
         bins = np.repeat(bins, np.diff(_edges(shape[axis])), axis=axis)
     return bins

@@ -1,8 +1,8 @@
-"""Parts of a frame's color that no filter takes: set apart before anything is made of it, and put back last.
+"""Parts of a frame's color that are not filtered: removed before denoising, and restored in the finished picture.
 
-Beside a render region a frame is black, which filters would mix into its edges. A sun beyond the range of half would
-shine over the frame, the negative light of a color outside of the gamut would be cut off by every denoiser, and a gray
-picture would be tinted by networks that learned from colors.
+Outside a render region a frame is black, which filters would mix into its edges. A sun beyond the range of half would
+spread over the frame, the negative light of a color outside of the gamut would be clipped by every denoiser, and a gray
+picture would be tinted by networks that were trained on colors.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Region = tuple[slice, slice]
 
-# A frame is mirrored by so many pixels beyond the edges of a render region: as far as most weights of a filter
-# reach.
+# Pixels by which a frame is mirrored beyond the edges of a render region: the support of most weights of a filter.
 _MIRRORED = 32
-# A region has no fewer pixels on a side, and of each of its edges this share is lit; the outline of an object touches
-# its box in less.
+# Least pixels on a side of a region, and the share of each of its edges that is lit; the outline of an object touches
+# its box in a smaller share.
 _LEAST, _EDGE = 16, 0.9
-# Fewer pixels of +Inf that touch are fireflies: one bright sample covers a pixel, a renderer's filter up to 2×2.
+# Fewer connected pixels of +Inf are fireflies: one bright sample covers a pixel, with a renderer's filter up to 2×2.
 _LIGHT = 5
 
 
 @dataclass(frozen=True)
 class Unfiltered:
-    """What is put back into the picture of a frame.
+    """Light that is restored in the finished picture of a frame.
 
     Attributes
     ----------
     beyond : (H, W, 3) array or None
         Radiance of lights brighter than half can hold: `HALF_MAX` where it is +Inf; NaN in all other pixels.
     negative : dict of str to (H, W, 3) array
-        Of "color" and the AOVs the negative radiance of colors outside of the gamut, noisy; those that have some.
+        "color" or AOV → noisy negative radiance of colors outside of the gamut.
     gray : frozenset of str
-        Of "color" and the AOVs those whose three channels are the same everywhere.
+        Names, "color" or AOVs, whose three channels are equal everywhere.
     region : (slice, slice) or None
-        Rows and columns of a render region, beside which all is black.
+        Rows and columns of a render region, outside which the frame is black.
     """
 
     beyond: Array | None = None
@@ -61,23 +60,13 @@ class Unfiltered:
 
     @property
     def count(self) -> int:
-        """How many values are `HALF_MAX` in the place of +Inf."""
+        """Number of values that are `HALF_MAX` instead of +Inf."""
         return 0 if self.beyond is None else int(np.count_nonzero(self.beyond == np.float32(HALF_MAX)))
 
     def restore(self, picture: Array, guide: Array | None) -> Array:
-        """Put all of it back into a picture.
+        """Restore the light in a denoised picture (H, W, 3), with the local mean of the negative light.
 
-        Parameters
-        ----------
-        picture : (H, W, 3) array
-            Denoised radiance, of what `split_unfiltered` has left.
-        guide : (H, W, G) array or None
-            Albedo and normal, finite.
-
-        Returns
-        -------
-        (H, W, 3) array
-            The picture plus the local mean of the negative light.
+        `guide` (H, W, G) or None is albedo and normal, finite.
         """
         if "color" in self.gray:
             picture = as_gray(picture)
@@ -88,27 +77,13 @@ class Unfiltered:
         return np.asarray(self.without_outside(picture), np.float32)
 
     def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
-        """The local mean of negative radiance.
-
-        Parameters
-        ----------
-        name : str
-            Of a layer that has some.
-        picture : (H, W, 3) array
-            Denoised radiance, whose edges it follows.
-        guide : (H, W, G) array or None
-            Albedo and normal, finite.
-
-        Returns
-        -------
-        (H, W, 3) array
-        """
+        """Return the local mean of a layer's negative radiance, which follows edges of `picture` and `guide`."""
         shown = compress(picture, measure_exposure(picture))
         shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
         return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
 
     def without_outside(self, layer: Array) -> Array:
-        """A layer (H, W, ...) that is 0 outside of the render region, if there is one."""
+        """Return a layer (H, W, ...) set to 0 outside the render region, if there is one."""
         if self.region is None:
             return layer
         inside = np.zeros_like(layer)
@@ -117,19 +92,11 @@ class Unfiltered:
 
 
 def find_region(color: Array) -> Region | None:
-    """Find the rectangle outside of which a frame is black, as beside a render region.
+    """Return rows and columns of the rectangle outside of which a frame (H, W, 3) is black, as of a render region.
 
-    Parameters
-    ----------
-    color : (H, W, 3) array
-        Radiance.
-
-    Returns
-    -------
-    (slice, slice) or None
-        Rows and columns; None where the frame is lit as a whole, or where what is lit is no rectangle.
+    None if the whole frame is lit, or if the lit area is no rectangle.
     """
-    # Closed: noise leaves single pixels of what is seen black.
+    # Closed: noise leaves single pixels of lit surfaces black.
     lit = cv2.morphologyEx((color != 0).any(axis=-1).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     shown = [np.flatnonzero(lit.any(axis=1 - axis)) for axis in (0, 1)]
     if not shown[0].size:
@@ -137,7 +104,7 @@ def find_region(color: Array) -> Region | None:
     rows, columns = (slice(int(places[0]), int(places[-1]) + 1) for places in shown)
     if min(rows.stop - rows.start, columns.stop - columns.start) < _LEAST:
         return None
-    # Of three rows or columns at each edge: noise leaves pixels of one black.
+    # Three rows or columns at each edge: noise leaves pixels of a single one black.
     edges = [lit[rows.start : rows.start + 3, columns].max(axis=0)] if rows.start > 0 else []
     edges += [lit[rows.stop - 3 : rows.stop, columns].max(axis=0)] if rows.stop < len(lit) else []
     edges += [lit[rows, columns.start : columns.start + 3].max(axis=1)] if columns.start > 0 else []
@@ -151,7 +118,6 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
     Parameters
     ----------
     frame : Frame
-        As read.
     region : (slice, slice)
         From `find_region`.
     """
@@ -173,25 +139,11 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
 
 
 def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
-    """Divide a frame's color into what is denoised and what is unfiltered.
+    """Split a frame's color (H, W, 3) into radiance to denoise, not finite where it is lost, and unfiltered light.
 
-    Parameters
-    ----------
-    frame : Frame
-        As read.
-
-    Returns
-    -------
-    color : (H, W, 3) array
-        Radiance; as before not finite where it is lost.
-    unfiltered : Unfiltered
-        The rest.
-
-    Notes
-    -----
-    A color outside of the gamut has negative channels and light in others: what is negative in a channel counts up to
-    the light of the brightest one. A pixel that is negative altogether is one that a filter with negative lobes has
-    left beside a lamp, and stays.
+    A color outside of the gamut has negative channels and light in others: the negative part of a channel counts up to
+    the light of the brightest one. A pixel that is negative in all channels is the trace of a filter with negative
+    lobes next to a lamp, and stays.
     """
     layers = {"color": frame.color, **frame.aovs}
     negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}
@@ -201,7 +153,7 @@ def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
 
 
 def as_gray(picture: Array) -> Array:
-    """The mean of three channels, in all three."""
+    """Return the mean of three channels, in all three."""
     return np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
 
 
@@ -214,7 +166,7 @@ def _is_gray(layer: Array) -> bool:
 
 
 def _negative(layer: Array) -> Array | None:
-    """What is negative in a channel of three, up to the light of the others; None where nothing is."""
+    """The negative part of three channels, up to the light of the brightest; None if there is none."""
     if layer.shape[-1] != 3 or not (layer < 0).any():
         return None
     light = np.maximum(layer.max(axis=-1, keepdims=True), 0)
