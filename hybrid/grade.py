@@ -1,4 +1,4 @@
-"""Whether denoised pictures have the level and the color of their samples, and what brings them there."""
+"""Color grade of denoised pictures: factors that bring them to the level of their samples."""
 
 from __future__ import annotations
 
@@ -12,32 +12,23 @@ Array = NDArray[np.float32]
 
 # Sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise.
 TILE = 8
-# Fewer tiles say nothing.
+# Fewer tiles are no evidence.
 FEWEST = 16
-# Tiles below this share of the mean light count for nothing: empty areas are equal in any grade.
+# Tiles below this share of the mean light are excluded: empty areas are equal in any grade.
 LIT = 0.01
-# Levels that differ by less than this factor, or by fewer standard errors, are left to the mean of the samples:
-# denoisers are off by some percent, and noise that is skewed moves a median by as much.
+# Levels that differ by less than this factor, or by fewer standard errors, are no grade: denoisers are off by some
+# percent, and skewed noise moves a median by as much. The stage that restores the mean corrects them.
 LEVEL, ERRORS = 1.1, 5.0
-# Frames whose pictures differ from their samples by levels that are so many times apart have no grade in common.
+# Frames whose levels relative to their samples differ by more than this factor have no common grade.
 ONE_LEVEL = 1.5
-# Tiles may differ from one factor by this, in units of the logarithm, and by so many times their noise: no factor
-# explains half of the light otherwise.
+# Median deviation of tiles from one factor, in units of the logarithm, plus a multiple of their noise; above it no
+# factor explains half of the light.
 SPREAD, NOISE = 0.15, 1.0
 
 
 @dataclass(frozen=True)
 class Grade:
-    """How denoised pictures differ from their samples.
-
-    Attributes
-    ----------
-    factors : (float, float, float) or None
-        By which the pictures are multiplied to have the level of their samples; None: no factor explains the
-        difference.
-    message : str
-        What was found, in words.
-    """
+    """Factors by channel that bring denoised pictures to the level of their samples; None if no factor does."""
 
     factors: tuple[float, float, float] | None
     message: str
@@ -46,27 +37,19 @@ class Grade:
 def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
     """Compare the level of denoised pictures with that of their samples, channel by channel.
 
-    Parameters
-    ----------
-    pictures : sequence of ((H, W, 3) array, (H, W, 3) array)
-        The denoised picture and the samples of some frames, linear radiance. Pixels that are not finite count for
-        nothing.
-
-    Returns
-    -------
-    Grade or None
-        None where the levels agree within their uncertainty, or where frames have no level in common.
+    `pictures` are (denoised picture, samples) of some frames, each (H, W, 3), linear; non-finite pixels are excluded.
+    Returns None if the levels agree within their uncertainty, or if frames have no common level.
 
     Notes
     -----
-    Of tiles of 8 x 8 pixels with the means e of the picture and s of the samples, the factor is the median of s / e,
-    weighted by e. It differs from 1 only if the ratio of the sums of s and e does so too: the median of noise that is
-    skewed lies below its mean, and fireflies, which denoisers remove, lie above.
+    For tiles of 8×8 pixels with the means e of the picture and s of the samples, the factor is the median of s / e,
+    weighted by e. It differs from 1 only if the ratio of the sums of s and e does so too: the median of skewed noise
+    lies below its mean, and fireflies, which denoisers remove, lie above.
     """
     tiles = [_tiles(*pair) for pair in pictures]
     levels = [np.log(part[1].sum() / part[0].sum()) for part in tiles if part[0].sum() > 0 and part[1].sum() > 0]
     if levels and max(levels) - min(levels) > np.log(ONE_LEVEL):
-        return None  # it is the frames that differ: each is checked when it is read
+        return None  # the frames differ among themselves: each is checked when it is read
     e, s, noise = (np.concatenate(parts) for parts in zip(*tiles, strict=True))
     factors, graded = [], False
     for c in range(3):
@@ -92,7 +75,7 @@ def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
 
 
 def _tiles(picture: Array, samples: Array) -> tuple[Array, Array, Array]:
-    """Means of both over tiles, (T, 3), and the standard error of those of the samples."""
+    """Means of both over tiles, (T, 3), and the standard error of the samples' means."""
     height, width = (side // TILE * TILE for side in picture.shape[:2])
     split = height // TILE, TILE, width // TILE, TILE, 3
     both = [

@@ -1,4 +1,4 @@
-"""Judging the further layers of a shot: what adds up to the picture, what has light of its own, what has no noise."""
+"""Classification of AOVs: parts that add up to the beauty, light of their own, or layers without noise."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from nlm.parts import few_differ, find_sums, is_noisy, is_textured, share_outsid
 
 Array = NDArray[np.float32]
 
-# Frames are looked at in bands of so many rows, of at most so many rows together.
+# Height of the bands of rows in which frames are sampled, and most rows of all bands together.
 _BAND, _ROWS = 27, 540
 
 
 def sample_rows(frame: Frame) -> Frame:
-    """Color, albedo and further layers of a frame, of tall ones some bands of rows; finite."""
+    """Return color, albedo and AOVs of a frame, finite; of a tall frame some bands of rows."""
     height = frame.color.shape[0]
     rows = np.arange(height) // _BAND % -(-height // _ROWS) == 0
 
@@ -37,25 +37,19 @@ def sample_rows(frame: Frame) -> Frame:
 
 
 def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
-    """Find out what the further layers of a shot are.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Some frames of it, from `sample_rows`; all have the same layers.
+    """Classify the AOVs of a shot by some of its frames, from `sample_rows`; all have the same layers.
 
     Returns
     -------
     passes : Passes
-        What was found.
     words : dict of str to str
-        What is done with each layer, and why, by its name.
+        AOV → how it is denoised, and why.
 
     Notes
     -----
-    Which layers are parts is found by adding up their noisy pixels (`nlm.parts.find_sums`), not by their names: sets of
-    layers that add up to the picture, and sets of others that add up to one of those. Where no set is complete, a layer
-    is a part that is nowhere above the picture and has its noise. Without noise, a layer that is no part is kept.
+    Parts are found by adding up noisy pixels (`nlm.parts.find_sums`), not by names: sets of AOVs that add up to the
+    beauty, and sets of others that add up to one of those. If no set is complete, an AOV is a part if it is nowhere
+    above the beauty and has its noise. An AOV that is no part and has no noise is kept.
     """
     color = np.concatenate([frame.color for frame in frames])
     exposure = measure_exposure(color)
@@ -66,33 +60,32 @@ def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
         if frames[0].aovs[name].shape == frames[0].color.shape
     }
     sums = list(_find_all(lights, color, exposure))
-    among = {name for found in sums for name in found.parts}
-    complete = {found.parts for found in sums if found.whole == BEAUTY}
+    parts = {name for found in sums for name in found.parts}
+    complete = any(found.whole == BEAUTY for found in sums)
     words = {name: _part_of(found, name) for found in sums for name in found.parts}
     kept, textured = list[str](), list[str]()
     for name in names:
-        own = [frame.aovs[name] for frame in frames]
-        if name not in among and not any(map(is_noisy, own)):
+        layers = [frame.aovs[name] for frame in frames]
+        if name not in parts and not any(map(is_noisy, layers)):
             kept.append(name)
-            words[name] = "kept as it is: it has no noise, and is no part of the beauty"
+            words[name] = "kept: it has no noise, and is no part of the beauty"
             continue
-        albedos = [frame.albedo for frame in frames]
-        known = [albedo for albedo in albedos if albedo is not None]
-        tinted = any(name in frame.pass_colors for frame in frames)
-        if len(known) == len(own) and not tinted and is_textured(np.concatenate(own), np.concatenate(known)):
+        albedos = [frame.albedo for frame in frames if frame.albedo is not None]
+        has_color = any(name in frame.pass_colors for frame in frames)
+        if len(albedos) == len(layers) and not has_color and is_textured(*map(np.concatenate, (layers, albedos))):
             textured.append(name)
-        if name in among:
+        if name in parts:
             continue
-        words[name] = "denoised by itself: it adds up to the beauty with no others"
+        words[name] = "denoised separately: no set of AOVs with it adds up to the beauty"
         if name not in lights:
-            words[name] = f"denoised by itself: it has {own[0].shape[-1]} channels, the beauty 3"
+            words[name] = f"denoised separately: it has {layers[0].shape[-1]} channels, the beauty 3"
         elif not few_differ(share := share_outside(lights[name], color, exposure)):
-            words[name] = f"denoised by itself: it is above the beauty, or negative, in {share:.0%} of the picture"
+            words[name] = f"denoised separately: it is above the beauty, or negative, in {share:.0%} of the picture"
         elif complete:
-            words[name] = "denoised by itself: the beauty is the sum of others"
+            words[name] = "denoised separately: the beauty is the sum of other AOVs"
         elif all(shares_noise(_radiance_of(frame, name), frame.color) for frame in frames):
             sums.append(Sum(BEAUTY, (name,), complete=False))
-            words[name] = "part of the beauty, the rest of which is in no layer: shared out of it"
+            words[name] = "part of the beauty, the rest of which is in no AOV: its share of the denoised beauty"
     level = float(color.mean(dtype=np.float64))
     light = sum(float(lights[name].mean(dtype=np.float64)) for name in lights if name not in kept)
     passes = Passes(tuple(sums), tuple(textured), tuple(kept), light / level if level > 0 else 0.0)
@@ -100,13 +93,13 @@ def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
 
 
 def _radiance_of(frame: Frame, name: str) -> Array:
-    """A layer of a frame, multiplied by its color where it is written without (H, W, C)."""
-    tint = frame.pass_colors.get(name)
-    return frame.aovs[name] if tint is None else frame.aovs[name] * tint
+    """An AOV of a frame times its pass color, if it has one (H, W, C)."""
+    pass_color = frame.pass_colors.get(name)
+    return frame.aovs[name] if pass_color is None else frame.aovs[name] * pass_color
 
 
 def _find_all(lights: dict[str, Array], color: Array, exposure: float) -> Iterator[Sum]:
-    """The sums that are the picture, then of what is left those that are a layer, and so on."""
+    """Yield the sums that make the beauty, then sums of the remaining AOVs that make one of these, and so on."""
     wholes = {BEAUTY: color}
     left = dict(lights)
     while wholes:
@@ -126,6 +119,6 @@ def _find_all(lights: dict[str, Array], color: Array, exposure: float) -> Iterat
 def _part_of(found: Sum, name: str) -> str:
     whole = "the beauty" if found.whole == BEAUTY else f"aov {found.whole}"
     if len(found.parts) == 1:
-        return f"equal to {whole}: denoised as that is"
+        return f"equal to {whole}: denoised like it"
     others = ", ".join(part for part in found.parts if part != name)
-    return f"part of {whole}, to which it adds up with {others}: shared out of it"
+    return f"part of {whole}, with {others}: its share of the denoised sum"

@@ -1,4 +1,4 @@
-"""What was done, beside what was made: one record for each run, and what all records of a folder say together.
+"""Records of runs, one JSON file each, and the status of a folder from all its records.
 
 A farm makes a shot in chunks, on many machines at once. Every run writes a file of its own,
 ``OUT/ravg/NAME.RANGE.json``, after every frame, so that nothing is overwritten and nothing is lost when a machine dies.
@@ -24,32 +24,20 @@ from hybrid.runtime.system import peak_memory, process_lives
 from hybrid.runtime.timing import Timings
 
 FOLDER = "ravg"
-# The sequence whose files are called by their numbers alone.
+# Name of a sequence whose file names are numbers alone.
 NAMELESS = "frames"
-# Packages that anything may depend on.
+# All packages whose versions are recorded.
 ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")
 # A longer list of frames is named by its ends and a hash in the record's name.
 LONGEST = 60
 
 
 class Record:
-    """The record of one run, written anew after each frame.
+    """The record of one run, rewritten after each frame.
 
-    Parameters
-    ----------
-    folder : Path
-        Where the frames go.
-    name : str
-        Of the sequence, without number and extension.
-    numbers : sequence of int
-        The frames that were asked for.
-    **facts : object
-        What else is known from the beginning: command, input, options.
-
-    Raises
-    ------
-    ValueError
-        If another file has the record's name, or the folder for records is a link.
+    `folder` is that of the frames, `name` that of the sequence without number and extension, `facts` are known at the
+    start: command, input, options. Raises ValueError if another file has the record's name, or the folder for records
+    is a link.
     """
 
     def __init__(self, folder: Path, name: str, numbers: Sequence[int], **facts: object) -> None:
@@ -76,25 +64,25 @@ class Record:
 
     @property
     def done(self) -> list[int]:
-        """The frames that are there, made by this run or before it, in the order in which they came."""
+        """The finished frames, made by this run or before it, in the order in which they were added."""
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] != "failed"]
 
     @property
     def made(self) -> list[int]:
-        """The frames that this run has made."""
+        """The frames that this run made."""
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "made"]
 
     @property
     def failed(self) -> list[int]:
-        """The frames that could not be made."""
+        """The frames that failed."""
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "failed"]
 
     def add(self, number: int, state: str, **facts: object) -> None:
-        """Count a frame: its state is "made", "there" (an earlier run had made it) or "failed"."""
+        """Add a frame, whose state is "made", "there" (made by an earlier run) or "failed"."""
         self._document["frames"][str(number)] = {"state": state, **facts}
 
     def write(self, timings: Timings, state: str = "running", **facts: object) -> None:
-        """Write all that is known by now; `state` is "running", "finished", "failed" or "stopped"."""
+        """Write the record; `state` is "running", "finished", "failed" or "stopped"."""
         now = time.time()
         self._document |= facts
         document = {
@@ -114,22 +102,20 @@ class Record:
 
 @dataclass
 class Status:
-    """What the records of a folder say of a sequence.
+    """State of the frames of a sequence, from the records of a folder.
 
     Attributes
     ----------
-    asked : set of int
-        Frames that some run was to make.
-    finished, running : set of int
-        Those that are there; and those that a run has still to make, as far as can be told.
+    asked, finished, running : set of int
+        Frames that some run was asked for, that are finished, and that a live run has still to make.
     failed : dict of int to str
-        Those that could not be made, with the reason.
+        Frame → reason.
     seconds : list of float
-        Of each frame that was made.
+        Time of each frame that was made.
     workers : int
-        Runs that go on.
+        Number of live runs.
     records : list of dict
-        The records themselves, oldest first.
+        Oldest first.
     """
 
     asked: set[int] = field(default_factory=set)
@@ -142,36 +128,30 @@ class Status:
 
     @property
     def missing(self) -> set[int]:
-        """Frames that were asked for, are not there, and that nobody makes."""
+        """Frames that were asked for, and that are neither finished nor running nor failed."""
         return self.asked - self.finished - self.running - set(self.failed)
 
     @property
     def seconds_per_frame(self) -> float | None:
-        """Mean time of the frames that were made; None where none was."""
+        """Mean time of the frames that were made; None if none was."""
         return sum(self.seconds) / len(self.seconds) if self.seconds else None
 
     @property
     def seconds_left(self) -> float | None:
-        """How long the frames that are not there take with as many runs as there are now, or with one."""
+        """Time for the unfinished frames with the current number of runs, or with one."""
         if self.seconds_per_frame is None:
             return None
         return len(self.asked - self.finished) * self.seconds_per_frame / max(self.workers, 1)
 
 
 def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Read the records of a folder of frames.
+    """Yield the records of a folder of frames with their files, oldest first; skip files that are no records.
 
     Parameters
     ----------
     folder : Path
-        Of frames.
     name : str, optional
-        Of one sequence in it; all without.
-
-    Yields
-    ------
-    (Path, dict)
-        A record and what it holds, oldest first. Files that are none are left out.
+        Of one sequence; default: all.
     """
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
@@ -181,30 +161,24 @@ def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, 
 
 
 def gather_status(folder: Path, name: str | None = None, frames: Collection[int] | None = None) -> Status:
-    """Find how far the runs have come that write into a folder.
+    """Return the status of the runs that write into a folder; raise FileNotFoundError if it has no records.
 
     Parameters
     ----------
     folder : Path
-        Of the frames.
     name : str, optional
-        Of the sequence; all records of the folder count without.
+        Of one sequence; default: all.
     frames : collection of int, optional
-        Only these, whether or not a run has been asked for them yet.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no record.
+        Only these, whether or not a run has been asked for them.
     """
     status = Status()
     for _, document in read_records(folder, name):
         status.records.append(document)
         wanted = {n for n in document["asked"] if frames is None or n in frames}
         status.asked |= wanted
-        alive = goes_on(document)
+        alive = is_running(document)
         status.workers += alive
-        for number in wanted:  # a later record overrules
+        for number in wanted:  # a later record replaces an earlier one
             entry = document["frames"].get(str(number))
             if entry is None:
                 if number in status.finished:
@@ -229,8 +203,8 @@ def gather_status(folder: Path, name: str | None = None, frames: Collection[int]
     return status
 
 
-def goes_on(document: Mapping[str, Any]) -> bool:
-    """Whether a run that has not said its end still lives: told by its process here, believed elsewhere."""
+def is_running(document: Mapping[str, Any]) -> bool:
+    """Return whether a run that has not recorded its end is alive; a run on another machine counts as alive."""
     if document["state"] != "running":
         return False
     if document["host"] != platform.node():
@@ -239,7 +213,7 @@ def goes_on(document: Mapping[str, Any]) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """A record; None where the file is none, or says of anything what cannot be."""
+    """A record; None if the file is no record, or holds invalid values."""
     try:
         if not path.is_file():  # a pipe would be waited for
             return None
@@ -250,7 +224,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _is_record(document: Any) -> bool:
-    """Whether a document is what `Record` writes: what is read of it elsewhere is there, and of its kind."""
+    """Whether a document has all entries of a `Record` that are read elsewhere, with valid types and values."""
     if not isinstance(document, dict):
         return False
     get = document.get
@@ -277,13 +251,13 @@ def _is_entry(number: str, entry: Any) -> bool:
     if entry.get("state") == "failed":
         return isinstance(entry.get("error"), str)
     file = entry.get("file")
-    # A name alone: what lies in another folder is no frame of this one.
+    # A bare name: a file in another folder is no frame of this one.
     plain = isinstance(file, str) and file not in ("", ".", "..") and not {"/", "\\", ":", "\0"} & {*file}
     return entry.get("state") in ("made", "there") and plain and _is_amount(entry.get("seconds"))
 
 
 def _are_different(names: Sequence[str]) -> bool:
-    """Whether no two are one: no file is two frames."""
+    """Whether no two frames have one file."""
     return len({*names}) == len(names)
 
 
@@ -300,6 +274,6 @@ def _range(numbers: Sequence[int]) -> str:
 
 
 def sequence_name(file: Path) -> str:
-    """The name of a sequence, of one of its files: without number and extension."""
+    """Return the name of a file's sequence: without number and extension."""
     behind = re.fullmatch(r"(|.*?[._-])-?[0-9]+[._-]([^0-9]*)", file.stem)  # 0001.beauty, view.0001.beauty
     return f"{behind[1]}{behind[2]}" if behind else re.sub(r"[._-]?-?[0-9]+$", "", file.stem)

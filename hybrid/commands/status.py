@@ -16,7 +16,7 @@ from rich.text import Text
 from hybrid.commands.log import duration, printable
 from hybrid.commands.options import OUTPUT, FramesOption, usage
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
-from hybrid.records import Status, gather_status, goes_on, sequence_name
+from hybrid.records import Status, gather_status, is_running, sequence_name
 
 
 def status(
@@ -77,7 +77,7 @@ def _show(found: Status) -> None:
     table = Table(*heads, box=SIMPLE_HEAD, pad_edge=False)
     for record in found.records:
         made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]
-        state = record["state"] if record["state"] != "running" or goes_on(record) else "died"
+        state = record["state"] if record["state"] != "running" or is_running(record) else "died"
         table.add_row(
             format_frames(record["asked"]),
             state,
