@@ -1,4 +1,4 @@
-"""`ravg view`: a local page that plays frames, also while others are still being made."""
+"""`ravg view`: a local page that plays frames, also while others are still being written."""
 
 from __future__ import annotations
 
@@ -19,13 +19,17 @@ def view(
     beside: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SHOT", help="frames to compare with: the noisy ones, another denoiser's", rich_help_panel=INPUT
+            metavar="SHOT",
+            help="frames to compare with, such as the noisy ones, or those of another denoiser; may be repeated",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     fps: RateOption = 24,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: one that is free", rich_help_panel=RESOURCES)] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port", rich_help_panel=RESOURCES)
+    ] = 0,
     browser: Annotated[
-        bool, typer.Option(help="open the page in a browser, where there is a screen", rich_help_panel=WHAT)
+        bool, typer.Option(help="open the page in a browser, if there is a screen", rich_help_panel=WHAT)
     ] = True,
 ) -> None:
     """Play frames in a browser: wipe, exposure, layers, weights, stages.

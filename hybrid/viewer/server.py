@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from hybrid import player
 from hybrid.files.exr import ExrError
 from hybrid.viewer.sequence import Sequence, encode_picture
 
@@ -154,7 +155,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Code, media type, body, and whether the browser may keep it."""
         if rest in PAGE:
             name, kind = PAGE[rest]
-            return 200, kind, files("hybrid.viewer").joinpath(name).read_bytes(), False
+            text = files("hybrid.viewer").joinpath(name).read_text(encoding="utf-8")
+            return 200, kind, (f"{player.script()}\n{text}" if name == "page.js" else text).encode(), False
         if rest == "state":
             return 200, "application/json", json.dumps(self.server.state()).encode(), False
         what, index, name = rest.split("/")
