@@ -54,10 +54,12 @@ COMMANDS = {
 # Old name → new name, and options that stand for the old defaults; accepted for one release.
 OLD_COMMANDS = {"pseudoref": ("denoise", ["--preset=standard"]), "prepare": ("make-clips", [])}
 OLD_OPTIONS = {
+    "--beside": "--with-report",
     "--contact": "--contact-sheet",
     "--estimate": "--first-pass",
     "--give-way": "--aov-sum",
     "--keep-estimates": "--keep-first-pass",
+    "--loops": "--movies",
 }
 
 

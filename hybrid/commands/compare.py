@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from rich.console import Console
 
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import (
@@ -24,12 +27,22 @@ from hybrid.commands.options import (
     choose,
 )
 from hybrid.commands.shots import judge_alike, open_input, say_cuts
+from hybrid.comparison.compare import CompareOptions, compare_shot
+from hybrid.comparison.methods import METHODS, Method
+from hybrid.comparison.methods import external as finished
+from hybrid.comparison.results import Comparison, Cost, MethodResult, join, read_comparison
+from hybrid.comparison.running import run_in_process
+from hybrid.comparison.samples import samples_of
+from hybrid.comparison.store import FrameStore
+from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
+from hybrid.comparison.tables import markdown_table, result_table
+from hybrid.files.movies import check_movie
+from hybrid.files.shots import Shot, open_matching_sequence
+from hybrid.runtime.allocator import reuse_freed_memory
+from hybrid.stream import plan_shot
 
 if TYPE_CHECKING:
-    from rich.table import Table as RichTable
-
-    from hybrid.comparison.methods import Method
-    from hybrid.files.shots import Shot
+    from hybrid.comparison.embedding import ShotImages
 
 
 def compare(
@@ -40,7 +53,7 @@ def compare(
         list[str] | None,
         typer.Option(
             metavar="PATTERN",
-            help="the same frames at many samples; twice: two independent halves, whose noise cancels",
+            help="the same frames at many samples; given twice: two independent halves, whose noise cancels",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -56,13 +69,13 @@ def compare(
     ] = None,
     methods: Annotated[
         str | None,
-        typer.Option(metavar="NAMES", help="separated by commas; all without", rich_help_panel=WHAT),
+        typer.Option(metavar="NAMES", help="methods to run, separated by commas; default: all", rich_help_panel=WHAT),
     ] = None,
     external: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=PATTERN",
-            help="frames that another denoiser has finished; may be repeated",
+            help="finished frames of another denoiser; may be repeated",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -70,14 +83,14 @@ def compare(
         bool, typer.Option("--sweep", help="also vary stages and settings, one at a time", rich_help_panel=WHAT)
     ] = False,
     rounds: Annotated[
-        int, typer.Option(min=1, help="runs of each method, in turns, whose median is the time", rich_help_panel=WHAT)
+        int, typer.Option(min=1, help="runs of each method, in turns; the time is their median", rich_help_panel=WHAT)
     ] = 3,
     samples: Annotated[
         float | None,
         typer.Option(
             metavar="SPP",
             min=1,
-            help="per pixel of SHOT, where its files do not tell, as those of Cycles do",
+            help="samples per pixel of SHOT, unless its files state them, as those of Cycles do",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -85,36 +98,37 @@ def compare(
         list[str] | None,
         typer.Option(
             metavar="PATTERN=SPP",
-            help="SHOT at other samples per pixel, to measure how noise falls",
+            help="SHOT at other samples per pixel, to measure how the noise falls; may be repeated",
             rich_help_panel=INPUT,
         ),
     ] = None,
     exposure: Annotated[
-        float, typer.Option(help="factor before the tone curve of the measures", rich_help_panel=WHAT)
+        float, typer.Option(help="exposure factor of the measures, applied before the tone curve", rich_help_panel=WHAT)
     ] = 1.0,
     clock: Annotated[
         Literal["wall", "cpu"],
-        typer.Option(help="the time that chart.png and the Markdown table show", rich_help_panel=OUTPUT),
+        typer.Option(help="time in chart.png and in the Markdown table", rich_help_panel=OUTPUT),
     ] = "wall",
     markdown: Annotated[
-        bool, typer.Option("--markdown", help="print the table of the README", rich_help_panel=OUTPUT)
+        bool, typer.Option("--markdown", help="print the table as Markdown", rich_help_panel=OUTPUT)
     ] = False,
     name: Annotated[
-        str | None, typer.Option(help="of the shot, in tables and on the page", rich_help_panel=OUTPUT)
+        str | None,
+        typer.Option(help="name of the shot in tables and on the page; default: its folder", rich_help_panel=OUTPUT),
     ] = None,
-    beside: Annotated[
+    with_report: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="REPORT",
-            help="folder of a finished comparison of another shot, to be shown beside",
+            help="folder of a finished comparison of another shot, to include; may be repeated",
             rich_help_panel=INPUT,
         ),
     ] = None,
     fps: RateOption = 24,
-    loops: Annotated[
+    movies: Annotated[
         bool,
         typer.Option(
-            "--loops", help="also write a movie of each method in its own size, beside the page", rich_help_panel=OUTPUT
+            "--movies", help="also write a movie of each method in full size, next to the page", rich_help_panel=OUTPUT
         ),
     ] = False,
     frames: FramesOption = None,
@@ -124,130 +138,120 @@ def compare(
     strict: StrictOption = False,
 ) -> None:
     """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
-    import tempfile
-
-    from hybrid.comparison.compare import compare_shot
-    from hybrid.comparison.results import Comparison, Cost, join, read_comparison
-    from hybrid.comparison.running import run_apart
-    from hybrid.comparison.samples import samples_of
-    from hybrid.comparison.store import FrameStore
-    from hybrid.comparison.tables import markdown_table, result_table
-    from hybrid.runtime.allocator import reuse_freed_memory
-    from hybrid.stream import plan_shot
-
-    costs: dict[str, Cost] = {"wall": "seconds_per_megapixel", "cpu": "cpu_seconds_per_megapixel"}
-    cost = costs[clock]
-    if output is not None:  # before anything runs
-        _need_page()
-        from hybrid.comparison.report import check_report
-
-        check_report(output, [folder / "results.json" for folder in beside or ()])
-    if loops:
-        from hybrid.files.movies import check_movie
-
-        if output is None:
-            raise typer.BadParameter("--loops writes beside a page, expected --output with it")
-        check_movie(output / "loop.mp4")
-    others = [read_comparison(folder / "results.json") for folder in beside or ()]
+    cost: Cost = "seconds_per_megapixel" if clock == "wall" else "cpu_seconds_per_megapixel"
+    report = _Report(output, cost, fps, movies, markdown, with_report or [])
+    report.check()
     if shot is None or not reference:
-        if not others or shot is not None or reference:
-            raise typer.BadParameter("expected SHOT and --reference, or --beside with finished comparisons")
-        joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
-        if output is not None:
-            from hybrid.comparison.report import write_report
-
-            LOG.info(f"wrote {write_report(output, joined, others=others, cost=cost)}")
-        _show(markdown, markdown_table(others, cost), result_table(joined.results))
+        if shot is not None or reference or not with_report:
+            raise typer.BadParameter("expected SHOT and --reference, or --with-report with finished comparisons")
+        report.show_joined()
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
     opened = open_input(shot, frames, layer, profile=profile, motion=motion)
-    alike, said = judge_alike({"shot": opened}, strict=strict)
+    alike, findings = judge_alike({"shot": opened}, strict=strict)
     noisy = alike["shot"]
-    clean = [_open_matching_sequence(spec, noisy, frames) for spec in reference]
+    clean = [_open_matching(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
-    plan = cache(partial(run_apart, plan_shot, noisy))
+    plan = cache(partial(run_in_process, plan_shot, noisy))
     if sweep:
-        from hybrid.comparison.methods import METHODS
-        from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
-
         LOG.info("plan the shot")
-        chosen = {**chosen, **{base: METHODS[base] for base in (CLASSICAL, NETWORK)}, **sweep_methods(plan())}
-    pairs = [_pair(item, "--level", "PATTERN=SPP") for item in level or ()]
-    levels = [
-        (open_input(pattern, frames, layer, profile=profile), _number(count, "--level")) for pattern, count in pairs
-    ]
-    bar: Progress | None = None
-
-    def show(what: str, done: float, total: float) -> None:
-        nonlocal bar
-        if bar is None:
-            bar = Progress(what, total, "steps")
-        else:
-            bar.advance(done - bar.done, what)
-
+        chosen |= {base: METHODS[base] for base in (CLASSICAL, NETWORK)} | sweep_methods(plan())
+    options = CompareOptions(
+        title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
+        exposure=exposure,
+        rounds=rounds,
+        samples=samples or samples_of(noisy),
+        reference_samples=samples_of(clean[0]),
+        levels=[(open_input(pattern, frames, layer, profile=profile), count) for pattern, count in _levels(level)],
+        findings=findings,
+        check_shot=lambda: [finding.message for finding in say_cuts(plan(), (), strict=strict)],
+        maps=output is not None,
+    )
     reuse_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
-        comparison = compare_shot(
-            noisy,
-            clean[0] if len(clean) == 1 else (clean[0], clean[1]),
-            chosen,
-            title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
-            exposure=exposure,
-            rounds=rounds,
-            samples=samples or samples_of(noisy),
-            reference_samples=samples_of(clean[0]),
-            levels=levels,
-            said=said,
-            look=lambda: [finding.message for finding in say_cuts(plan(), (), strict=strict)],
-            maps=output is not None,
-            folder=Path(folder),
-            progress=show,
-        )
+        halves = clean[0] if len(clean) == 1 else (clean[0], clean[1])
+        comparison = compare_shot(noisy, halves, chosen, options, folder=Path(folder), on_step=_ProgressBar().show)
         if output is not None:
-            from hybrid.comparison.report import report_images, write_report
+            from hybrid.comparison.report import report_images
 
-            LOG.info("page: pack the pictures")
-            judged = [number for number in noisy.numbers if all(number in half.numbers for half in clean)]
-            images, truth = report_images(FrameStore(Path(folder)), comparison, judged)
-            page = write_report(
-                output,
-                comparison,
-                images,
-                truth,
-                judged,
-                others=others,
-                exposure=exposure,
-                cost=cost,
-                rate=fps,
-                movies=loops,
-            )
-            LOG.info(f"wrote {page}")
-    _show(markdown, markdown_table([comparison, *others], cost), result_table(comparison.results))
+            LOG.info("page: encode the pictures")
+            numbers = [n for n in noisy.numbers if all(n in half.numbers for half in clean)]
+            report.write(comparison, report_images(FrameStore(Path(folder)), comparison, numbers, exposure))
+    report.show([comparison, *report.read_others()], comparison.results)
 
 
-def _need_page() -> None:
-    """Refuse a page that cannot be made here."""
-    if missing := [name for name in ("jinja2", "resvg_py", "font_manrope") if find_spec(name) is None]:
-        packages = " ".join(f'"{name}"' for name in missing)
-        words = f"expected: pip install {packages} (the table alone is made without)"
-        raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
+class _ProgressBar:
+    """A progress bar that appears with the first step."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+
+    def show(self, what: str, done: float, total: float) -> None:
+        """Show a step."""
+        if self._bar is None:
+            self._bar = Progress(what, total, "steps")
+        else:
+            self._bar.advance(done - self._bar.done, what)
 
 
-def _show(markdown: bool, text: str, table: RichTable) -> None:
-    """Print results as Markdown for a file, or as a table for a terminal."""
-    from rich.console import Console
+@dataclass(frozen=True)
+class _Report:
+    """Options of what is written and printed; `folders` are those of finished comparisons to include."""
 
-    if markdown:
-        typer.echo(text, nl=False)
-    else:
-        Console().print(table)
+    output: Path | None
+    cost: Cost
+    rate: float
+    movies: bool
+    markdown: bool
+    folders: Sequence[Path]
+
+    def check(self) -> None:
+        """Raise an error for a report that cannot be written, before any method runs."""
+        if self.output is not None:
+            if missing := [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]:
+                packages = " ".join(f'"{name}"' for name in missing)
+                words = f"expected: pip install {packages} (the table alone needs neither)"
+                raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
+            from hybrid.comparison.report import check_report
+
+            check_report(self.output, [folder / "results.json" for folder in self.folders])
+        if self.movies:
+            if self.output is None:
+                raise typer.BadParameter("--movies writes next to a page, expected --output with it")
+            check_movie(self.output / "movie.mp4")
+        self.read_others()
+
+    def read_others(self) -> list[Comparison]:
+        """Read the finished comparisons."""
+        return [read_comparison(folder / "results.json") for folder in self.folders]
+
+    def show_joined(self) -> None:
+        """Join finished comparisons, without running a method."""
+        others = self.read_others()
+        joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
+        if self.output is not None:
+            self.write(joined, None)
+        self.show(others, joined.results)
+
+    def write(self, comparison: Comparison, images: ShotImages | None) -> None:
+        """Write the page and its files."""
+        from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
+
+        assert self.output is not None
+        report = Report(comparison, images, self.read_others(), self.cost, self.rate, self.movies)
+        LOG.info(f"wrote {write_report(self.output, report)}")
+
+    def show(self, comparisons: Sequence[Comparison], results: Sequence[MethodResult]) -> None:
+        """Print results as Markdown, or as a table for a terminal."""
+        if self.markdown:
+            typer.echo(markdown_table(comparisons, self.cost), nl=False)
+        else:
+            Console().print(result_table(results))
 
 
-def _open_matching_sequence(spec: str, shot: Shot, frames: str | None) -> Shot:
-    """Open a reference or a finished sequence, and pass on its warnings."""
-    from hybrid.files.shots import open_matching_sequence
-
+def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
+    """Open a reference or a finished sequence, and log its warnings."""
     opened = open_matching_sequence(spec, shot, frames=frames)
     for warning in opened.warnings:
         LOG.warning(warning)
@@ -255,33 +259,31 @@ def _open_matching_sequence(spec: str, shot: Shot, frames: str | None) -> Shot:
 
 
 def _methods(names: str | None, external: Sequence[str] | None, shot: Shot, frames: str | None) -> dict[str, Method]:
-    """The methods asked for, and sequences that others have finished."""
-    from hybrid.comparison.methods import METHODS
-    from hybrid.comparison.methods import external as finished
-
+    """The requested methods, and sequences of other denoisers."""
     wanted = METHODS if names is None else {n.strip(): choose(METHODS, n.strip(), "methods") for n in names.split(",")}
     chosen = dict(wanted)
     for item in external or ():
-        name, pattern = _pair(item, "--external", "NAME=PATTERN")
+        name, separator, pattern = item.partition("=")
+        if not separator or not name or not pattern:
+            raise typer.BadParameter(f"--external is {item!r}, expected NAME=PATTERN")
         if name in METHODS or name == "reference":
             raise typer.BadParameter(f"--external is {item!r}, expected a name that no other method has")
-        chosen[name] = finished(_open_matching_sequence(pattern, shot, frames))
+        chosen[name] = finished(_open_matching(pattern, shot, frames))
     return chosen
 
 
-def _pair(item: str, option: str, form: str) -> tuple[str, str]:
-    """Split at the last "=" for patterns that hold one, at the first otherwise."""
-    first, separator, second = item.rpartition("=") if form.startswith("PATTERN") else item.partition("=")
-    if not separator or not first or not second:
-        raise typer.BadParameter(f"{option} is {item!r}, expected {form}")
-    return first, second
-
-
-def _number(text: str, option: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0:
-        raise typer.BadParameter(f"{option} is {text!r}, expected a positive number")
-    return value
+def _levels(level: Sequence[str] | None) -> list[tuple[str, float]]:
+    """Patterns and samples per pixel; a pattern may hold "=" itself."""
+    levels = []
+    for item in level or ():
+        pattern, separator, count = item.rpartition("=")
+        if not separator or not pattern or not count:
+            raise typer.BadParameter(f"--level is {item!r}, expected PATTERN=SPP")
+        try:
+            samples = float(count)
+        except ValueError:
+            samples = 0.0
+        if not samples > 0:
+            raise typer.BadParameter(f"--level is {count!r}, expected a positive number")
+        levels.append((pattern, samples))
+    return levels

@@ -1,4 +1,4 @@
-"""Pictures and maps as text inside a page, small enough and without loss that can be seen."""
+"""Frames and maps as text inside the page: compact, without visible loss."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ Array = NDArray[np.float32]
 Codes = NDArray[np.int32]
 Box = tuple[int, int, int, int]  # x, y, width, height in pixels
 
-# Radiance is embedded as a logarithm in steps of 1.5 % (finer than 8 bits of sRGB show from mid-grey up), and
-# linearly below 1/64 of the shot's mean level. 1023 codes reach 40,000 times that level.
+# Radiance is stored as a logarithm in steps of 1.5 % (finer than 8 bits of sRGB from mid-gray up), and linearly below
+# 1/64 of the shot's mean level. 1023 codes reach 40,000 times that level.
 CODES_PER_STOP = 48
 CODES = 1024
 NOT_FINITE = CODES - 1
-MAP_LEVELS = 64  # of a map in [0, 1]; a colour scale shows no more
+MAP_LEVELS = 64  # of a map in [0, 1]; a color scale shows no more
+LIMIT = 24e6  # bytes of all pictures and maps
 SMALLEST_CROP = 160  # pixels across; below that frames are left out instead
 
 
 @dataclass(frozen=True)
-class ReportImages:
-    """The pictures of one method, read when asked for.
+class MethodImages:
+    """Images of one method, read on demand.
 
     Attributes
     ----------
     name : str
-        That of its `MethodResult`.
+        Name of its `MethodResult`.
     frame : callable
-        From a frame number to its (H, W, 3) linear radiance.
+        From a frame number to (H, W, 3) linear radiance.
     maps : mapping of str to callable
-        From a title, such as "FLIP" or "Confidence", to a function from a frame number to an (H, W) map in [0, 1], or
-        to None where that frame has none.
+        From a title, such as "FLIP", to a function from a frame number to an (H, W) map in [0, 1], or to None.
     """
 
     name: str
@@ -48,72 +48,53 @@ class ReportImages:
 
 
 @dataclass(frozen=True)
-class EmbeddedPictures:
-    """Pictures encoded for a page.
+class ShotImages:
+    """Images of all methods in the order of the viewer, the reference, and the numbers of consecutive frames.
 
-    Attributes
-    ----------
-    info : dict
-        What the page's script has to know to decode and to name them.
-    elements : list of (str, str)
-        Of each element that holds a picture or a map: its id and its text.
+    `exposure` is the factor e of the tone curve e·x / (1 + e·x) of the metrics.
     """
 
-    info: dict[str, object]
-    elements: list[tuple[str, str]]
+    methods: Sequence[MethodImages]
+    reference: Callable[[int], Array]
+    frames: Sequence[int]
+    exposure: float = 1.0
 
     @property
-    def extent(self) -> str:
-        """What is shown of the shot, in words."""
-        return str(self.info["extent"])
+    def sources(self) -> list[MethodImages]:
+        """The reference, then the methods."""
+        return [MethodImages("reference", self.reference), *self.methods]
+
+    @property
+    def middle(self) -> int:
+        """Number of the middle frame."""
+        return self.frames[len(self.frames) // 2]
 
 
-def embed_pictures(
-    images: Sequence[ReportImages],
-    labels: Mapping[str, str],
-    reference: Callable[[int], Array],
-    frames: Sequence[int],
-    limit: float,
-) -> EmbeddedPictures:
-    """Encode pictures and maps of all methods and of the reference.
+@dataclass(frozen=True)
+class Embedded:
+    """Data for the page: `info` for its script, and (id, text) of the elements that hold the encoded images."""
 
-    Parameters
-    ----------
-    images : sequence of ReportImages
-        In the order of the viewer.
-    labels : mapping of str to str
-        What the viewer calls each method, by name.
-    reference : callable
-        From a frame number to (H, W, 3) linear radiance.
-    frames : sequence of int
-        Numbers of the frames.
-    limit : float
-        Bytes that the pictures may take. Above it they are cropped around what differs most, then frames are left out.
+    info: Mapping[str, object]
+    elements: Sequence[tuple[str, str]]
 
-    Returns
-    -------
-    EmbeddedPictures
 
-    Raises
-    ------
-    ValueError
-        If pictures differ in shape.
+def embed_pictures(images: ShotImages) -> Embedded:
+    """Encode frames and maps of the reference and of all methods; ValueError if they differ in shape.
+
+    Above `LIMIT` bytes they are cropped around the largest differences, then frames are left out.
     """
-    sources = [ReportImages("reference", reference), *images]
-    middle_number = frames[len(frames) // 2]
-    middle = reference(middle_number)
+    middle = images.reference(images.middle)
     height, width = middle.shape[:2]
     level = measure_exposure(middle)
-    box, kept = (0, 0, width, height), list(frames)
-    # 4.5 bits a sample is what rendered frames take; where it is not enough the loop shrinks further.
-    expected = len(sources) * len(kept) * width * height * 3 * 4.5 / 8 * 4 / 3
+    box, kept = (0, 0, width, height), list(images.frames)
+    # 4.5 bits per sample are typical of rendered frames; the loop shrinks further where they need more.
+    expected = len(images.sources) * len(kept) * width * height * 3 * 4.5 / 8 * 4 / 3
     while True:
-        if expected > limit:
-            busy = _busiest_point(sources, middle_number, level, middle.shape)
-            box, kept = _shrink(box, kept, limit / expected, busy)
-        elements, row = _encode_all(sources, kept, box, level, middle.shape)
+        if expected > LIMIT:
+            box, kept = _shrink(box, kept, LIMIT / expected, _point_of_differences(images, level, middle.shape))
+        elements, row = _encode_all(images.sources, kept, box, level, middle.shape)
         expected = sum(len(text) for _, text in elements)
-        if expected <= limit or (len(kept) == 1 and box[2] <= SMALLEST_CROP):
+        if expected <= LIMIT or (len(kept) == 1 and box[2] <= SMALLEST_CROP):
             break
     info = {
         "width": box[2],
@@ -125,13 +106,13 @@ def embed_pictures(
         "black": level / 64,
         "mapLevels": MAP_LEVELS,
         "row": row,
-        "extent": _describe_extent(box, kept, (width, height), frames, limit),
-        "sources": [{"name": s.name, "label": labels.get(s.name, "Reference"), "maps": list(s.maps)} for s in sources],
+        "extent": _describe_extent(box, kept, (width, height), images.frames),
+        "sources": [{"name": source.name, "maps": list(source.maps)} for source in images.sources],
     }
-    return EmbeddedPictures(info, elements)
+    return Embedded(info, elements)
 
 
-def _describe_extent(box: Box, kept: Sequence[int], size: tuple[int, int], frames: Sequence[int], limit: float) -> str:
+def _describe_extent(box: Box, kept: Sequence[int], size: tuple[int, int], frames: Sequence[int]) -> str:
     """Which frames and pixels are embedded, and why not all."""
     width, height = size
     words = f"Frames {kept[0]} to {kept[-1]}" if len(kept) > 1 else f"Frame {kept[0]}"
@@ -141,28 +122,28 @@ def _describe_extent(box: Box, kept: Sequence[int], size: tuple[int, int], frame
     if box[2:] != size:
         words += f" at ({box[0]}, {box[1]}) of {width} × {height}"
     if len(kept) < len(frames) or box[2:] != size:
-        words += f"; the rest is left out to keep the page below {limit / 1e6:.0f} MB. The figures are of everything"
+        words += f"; the rest is left out to keep the page below {LIMIT / 1e6:.0f} MB. The figures include everything"
     return words
 
 
 def _encode_all(
-    sources: Sequence[ReportImages], frames: Sequence[int], box: Box, level: float, shape: tuple[int, ...]
+    sources: Sequence[MethodImages], frames: Sequence[int], box: Box, level: float, shape: tuple[int, ...]
 ) -> tuple[list[tuple[str, str]], int]:
-    """Ids and texts of every picture and map, and the row in which the methods flicker most."""
+    """Ids and texts of all images, and the row with the strongest flicker of the methods."""
     elements = []
     flicker = np.zeros(box[3])
-    truth: list[Codes] = []
+    reference: list[Codes] = []
     for i, source in enumerate(sources):
-        before = None
+        previous_error = None
         for k, number in enumerate(frames):
             codes = to_codes(_cut(source.frame(number), box, shape, source.name), level)
             elements.append((f"p{i}-{k}", compress(codes, CODES)))
             if i == 0:
-                truth.append(codes)
-            error = codes - truth[k]
-            if before is not None:
-                flicker += np.abs(error - before).mean(axis=(1, 2))
-            before = error
+                reference.append(codes)
+            error = codes - reference[k]
+            if previous_error is not None:
+                flicker += np.abs(error - previous_error).mean(axis=(1, 2))
+            previous_error = error
             for j, (title, read) in enumerate(source.maps.items()):
                 whole = read(number)
                 if whole is None:
@@ -174,6 +155,7 @@ def _encode_all(
 
 
 def _cut(image: Array, box: Box, shape: tuple[int, ...], name: str) -> Array:
+    """The box of an image of the expected shape."""
     if image.shape != shape:
         raise ValueError(f"pictures must be alike: {name} has the shape {image.shape}, expected {shape}")
     x, y, width, height = box
@@ -181,19 +163,14 @@ def _cut(image: Array, box: Box, shape: tuple[int, ...], name: str) -> Array:
 
 
 def to_codes(image: Array, level: float) -> Codes:
-    """Encode radiance as integers, evenly spaced in log(1 + x / black); the last one means "not finite".
+    """Encode radiance as integers in [0, `CODES`), uniform in log(1 + x / black); `NOT_FINITE` for NaN and infinity.
 
     Parameters
     ----------
     image : (H, W, 3) array
         Linear radiance; negative values count as 0.
     level : float
-        The shot's mean level; black is 1/64 of it.
-
-    Returns
-    -------
-    (H, W, 3) array of int32
-        In [0, `CODES`).
+        Mean level of the shot; black is 1/64 of it.
     """
     finite = np.isfinite(image)
     scaled = np.maximum(np.where(finite, image, 0), 0) / (level / 64)
@@ -201,24 +178,22 @@ def to_codes(image: Array, level: float) -> Codes:
     return np.where(finite, codes, NOT_FINITE).astype(np.int32)
 
 
-def _busiest_point(
-    sources: Sequence[ReportImages], number: int, level: float, shape: tuple[int, ...]
-) -> tuple[int, int]:
-    """The pixel (x, y) around which the methods differ most from each other in one frame."""
+def _point_of_differences(images: ShotImages, level: float, shape: tuple[int, ...]) -> tuple[int, int]:
+    """The pixel (x, y) around which the methods differ most in the middle frame."""
     height, width = shape[:2]
     total, squares = np.zeros((2, height, width), np.float32)
-    for source in sources:
-        picture = _cut(source.frame(number), (0, 0, width, height), shape, source.name)
+    for source in images.sources:
+        picture = _cut(source.frame(images.middle), (0, 0, width, height), shape, source.name)
         codes = to_codes(picture, level).mean(axis=-1).astype(np.float32)
         total += codes
         squares += codes**2
-    spread = np.maximum(squares / len(sources) - (total / len(sources)) ** 2, 0)
+    spread = np.maximum(squares / len(images.sources) - (total / len(images.sources)) ** 2, 0)
     y, x = np.unravel_index(np.argmax(cv2.boxFilter(spread, -1, (width // 4 + 1, height // 4 + 1))), spread.shape)
     return int(x), int(y)
 
 
 def _shrink(box: Box, frames: list[int], ratio: float, towards: tuple[int, int]) -> tuple[Box, list[int]]:
-    """Leave out pixels around the busy point, and frames where the crop is the smallest."""
+    """Crop around a pixel to a fraction of the size; below the smallest crop leave out frames."""
     x, y, width, height = box
     ratio *= 0.97
     if width > SMALLEST_CROP:
@@ -236,7 +211,7 @@ def _shrink(box: Box, frames: list[int], ratio: float, towards: tuple[int, int])
 
 
 def compress(codes: Codes, levels: int) -> str:
-    """Compress integers without loss.
+    """Compress integers without loss to base64, which `pictures.js` decodes.
 
     Parameters
     ----------
@@ -244,11 +219,6 @@ def compress(codes: Codes, levels: int) -> str:
         In [0, levels).
     levels : int
         A power of two.
-
-    Returns
-    -------
-    str
-        Base64, which `pictures.js` decodes.
 
     Notes
     -----

@@ -1,7 +1,7 @@
-"""HDR-FLIP: how different two pictures look to who flips between them, at every exposure that shows something.
+"""HDR-FLIP: the visible difference of two images when flipping between them, over all relevant exposures.
 
-Written from the papers, with separable filters of OpenCV and with the reference's part made once for all methods: the
-authors' own code (the package flip-evaluator, which tests compare with) takes 18 CPU seconds of a picture of 1920×1080.
+Written from the papers, with separable filters of OpenCV, and the reference processed once for all methods: the
+authors' code (the package flip-evaluator, which tests compare with) takes 18 CPU seconds for an image of 1920×1080.
 
 References
 ----------
@@ -44,50 +44,33 @@ FEATURE = 0.082  # degrees: how wide edges and points are
 COLOR_POWER, FEATURE_POWER = 0.7, 0.5
 KNEE, BELOW = 0.4, 0.95  # color errors up to KNEE of the greatest are spread over [0, BELOW]
 BORDER = cv2.BORDER_REPLICATE
-ROWS = 128  # that are worked on at a time: what they take stays in the processor's cache from filter to filter
+ROWS = 128  # processed at a time: they stay in the processor's cache from filter to filter
 # Of the widest Gaussian, three deviations, pixels; the filters of features are narrower.
 _REACH = int(np.ceil(3 * np.sqrt(0.04 / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
 BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes radiance around 1
 
 
-def flip_map(image: Array, reference: Array) -> Array:
-    """HDR-FLIP error of each pixel, 0 at best and 1 at worst.
+def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> list[Array]:
+    """HDR-FLIP error of each pixel of several images of one frame, in [0, 1]; the reference is processed once.
 
     Parameters
     ----------
-    image, reference : (H, W, 3) array
-        Linear radiance in sRGB primaries; negative values count as 0. They are not alike: the exposures are those of
-        the reference.
+    images : sequence of (H, W, 3) array
+        Linear radiance in sRGB primaries; negative values count as 0. Read `ROWS` at a time, so memory maps will do.
+    reference : (H, W, 3) array
+        Determines the exposures.
+    scale : float
+        Factor on all images.
 
     Returns
     -------
-    (H, W) array of float32
-        NaN everywhere if the image is not finite everywhere.
+    list of (H, W) array of float32
+        The greatest error over all exposures; NaN everywhere for an image that is not finite everywhere.
 
     Raises
     ------
     ValueError
         If shapes differ, or the reference is not finite.
-    """
-    return flip_maps([image], reference)[0]
-
-
-def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> list[Array]:
-    """`flip_map` of several pictures of one frame; what the reference looks like is found out once.
-
-    Parameters
-    ----------
-    images : sequence of (H, W, 3) array
-        Linear radiance. They may lie in files: `ROWS` at a time are looked at.
-    reference : (H, W, 3) array
-        The same.
-    scale : float
-        Factor on all of them.
-
-    Returns
-    -------
-    list of (H, W) array of float32
-        One for each picture: the greatest error of all exposures.
     """
     for image in images:
         check_images(image, reference)
@@ -100,10 +83,10 @@ def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> 
         inner = slice(top - rows.start, top - rows.start + ROWS)
         strips = [np.maximum(image[rows] * np.float32(scale), 0) for image in images]
         for exposure in exposures:
-            truth = _see(reference[rows], exposure)
+            truth = _perceive(reference[rows], exposure)
             for strip, worst in zip(strips, errors, strict=True):
                 part = worst[top : top + ROWS]
-                np.maximum(part, _difference(_see(strip, exposure), truth)[inner], out=part)
+                np.maximum(part, _difference(_perceive(strip, exposure), truth)[inner], out=part)
     return [
         worst if np.isfinite(image).all() else np.full_like(worst, np.nan)
         for image, worst in zip(images, errors, strict=True)
@@ -111,18 +94,10 @@ def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> 
 
 
 def find_exposures(reference: Array) -> NDArray[np.float64]:
-    """Choose the exposures at which pictures are compared.
+    """Return the exposures in stops at which images are compared, at least two, evenly spaced, at most one apart.
 
-    Parameters
-    ----------
-    reference : (H, W, 3) array
-        Linear radiance in sRGB primaries, not negative.
-
-    Returns
-    -------
-    (N ≥ 2,) array
-        Stops, evenly spaced: from the brightest pixel at `TOP` of the tone curve to the (upper) median there, at most
-        one apart.
+    The first brings the brightest pixel of the reference (not negative) to `TOP` of the tone curve, the last the
+    (upper) median.
     """
     light = _mix(reference, np.array([[0.2126, 0.7152, 0.0722]])).ravel()
     median = np.partition(light, light.size // 2)[light.size // 2]
@@ -133,38 +108,38 @@ def find_exposures(reference: Array) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A picture as it is seen: (H, W, 3) color in L*a*b* after Hunt, and strength of edges and points, (H, W) each."""
+class _Perceived:
+    """An image as perceived: (H, W, 3) color in L*a*b* after Hunt, and strength of edges and points, (H, W) each."""
 
     color: Array
     edges: Array
     points: Array
 
 
-def _see(image: Array, exposure: float) -> _Seen:
-    """What the eye makes of a picture, not negative, on a display."""
+def _perceive(image: Array, exposure: float) -> _Perceived:
+    """Perceive an image, not negative, on a display."""
     scaled = image * np.float32(2**exposure)
     k = [np.float32(value) for value in ACES]
     shown = np.minimum(((k[0] * scaled + k[1]) * scaled + k[2]) / ((k[3] * scaled + k[4]) * scaled + k[5]), 1)
-    # The 16 that Y lacks cancel: filters of color preserve constants, and those of edges and points remove them.
+    # The 16 missing in Y cancel: color filters preserve constants, filters of edges and points remove them.
     opponent = _mix(shown, OPPONENT @ RELATIVE)
     seen = np.dstack([_blur(opponent[..., i], gaussians) for i, gaussians in enumerate(SENSITIVITY)])
     light = np.clip(_mix(seen, np.linalg.inv(OPPONENT @ RELATIVE)), 0, 1)
     wide, edge, point = _feature_filters()
     gray = opponent[..., 0] * np.float32(1 / 116)
-    return _Seen(_hunt(light), _strength(gray, edge, wide), _strength(gray, point, wide))
+    return _Perceived(_hunt(light), _strength(gray, edge, wide), _strength(gray, point, wide))
 
 
-def _difference(one: _Seen, other: _Seen) -> Array:
+def _difference(one: _Perceived, other: _Perceived) -> Array:
     """Error of each pixel at one exposure: ΔC^(1 − ΔF), with the errors of color and of features in [0, 1]."""
-    most = _greatest_color_error()
+    greatest = _greatest_color_error()
     color = _power(_hyab(one.color, other.color), COLOR_POWER)
-    below = color * np.float32(BELOW / (KNEE * most))
-    above = BELOW + (color - np.float32(KNEE * most)) * np.float32((1 - BELOW) / (most - KNEE * most))
-    color = np.where(color < KNEE * most, below, above)
+    below = color * np.float32(BELOW / (KNEE * greatest))
+    above = BELOW + (color - np.float32(KNEE * greatest)) * np.float32((1 - BELOW) / (greatest - KNEE * greatest))
+    color = np.where(color < KNEE * greatest, below, above)
     features = cv2.max(cv2.absdiff(one.edges, other.edges), cv2.absdiff(one.points, other.points))
     features = _power(features * np.float32(1 / np.sqrt(2)), FEATURE_POWER)
-    # The logarithm of 0 is a number in OpenCV, and its power is 0.
+    # OpenCV's logarithm of 0 is finite, and its power is 0.
     return np.asarray(cv2.exp(cv2.log(color) * (1 - features)), np.float32)
 
 
@@ -174,7 +149,7 @@ def _mix(image: Array, matrix: NDArray[np.float64]) -> Array:
 
 
 def _length(x: NDArray[Any], y: NDArray[Any]) -> Array:
-    # That of OpenCV differs in the last bit from call to call.
+    # OpenCV's result differs in the last bit from call to call.
     return np.asarray(np.sqrt(x * x + y * y), np.float32)
 
 
@@ -183,13 +158,13 @@ def _power(x: Array, power: float) -> Array:
 
 
 def _hyab(one: Array, other: Array) -> Array:
-    """The distance of large color differences: that in lightness, and that in a* and b*, added."""
+    """HyAB distance for large color differences: the distance in lightness plus that in a* and b*."""
     apart = one - other
     return np.asarray(np.abs(apart[..., 0]) + _length(apart[..., 1], apart[..., 2]), np.float32)
 
 
 def _hunt(light: Array) -> Array:
-    """L*a*b* of linear sRGB, chroma scaled with the lightness: dark colors look alike."""
+    """L*a*b* of linear sRGB, chroma scaled by lightness (Hunt effect): dark colors look alike."""
     xyz = _mix(light, RELATIVE)
     edge = 6 / 29
     low = xyz * np.float32(1 / (3 * edge**2)) + np.float32(4 / 29)
@@ -200,13 +175,13 @@ def _hunt(light: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _greatest_color_error() -> float:
-    """That between green and blue, to the power of color errors."""
+    """The color error between green and blue."""
     green, blue = (_hunt(np.array([[color]], np.float32)) for color in ((0, 1, 0), (0, 0, 1)))
     return float(_hyab(green, blue)[0, 0] ** COLOR_POWER)
 
 
 def _blur(plane: Array, gaussians: Sequence[tuple[float, float]]) -> Array:
-    """Filter by a sum of Gaussians, whose weights sum to one together."""
+    """Filter by a sum of Gaussians with a total weight of one."""
     degrees = np.arange(-_REACH, _REACH + 1) / PIXELS_PER_DEGREE
     rows = [np.exp(-(np.pi**2) / b * degrees**2) for _, b in gaussians]
     heights = [a * np.sqrt(np.pi / b) for a, b in gaussians]
@@ -219,7 +194,7 @@ def _blur(plane: Array, gaussians: Sequence[tuple[float, float]]) -> Array:
 
 
 def _strength(gray: Array, across: NDArray[np.float64], along: NDArray[np.float64]) -> Array:
-    """Length of what a filter finds horizontally and vertically."""
+    """Magnitude of a filter's horizontal and vertical responses."""
     x = cv2.sepFilter2D(gray, -1, across, along, borderType=BORDER)
     y = cv2.sepFilter2D(gray, -1, along, across, borderType=BORDER)
     return _length(x, y)

@@ -1,13 +1,12 @@
-"""How far a denoised shot is from its reference, in space and in time.
+"""Error measures of denoised frames against a reference, in space and in time.
 
-Every measure takes linear radiance and says in its docstring what it computes. The tone curve, where one
-is used, is x / (1 + x) at one exposure for the whole shot, so that frames can be compared. Agreed throughout:
+All measures take (H, W, 3) linear radiance. The exposure e is one factor for the whole shot: on the tone curve
+T(x) = e·x / (1 + e·x) for PSNR, SSIM and the temporal measures, on the radiance for relMSE and SMAPE.
 
-- A reference may be given as two independent halves ``(a, b)``: every squared error (x − r)² becomes the
-  product (x − a)(x − b), whose expectation is free of the reference's own noise; where a tone curve bends that
-  noise, its bias is taken off.
-- A frame with a non-finite pixel scores NaN: one lost pixel must not be averaged away, and must not stop the
-  comparison of the others either. A non-finite *reference* is the caller's mistake and raises ValueError.
+- A reference may be two independent halves ``(a, b)``: every squared error (x − r)² becomes the product (x − a)(x − b),
+  whose expectation is free of the reference's noise. The bias that the tone curve makes of that noise is subtracted.
+- An image with a non-finite pixel scores NaN: one such pixel must not be averaged away, and must not stop the
+  comparison of other methods. A non-finite *reference* is the caller's mistake and raises ValueError.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from flow.warp import warp
 Array = NDArray[np.floating]
 Reference = Array | tuple[Array, Array]
 
-EPSILON = 1e-2  # keeps black from dividing by zero, and assumes radiance around 1 after the exposure
-AROUND = 2.0  # pixels: deviation of the Gaussian that averages the bias of noisy halves
-LEVEL = 0.95  # coverage of intervals
+EPSILON = 1e-2  # prevents division by zero at black; assumes radiance around 1 after the exposure
+BIAS_SIGMA = 2.0  # pixels: deviation of the Gaussian that averages the bias of noisy halves
+LEVEL = 0.95  # coverage of bootstrap intervals
 RESAMPLES = 2000
 
 
@@ -39,35 +38,26 @@ def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
     x : (...) array
         Linear radiance. Negative values count as 0: the curve has a pole at −1/e.
     exposure : float
-        The factor e, one for a whole shot.
-
-    Returns
-    -------
-    (...) array of float64
-        In [0, 1).
+        The factor e.
     """
     scaled = np.maximum(np.asarray(x, np.float64) * exposure, 0.0)
-    with np.errstate(invalid="ignore"):  # inf / inf: NaN is what a non-finite pixel is to become
+    with np.errstate(invalid="ignore"):  # inf / inf gives NaN, as intended for non-finite pixels
         return scaled / (1.0 + scaled)
 
 
 def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
-    """Peak signal-to-noise ratio of the tone-mapped image, in dB.
+    """Peak signal-to-noise ratio of the tone-mapped image: −10 log₁₀ mean (T(x) − T(r))² dB, with peak 1.
 
     Parameters
     ----------
     image : (H, W, 3) array
-        Linear radiance.
     reference : (H, W, 3) array or two of them
-        The same, or two independent halves.
     exposure : float
-        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
     float
-        −10 log₁₀ mean (T(x) − T(r))², with peak 1. Infinite where the error is zero or, with a reference in
-        halves, where it cannot be told from zero. NaN if the image is not finite everywhere.
+        Infinite where the error is zero, or where the estimate from two halves is not positive.
     """
     errors = _tone_errors(image, reference, exposure)
     return _decibels(np.mean(errors[0] * errors[-1]))
@@ -79,13 +69,8 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     Parameters
     ----------
     image, reference : (H, W, 3) array
-        Linear radiance, at least 11 × 11 pixels.
+        At least 11 × 11 pixels.
     exposure : float
-        Factor before the tone curve, one for a whole shot.
-
-    Returns
-    -------
-    float
 
     Notes
     -----
@@ -107,23 +92,12 @@ def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: f
     Parameters
     ----------
     image : (H, W, 3) array
-        Linear radiance.
     reference : (H, W, 3) array or two of them
-        The same, or two independent halves, whose mean is then the r of the denominator.
+        The mean of two halves is the r of the denominator.
     trim : float
-        Share of the pixels, those with the largest error, that are left out; 0.001 is usual, since a
-        single firefly can outweigh the rest of the frame.
+        Fraction of the pixels, with the largest errors, that is excluded, in [0, 1); 0.001 is usual, since a single
+        firefly can outweigh the rest of the frame.
     exposure : float
-        Factor on image and reference, one for a whole shot.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ValueError
-        If trim is not in [0, 1).
     """
     if not 0.0 <= trim < 1.0:
         raise ValueError(f"trim must be in [0, 1), is {trim}")
@@ -140,29 +114,18 @@ def smape(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
     Parameters
     ----------
     image, reference : (H, W, 3) array
-        Linear radiance.
     exposure : float
-        Factor on image and reference, one for a whole shot.
-
-    Returns
-    -------
-    float
     """
     x, r, _ = _checked(image, reference, exposure)
     return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + EPSILON)))
 
 
 def mean_bias(image: Array, reference: Array) -> float:
-    """Relative error of the mean radiance: (mean x − mean r) / mean r; negative where light was lost.
+    """Relative error of the mean radiance: (mean x − mean r) / mean r; NaN for a black reference.
 
     Parameters
     ----------
     image, reference : (H, W, 3) array
-        Linear radiance. A black reference gives NaN.
-
-    Returns
-    -------
-    float
     """
     x, r, _ = _checked(image, reference)
     return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
@@ -176,39 +139,36 @@ def temporal_psnr(
     *,
     exposure: float = 1.0,
 ) -> NDArray[np.float64]:
-    """PSNR of motion-compensated frame differences against the reference's own, for each pair of frames.
+    """PSNR of motion-compensated frame differences against those of the reference, for each pair of frames.
 
     Parameters
     ----------
     frames : N arrays (H, W, 3)
-        Linear radiance, consecutive in time.
+        Consecutive in time.
     references : N references
-        Each an image or two independent halves.
     flows : N − 1 arrays (H, W, 2)
         Pixels; flow k leads from frame k + 1 back to frame k.
     valid : N − 1 arrays (H, W) of bool
-        True where that flow leads to the same point of the scene.
+        True where the flow leads to the same point of the scene.
     exposure : float
-        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
     (N − 1,) array
-        PSNR in dB. Infinite where the differences are the reference's, NaN where a frame is not finite or no pixel is
-        valid.
+        dB. Infinite where the differences equal the reference's, NaN where a frame is not finite or no pixel is valid.
 
     Raises
     ------
     ValueError
-        If the numbers of frames, references, flows and masks do not belong together.
+        If the numbers of frames, references, flows and masks do not correspond.
 
     Notes
     -----
-    With W the (bilinear) warp of frame t − 1 to frame t and T the tone curve,
-    D_t(x) = T(x_t) − W T(x_{t−1}), and the value is −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels.
-    The reference subtracts what really changes (light, reflections, the interpolation itself). Without it,
-    blur would score above the truth. What is wrong in the same way on every frame is no flicker and is not
-    seen: read this figure beside the PSNR. Arguments are consumed a pair at a time, so generators will do.
+    With W the bilinear warp of frame t − 1 to frame t, D_t(x) = T(x_t) − W T(x_{t−1}), and the value is
+    −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels. Subtracting the reference's differences excludes real changes:
+    light, reflections, the interpolation itself; without it, blur would score above the truth. An error that is the
+    same on every frame is no flicker and is not measured here. Arguments are consumed a pair at a time: generators
+    are accepted.
     """
     series = zip(frames, references, strict=True)
     values = []
@@ -227,23 +187,22 @@ def temporal_psnr(
 
 
 def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> NDArray[np.float64]:
-    """Standard deviation over time of the pixels that stand still, on the tone curve, frame by frame.
+    """Standard deviation over time of static pixels, on the tone curve, frame by frame.
 
     Parameters
     ----------
     frames : N ≥ 2 arrays (H, W, 3)
-        Linear radiance. Their static pixels are held in memory.
+        Their static pixels are held in memory.
     static : (H, W) array of bool
-        True where neither the scene nor its light changes in the picture.
+        True where neither the scene nor its light changes.
     exposure : float
-        Factor before the tone curve, one for a whole shot.
 
     Returns
     -------
     (N,) array
-        Root mean squares over pixels and channels of each frame's distance to the mean over time, times
-        √(N / (N − 1)): their squares' mean is the unbiased variance over time. NaN where no pixel is static, there are
-        less than two frames, or one is not finite.
+        RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of
+        the squares is the unbiased variance over time. NaN without static pixels, for fewer than two frames, or if a
+        frame is not finite.
     """
     values = []
     for frame in frames:
@@ -265,22 +224,14 @@ def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) 
     values : sequence of float
         One per frame.
     shots : sequence of int
-        How many of the values belong to each shot; all to one without.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ValueError
-        If `shots` do not add up to the values.
+        Number of values of each shot; default: all values belong to one shot.
     """
     data = np.asarray(values, np.float64)
     return float(np.mean([part.mean() for part in _by_shot(data, shots)]))
 
 
 def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np.float64]]:
+    """Split the values into those of each shot."""
     if not shots:
         return [data]
     if sum(shots) != data.size or min(shots) < 1:
@@ -288,34 +239,22 @@ def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np
     return np.split(data, np.cumsum(shots)[:-1])
 
 
-def bootstrap_interval(
-    values: Sequence[float] | Array,
-    seed: int = 0,
-    *,
-    shots: Sequence[int] = (),
-) -> tuple[float, float]:
+def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] = ()) -> tuple[float, float]:
     """95 % percentile bootstrap interval of the mean of `values`.
 
     Parameters
     ----------
     values : N ≥ 1 floats
-        One per frame (or per shot). For "is A better than B" pass the differences A − B frame by frame: the frames are
-        the same, and most of their spread cancels. An interval that contains 0 is a tie.
-    seed : int
-        Of the resampling.
+        One per frame. To decide whether A is better than B, pass the differences A − B frame by frame: both have the
+        same frames, and most of their spread cancels. An interval that contains 0 is a tie.
     shots : sequence of int
-        How many of the values belong to each shot, if to several. Shots are then resampled first, and the
-        frames within each: frames of one shot are alike, and more of them tell little about another shot.
+        Number of values of each shot. Of several shots, the shots are resampled first, then the frames within each:
+        frames of one shot are correlated, and more of them say little about another shot.
 
     Returns
     -------
     low, high : float
         NaN if a value is NaN.
-
-    Raises
-    ------
-    ValueError
-        If there are no values, or `shots` do not add up to them.
 
     References
     ----------
@@ -326,7 +265,7 @@ def bootstrap_interval(
         raise ValueError(f"values must be one-dimensional and not empty, have shape {data.shape}")
     if np.isnan(data).any():
         return float("nan"), float("nan")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     parts = _by_shot(data, shots)
 
     def draw(part: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -337,26 +276,19 @@ def bootstrap_interval(
     else:
         drawn = [rng.integers(0, len(parts), RESAMPLES) for _ in parts]
         means = np.mean([np.choose(shot, [draw(part) for part in parts]) for shot in drawn], axis=0)
-    # An order statistic and no interpolation, which would make NaN of two infinite PSNRs.
+    # An order statistic without interpolation, which would make NaN of two infinite PSNRs.
     tails = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
     low, high = np.quantile(means, tails, method="inverted_cdf")
     return float(low), float(high)
 
 
 def check_images(image: Array, reference: Reference) -> None:
-    """Refuse what cannot be compared.
+    """Raise ValueError if the shapes differ or the reference is not finite.
 
     Parameters
     ----------
     image : (H, W, C) array
-        What is judged, finite or not.
     reference : (H, W, C) array or two of them
-        What it is judged against.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ, or the reference is not finite.
     """
     for half in reference if isinstance(reference, tuple) else (reference,):
         if half.shape != image.shape or image.ndim != 3:
@@ -367,7 +299,7 @@ def check_images(image: Array, reference: Reference) -> None:
 
 
 def _checked(image: Array, reference: Reference, scale: float = 1.0) -> tuple[NDArray[np.float64], ...]:
-    """The image, all NaN if any of it is not finite, and the halves of the reference; a whole one is both."""
+    """Image (all NaN if not finite) and the halves of the reference; a whole reference is returned as both."""
     check_images(image, reference)
     if not np.isfinite(image).all():
         image = np.full(image.shape, np.nan)
@@ -377,20 +309,20 @@ def _checked(image: Array, reference: Reference, scale: float = 1.0) -> tuple[ND
 
 
 def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[NDArray[np.float64]]:
-    """The tone-mapped error against a whole reference, or against each half, whose product is the squared one.
+    """Tone-mapped error against a whole reference, or against each half; the product of two is the squared error.
 
-    T is concave: of halves with noise of variance v it makes pictures that are T'' v / 2 too dark, which dark pictures
-    would gain by. The curve of their mean has half of that bias, so twice what lies between is all of it (Quenouille
-    1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over `AROUND` pixels, as one pixel does not tell.
+    T is concave: halves with noise of variance v give tone-mapped images that are T'' v / 2 too dark, which would
+    favor dark images. The curve of the halves' mean has half of that bias, so twice the difference is all of it
+    (Quenouille 1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over `BIAS_SIGMA` pixels against variance.
     """
     x, a, b = _checked(image, reference)
     tone = tone_map(x, exposure)
     if b is a:
         return [tone - tone_map(a, exposure)]
     halves = [tone_map(half, exposure) for half in (a, b)]
-    between = 2 * tone_map((a + b) / 2, exposure) - halves[0] - halves[1]
-    lost = np.asarray(cv2.GaussianBlur(between, (0, 0), AROUND), np.float64)
-    return [tone - half - lost for half in halves]
+    difference = 2 * tone_map((a + b) / 2, exposure) - halves[0] - halves[1]
+    bias = np.asarray(cv2.GaussianBlur(difference, (0, 0), BIAS_SIGMA), np.float64)
+    return [tone - half - bias for half in halves]
 
 
 def _decibels(mse: np.floating) -> float:

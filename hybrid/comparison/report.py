@@ -1,13 +1,13 @@
-"""The results of a comparison as one HTML page, and as PNG, CSV, JSON and Markdown for scripts and papers.
+"""The report of a comparison: an HTML page, a PNG of its chart, and JSON for scripts.
 
-The page holds everything it shows: it asks for no library, font or file, and a content security policy keeps it
-from doing so. Its templates are in `hybrid.comparison.page`.
+The page is one file that holds all it shows and requests nothing; a content security policy enforces this. Its
+templates are in `hybrid.comparison.page`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hybrid.comparison import chart, page
-from hybrid.comparison.embedding import ReportImages, embed_pictures
-from hybrid.comparison.loops import embed_loops, write_loops
+from hybrid.comparison.animations import embed_animations, write_movies
+from hybrid.comparison.embedding import Embedded, MethodImages, ShotImages, embed_pictures
 from hybrid.comparison.results import (
     CHART_METRICS,
     COSTS,
@@ -38,104 +38,171 @@ from hybrid.comparison.results import (
     to_plain_numbers,
 )
 from hybrid.comparison.store import MAP_TITLES, REFERENCE, FrameStore
-from hybrid.comparison.tables import (
-    format_bytes,
-    format_change,
-    format_seconds,
-    format_value,
-    format_worth,
-    markdown_table,
-    to_csv,
-)
+from hybrid.comparison.tables import format_bytes, format_change, format_seconds, format_value, format_worth
 from hybrid.files.replace import check_outputs, write_file
 
 Array = NDArray[np.float32]
 
-# Frames per second that the page plays at, besides the one asked for.
-RATES = (4, 12, 24, 25, 30, 60)
-LOOPS = "loops"
-FILES = ("report.html", "results.json", "results.csv", "results.md", "chart.png")
+RATES = (4, 12, 24, 25, 30, 60)  # frames per second that the page offers
+MOVIES = "movies"  # folder next to the page
+FILES = ("report.html", "results.json", "chart.png")
 
 
-def write_report(
-    folder: Path | str,
-    comparison: Comparison,
-    images: Sequence[ReportImages] = (),
-    reference: Callable[[int], Array] | None = None,
-    frames: Sequence[int] = (),
-    *,
-    others: Sequence[Comparison] = (),
-    exposure: float = 1.0,
-    cost: Cost = "seconds_per_megapixel",
-    megabytes: float = 24.0,
-    rate: float = 24.0,
-    movies: bool = False,
-) -> Path:
-    """Write ``report.html``, ``results.json``, ``results.csv``, ``results.md`` and ``chart.png`` into a folder.
+@dataclass(frozen=True)
+class Report:
+    """Content of a report.
+
+    Attributes
+    ----------
+    comparison : Comparison
+        The shot of the page, methods in the order of the tables. Gains are relative to the method "noisy".
+    images : ShotImages, optional
+        Frames and maps for the viewer.
+    others : sequence of Comparison
+        Comparisons of other shots, for a table of all shots.
+    cost : str
+        One of `COSTS`: the chart's first choice, and that of chart.png.
+    rate : float
+        Frames per second at which the page plays first.
+    movies : bool
+        Also write the animations in full size into a folder ``movies``.
+    """
+
+    comparison: Comparison
+    images: ShotImages | None = None
+    others: Sequence[Comparison] = ()
+    cost: Cost = "seconds_per_megapixel"
+    rate: float = 24.0
+    movies: bool = False
+
+
+def write_report(folder: Path | str, report: Report) -> Path:
+    """Write ``report.html``, ``results.json`` and ``chart.png`` into a folder; return the path of the page.
 
     Parameters
     ----------
     folder : Path or str
-        Is made where it does not exist.
-    comparison : Comparison
-        Of the shot that the page is about, methods in the order of the tables. The one named "noisy" is what gains
-        are counted from.
-    images : sequence of ReportImages
-        Of those methods that have pictures, in the order of the viewer; each read one frame at a time.
-    reference : callable, optional
-        From a frame number to (H, W, 3) linear radiance. Needed with `images`.
-    frames : sequence of int
-        Numbers of the consecutive frames whose pictures are embedded.
-    others : sequence of Comparison
-        Of further shots, which are shown beside this one and put together with it.
-    exposure : float
-        The factor e of the tone curve e·x / (1 + e·x) of the metrics: 0 EV in the viewer.
-    cost : str
-        One of `COSTS`: what the chart begins with, and what chart.png shows.
-    megabytes : float
-        Limit on the embedded pictures. What is left out to keep it is said on the page. Loops
-        (`hybrid.comparison.loops`) may take a sixth of it beside.
-    rate : float
-        Frames per second, as the page plays at first.
-    movies : bool
-        Whether the loops are written in their own size too, into a folder ``loops`` beside the page.
-
-    Returns
-    -------
-    Path
-        Of the page.
+        Created if it does not exist.
+    report : Report
 
     Raises
     ------
     ValueError
-        Two results of one name; images without a result, a reference or frames; pictures of different shapes.
+        If two results have one name, images have no result or no frames, or images differ in shape.
     """
-    results = comparison.results
-    _check(results, images, reference, frames)
-    folder = Path(folder)
+    folder, results = Path(folder), report.comparison.results
+    _check(results, report.images)
     check_report(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    pictures, labels = None, {r.name: r.label for r in results}
-    if images and reference is not None:
-        pictures = embed_pictures(images, labels, reference, frames, megabytes * 1e6)
-    loops, beside = None, {}
-    if images and reference is not None and len(frames) > 1:
-        looped = {"exposure": exposure, "rate": rate}
-        loops = embed_loops(images, labels, reference, frames, **looped, limit=megabytes * 1e6 / 6)
-        if movies:
-            beside = write_loops(folder / LOOPS, images, reference, frames, **looped)
-    metrics = present_metrics(results, METRICS)
-    charted = [m for m in metrics if m.key in CHART_METRICS]
-    costs = {key: COSTS[key] for key in (cost, *(c for c in COSTS if c != cost))}
-    document = to_document(comparison)
+    embedded = _embed(folder, report)
+    document = to_document(report.comparison)
     write_file(folder / "results.json", to_json(document, indent=1))
-    write_file(folder / "results.csv", to_csv(results, metrics))
-    write_file(folder / "results.md", markdown_table([comparison, *others], cost))
-    layout = chart.lay_out(results, charted[0], cost) if charted else None
-    if layout is not None:
-        write_file(folder / "chart.png", chart.to_png(layout))
+    charted = present_metrics(results, [m for m in METRICS if m.key in CHART_METRICS])
+    figure = chart.draw_chart(results, charted[0], report.cost, legend=True) if charted else None
+    if figure is not None:
+        write_file(folder / "chart.png", chart.to_png(figure))
+    write_file(folder / "report.html", _page(report, embedded, document, charted))
+    return folder / "report.html"
+
+
+def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
+    """Raise ValueError or OSError if a report would overwrite an input, or files of another origin.
+
+    Parameters
+    ----------
+    folder : Path
+        As for `write_report`.
+    inputs : sequence of Path
+    """
+    check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
+    there = [folder / name for name in (*FILES, MOVIES) if (folder / name).exists()]
+    if there and not is_comparison(folder / "results.json"):
+        raise ValueError(f"{there[0]} exists and was not written by ravg compare: expected another folder")
+
+
+def report_images(
+    store: FrameStore, comparison: Comparison, frames: Sequence[int], exposure: float = 1.0
+) -> ShotImages:
+    """Return the images that `compare_shot` has stored; points of sweeps are left out: they are many and look alike.
+
+    Parameters
+    ----------
+    store : FrameStore
+        Of the folder given to `compare_shot`.
+    comparison : Comparison
+        The result of `compare_shot`.
+    frames : sequence of int
+        Numbers of the evaluated frames.
+    exposure : float
+        Of the comparison.
+    """
+    methods = []
+    for result in comparison.results:
+        if result.absent_reason is None and not result.sweep:
+            titles = [t for t in MAP_TITLES if any(store.has(result.name, number, t) for number in frames)]
+            maps = {title: partial(_load_map, store, result.name, title) for title in titles}
+            methods.append(MethodImages(result.name, partial(store.load, result.name), maps))
+    return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure)
+
+
+def _load_map(store: FrameStore, name: str, title: str, number: int) -> Array | None:
+    return store.load(name, number, title) if store.has(name, number, title) else None
+
+
+def _check(results: Sequence[MethodResult], images: ShotImages | None) -> None:
+    """Raise ValueError for content that contradicts itself."""
+    names = [r.name for r in results]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"results must have different names, {name!r} appears {names.count(name)} times")
+    if REFERENCE in names:
+        raise ValueError(f"results must not be named {REFERENCE!r}: the viewer uses that name")
+    for entry in images.methods if images is not None else ():
+        if entry.name not in names:
+            raise ValueError(f"images of {entry.name!r} belong to no result; there are {', '.join(names)}")
+    if images is not None and not images.frames:
+        raise ValueError("images need at least one frame")
+
+
+# Content of the page
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Encoded images of a page, and the movies next to it by method."""
+
+    pictures: Embedded | None = None
+    animations: Embedded | None = None
+    movies: Mapping[str, str] | None = None
+
+
+def _embed(folder: Path, report: Report) -> _Images:
+    """Encode the images of a page; a single frame has no animation."""
+    images = report.images
+    if images is None:
+        return _Images()
+    pictures = embed_pictures(images)
+    if len(images.frames) < 2:
+        return _Images(pictures)
+    movies = write_movies(folder / MOVIES, images, report.rate) if report.movies else None
+    return _Images(pictures, embed_animations(images), movies)
+
+
+def _page(report: Report, embedded: _Images, document: Mapping[str, object], charted: Sequence[Metric]) -> Markup:
+    """The page as HTML."""
+    comparison, results = report.comparison, report.comparison.results
+    metrics = present_metrics(results, METRICS)
     present = [r for r in results if r.absent_reason is None]
-    text = page.render(
+    costs = {key: COSTS[key] for key in (report.cost, *(c for c in COSTS if c != report.cost))}
+    data = {
+        **document,
+        "chart": [m.key for m in charted],
+        "cost": report.cost,
+        "exposure": report.images.exposure if report.images is not None else 1.0,
+        "pictures": embedded.pictures and embedded.pictures.info,
+        "animations": embedded.animations and embedded.animations.info,
+    }
+    return page.render(
         "report.html",
         comparison=comparison,
         style=page.style(),
@@ -145,122 +212,26 @@ def write_report(
         charted=charted,
         costs=costs,
         families=chart.families(results),
-        colors=len(chart.COLORS),
+        colors=chart.COLORS,
         marker=chart.marker,
-        plots=[_plot(results, m, c) for m in charted for c in costs],
+        plots=[_plot(results, m, c, f"chart{i}") for i, (m, c) in enumerate((m, c) for m in charted for c in costs)],
         methods=_method_table([r for r in present if not r.sweep], metrics),
         absent=[r for r in results if r.absent_reason is not None],
         sweeps=_sweep_tables(present, metrics),
         stages=stage_values(results),
-        shots=_shot_table([comparison, *others]),
-        pictures=pictures,
-        loops=loops,
-        movies=[(labels.get(name, "Reference"), file) for name, file in beside.items()],
-        rates=sorted({*RATES, rate}),
-        fps=rate,
-        data=to_plain_numbers(
-            {
-                **document,
-                "chart": [m.key for m in charted],
-                "cost": cost,
-                "exposure": exposure,
-                "pictures": pictures and pictures.info,
-                "loops": loops and loops.info,
-            }
-        ),
+        shots=_shot_table([comparison, *report.others]),
+        pictures=embedded.pictures,
+        animations=embedded.animations,
+        movies=embedded.movies,
+        rates=sorted({*RATES, report.rate}),
+        fps=report.rate,
+        data=to_plain_numbers(data),
     )
-    write_file(folder / "report.html", text)
-    return folder / "report.html"
-
-
-def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
-    """Refuse a folder where a report would be written over something that is none.
-
-    Parameters
-    ----------
-    folder : Path
-        As for `write_report`.
-    inputs : sequence of Path
-        Files that are read meanwhile.
-
-    Raises
-    ------
-    ValueError, OSError
-        If the folder has a file that a report would replace and that no comparison has left there, or that is read.
-    """
-    check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
-    there = [folder / name for name in (*FILES, LOOPS) if (folder / name).exists()]
-    if there and not is_comparison(folder / "results.json"):
-        raise ValueError(f"{there[0]} is there, and of no earlier comparison: expected another folder")
-
-
-def report_images(
-    store: FrameStore, comparison: Comparison, frames: Sequence[int]
-) -> tuple[list[ReportImages], Callable[[int], Array]]:
-    """Name the pictures that `compare_shot` has left; they are read when asked for.
-
-    Parameters
-    ----------
-    store : FrameStore
-        Of the folder given to `compare_shot`.
-    comparison : Comparison
-        What it has returned.
-    frames : sequence of int
-        Numbers of the frames that were judged.
-
-    Returns
-    -------
-    list of ReportImages
-        Pictures and maps of every method. Points of sweeps are left out: there are too many, and they look alike.
-    callable
-        From a frame number to the reference.
-    """
-    images = [
-        ReportImages(
-            r.name,
-            partial(store.load, r.name),
-            {
-                title: partial(_load_map, store, r.name, title)
-                for title in MAP_TITLES
-                if any(store.has(r.name, number, title) for number in frames)
-            },
-        )
-        for r in comparison.results
-        if r.absent_reason is None and not r.sweep
-    ]
-    return images, partial(store.load, REFERENCE)
-
-
-def _load_map(store: FrameStore, name: str, title: str, number: int) -> Array | None:
-    return store.load(name, number, title) if store.has(name, number, title) else None
-
-
-def _check(
-    results: Sequence[MethodResult],
-    images: Sequence[ReportImages],
-    reference: Callable[[int], Array] | None,
-    frames: Sequence[int],
-) -> None:
-    """Refuse what would make a page that contradicts itself."""
-    names = [r.name for r in results]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"results must have different names, {name!r} appears {names.count(name)} times")
-    if REFERENCE in names:
-        raise ValueError(f"results must not be named {REFERENCE!r}: the viewer keeps that name")
-    for entry in images:
-        if entry.name not in names:
-            raise ValueError(f"images of {entry.name!r} belong to no result; there are {', '.join(names)}")
-    if images and (reference is None or not frames):
-        raise ValueError("images need a reference and at least one frame")
-
-
-# What the templates ask for
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The page's head: who leads by the first measure, who ties with it, and (figure, unit, label) of what it gains."""
+    """Head of the page: the best method by the first measure, its ties, and (figure, unit, label) of its gains."""
 
     leader: str
     ties: list[str]
@@ -268,12 +239,10 @@ class Verdict:
 
 
 def _verdict(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> Verdict | None:
-    if not metrics:
-        return None
-    metric, by_name = metrics[0], {r.name: r for r in results}
-    best, ties = best_and_ties(results, metric)
+    best, ties = best_and_ties(results, metrics[0]) if metrics else (None, set())
     if best is None:
         return None
+    metric, by_name = metrics[0], {r.name: r for r in results}
     leader, noisy = by_name[best], by_name.get("noisy")
     value = leader.metrics[metric.key].mean
     figures = [(format_value(value, metric), metric.unit, metric.label)]
@@ -281,15 +250,15 @@ def _verdict(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> Verd
         gain = value - noisy.metrics[metric.key].mean
         figures.append((format_change(gain, metric), metric.unit, "over the noisy input"))
     if leader.worth is not None and math.isfinite(leader.worth):
-        figures.append((format_worth(leader.worth), "", "the samples it is worth"))
+        figures.append((format_worth(leader.worth), "", "worth in samples"))
     if leader.seconds_per_megapixel is not None:
         figures.append((format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
-    return Verdict(leader.label, [r.label for r in results if r.name in ties], figures)
+    return Verdict(best, [r.name for r in results if r.name in ties], figures)
 
 
 @dataclass(frozen=True)
 class Plot:
-    """One pair of axes: the drawing, None where nothing is finite, and (budget, label, figure) of what to use."""
+    """A chart, None without finite values, and (budget, method, figure) of the recommendations."""
 
     metric: Metric
     cost: Cost
@@ -297,22 +266,21 @@ class Plot:
     advice: list[tuple[str, str, str]]
 
 
-def _plot(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> Plot:
-    layout = chart.lay_out(results, metric, cost)
+def _plot(results: Sequence[MethodResult], metric: Metric, cost: Cost, prefix: str) -> Plot:
+    figure = chart.draw_chart(results, metric, cost)
     by_name = {r.name: r for r in results}
     advice = []
     for name in pareto_front(results, metric, cost):
-        result = by_name[name]
-        spent = getattr(result, cost)
+        spent = getattr(by_name[name], cost)
         budget = format_bytes(spent) if cost == "peak_bytes" else f"{format_seconds(spent)} s"
-        figure = f"{format_value(result.metrics[metric.key].mean, metric)} {metric.unit}".strip()
-        advice.append(("nothing" if spent == 0 else budget, result.label, figure))
-    return Plot(metric, cost, None if layout is None else chart.to_svg(layout), advice)
+        value = f"{format_value(by_name[name].metrics[metric.key].mean, metric)} {metric.unit}".strip()
+        advice.append(("nothing" if spent == 0 else budget, name, value))
+    return Plot(metric, cost, None if figure is None else chart.to_svg(figure, prefix), advice)
 
 
 @dataclass(frozen=True)
 class Column:
-    """A measure as a column of a table: the best method, those that tie with it, and the range of all figures."""
+    """A measure as a column of a table: the best method, its ties, and the range of all values."""
 
     metric: Metric
     best: str | None
@@ -321,7 +289,7 @@ class Column:
     high: float
 
     def percent(self, value: float) -> str:
-        """How far along a cell a figure lies, in the range of all methods."""
+        """Position of a value along a cell, in the range of all methods."""
         if not math.isfinite(value):
             return "100.0%"
         share = (_along(value, self.metric) - self.low) / ((self.high - self.low) or 1.0)
@@ -343,7 +311,7 @@ def _columns(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list
 
 @dataclass(frozen=True)
 class MethodTable:
-    """Methods by family, the measures as columns, and how many of the methods are points of a sweep."""
+    """Methods by family, the measures as columns, and the number of methods that are points of a sweep."""
 
     columns: list[Column]
     families: dict[str, list[MethodResult]]
@@ -367,7 +335,7 @@ def _sweep_tables(present: Sequence[MethodResult], metrics: Sequence[Metric]) ->
 
 @dataclass(frozen=True)
 class ShotTable:
-    """What several shots have in common: their means as results, and the results of each shot by name."""
+    """Joined results of several shots, and the results of each shot by name."""
 
     columns: list[Column]
     joined: list[MethodResult]

@@ -1,11 +1,11 @@
-"""What a comparison has measured: methods, measures, who is best, what ties, and all of it as JSON."""
+"""Results of a comparison: methods, measures, best and ties, Pareto fronts, and JSON."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,43 +23,57 @@ COSTS: dict[Cost, str] = {
 
 @dataclass(frozen=True)
 class Statistic:
-    """One measure over the frames of one or more shots: its mean, range, and the interval that the mean is known to."""
+    """One measure over the frames of one or more shots: mean, range, and 95 % interval (`low`, `high`) of the mean."""
 
     mean: float
     minimum: float
     maximum: float
     low: float
     high: float
-    values: tuple[float, ...] = ()  # frame by frame, where known: paired differences then decide on ties
-    shots: tuple[int, ...] = ()  # how many of the values belong to each shot, where there are several
+    values: tuple[float, ...] = ()  # per frame, where known: ties are then decided by paired differences
+    shots: tuple[int, ...] = ()  # number of values of each shot, if there are several shots
 
 
 @dataclass(frozen=True)
 class Metric:
-    """How a measure is called, read and printed."""
+    """Name and number format of a measure."""
 
     key: str
     label: str
-    definition: str
     unit: str = ""
     digits: int = 2
     better: Literal["higher", "lower", "zero"] = "higher"
-    logarithmic: bool = False  # on the chart; printed with three significant digits
+    logarithmic: bool = False  # axis of the chart; printed with three significant digits
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What one method, with one choice of settings, has reached and cost on a shot.
+    """Accuracy and cost of one method, with one choice of settings, on a shot.
 
-    `seconds_per_megapixel` is the median, `spread` the (low, high) of repeated runs; None where the time is not
-    known, 0 where nothing was run. `worth` is the number of times the noisy render's samples that would
-    bring it to the same error. Methods of one `family` share a marker. A point of a sweep names what is varied in
-    `sweep` and the method it varies in `base`; its settings are those in which it differs. `absent_reason`
-    says why a method that was asked for has no figures.
+    Attributes
+    ----------
+    name : str
+    settings : mapping of str to object
+        For a point of a sweep: the settings that differ from those of `base`.
+    family : str
+        Methods of one family share color and marker on the chart.
+    sweep, base : str
+        The setting that is varied, and the method that is varied; "" outside sweeps.
+    seconds_per_megapixel, cpu_seconds_per_megapixel : float, optional
+        Median of the runs; 0 for frames that existed before, None where unknown.
+    spread : (float, float), optional
+        Least and greatest seconds per megapixel of repeated runs.
+    peak_bytes : int, optional
+        Peak memory; None where unknown.
+    metrics : mapping of str to Statistic
+        By `Metric.key`.
+    worth : float, optional
+        The noisy render would need this many times its samples for the same error.
+    absent_reason : str, optional
+        Why a requested method has no measurements.
     """
 
     name: str
-    label: str
     settings: Mapping[str, object] = field(default_factory=dict)
     family: str = "Methods"
     sweep: str = ""
@@ -75,176 +89,99 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What one shot has shown: the methods' results, and what to know about how they were measured."""
+    """Results of all methods on one shot, and facts on how they were measured."""
 
     shot: str
     results: tuple[MethodResult, ...]
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
+# Their definitions are in page/definitions.html.
 METRICS: tuple[Metric, ...] = (
-    Metric(
-        "psnr",
-        "PSNR",
-        "Peak signal-to-noise ratio, −10 log₁₀ mean (T(x) − T(r))², on the tone curve T(x) = e·x / (1 + e·x) "
-        "at one exposure e for the whole shot. Mean over frames.",
-        unit="dB",
-    ),
-    Metric(
-        "temporal_psnr",
-        "Temporal PSNR",
-        "PSNR of what changes from frame to frame: the difference of each frame to the one before, warped onto "
-        "it, against the reference's own. Flicker lowers it; an error that stands still does not, so read "
-        "it beside the PSNR.",
-        unit="dB",
-    ),
-    Metric(
-        "ssim",
-        "SSIM",
-        "Mean structural similarity on the same tone curve: Gaussian window, σ = 1.5, K = (0.01, 0.03); 1 at best.",
-        digits=4,
-    ),
-    Metric(
-        "relmse",
-        "relMSE",
-        "Relative mean squared error, mean (x − r)² / (r² + 0.01), on linear radiance. One firefly can decide it.",
-        better="lower",
-        logarithmic=True,
-    ),
-    Metric(
-        "relmse_trimmed",
-        "relMSE, trimmed",
-        "relMSE without the 0.1 % of the pixels whose error is largest.",
-        better="lower",
-        logarithmic=True,
-    ),
-    Metric("smape", "SMAPE", "Mean |x − r| / (|x| + |r| + 0.01), in [0, 1].", digits=4, better="lower"),
-    Metric(
-        "flip",
-        "FLIP",
-        "Mean HDR-FLIP error: how different the two look when one flips between them, over the range of "
-        "exposures the reference calls for; 0 at best, 1 at worst.",
-        digits=4,
-        better="lower",
-    ),
-    Metric(
-        "mean_bias",
-        "Bias",
-        "Relative error of the mean radiance, mean x / mean r − 1: below zero where light was lost.",
-        digits=4,
-        better="zero",
-    ),
-    Metric(
-        "static_std",
-        "Static deviation",
-        "Standard deviation over time, on the tone curve, of the pixels that stand still: the vectors stay below a "
-        "twentieth of a pixel, and the reference's 9 × 9 means within 0.02. Frame by frame: √(n / (n − 1)) times "
-        "the root mean square distance to each pixel's own mean over the n frames. 0 is no flicker at all, which "
-        "blur reaches too.",
-        better="lower",
-        logarithmic=True,
-    ),
+    Metric("psnr", "PSNR", unit="dB"),
+    Metric("temporal_psnr", "Temporal PSNR", unit="dB"),
+    Metric("ssim", "SSIM", digits=4),
+    Metric("relmse", "relMSE", better="lower", logarithmic=True),
+    Metric("relmse_trimmed", "relMSE, trimmed", better="lower", logarithmic=True),
+    Metric("smape", "SMAPE", digits=4, better="lower"),
+    Metric("flip", "FLIP", digits=4, better="lower"),
+    Metric("mean_bias", "Bias", digits=4, better="zero"),
+    Metric("static_std", "Static deviation", better="lower", logarithmic=True),
 )
 MARKDOWN_METRICS = ("psnr", "temporal_psnr")  # the columns of the README's table
-CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # those the chart offers, the first one first
+CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # in the order of the chart's menu
 
 
 def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
-    """Summarize a measure taken frame by frame: mean, range, and the 95 % bootstrap interval of the mean.
+    """Summarize values of a measure: mean over the shots' means, range, and 95 % bootstrap interval of the mean.
 
     Parameters
     ----------
     values : sequence of float
-        N ≥ 1 figures, one per frame.
+        N ≥ 1 values, one per frame.
     shots : sequence of int
-        How many of them belong to each shot, if to several. The mean is then that of the shots' means.
-
-    Returns
-    -------
-    Statistic
-
-    Raises
-    ------
-    ValueError
-        If there are no values.
+        Number of values of each shot, if there are several shots.
     """
     if len(values) == 0:
         raise ValueError("values must hold at least one frame, is empty")
     data = np.asarray(values, np.float64)
-    return Statistic(
-        mean_over_shots(data, shots),
-        float(data.min()),
-        float(data.max()),
-        *bootstrap_interval(data, shots=shots),
-        tuple(float(v) for v in data),
-        tuple(shots),
-    )
+    low, high = bootstrap_interval(data, shots=shots)
+    mean, frames = mean_over_shots(data, shots), tuple(float(v) for v in data)
+    return Statistic(mean, float(data.min()), float(data.max()), low, high, frames, tuple(shots))
 
 
 def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
-    """Put the results of several shots together: the methods that none of them lacks, points of sweeps left out.
+    """Join the results of several shots: methods measured on all of them, without points of sweeps.
 
-    Parameters
-    ----------
-    comparisons : sequence of Comparison
-        Of the shots.
-
-    Returns
-    -------
-    list of MethodResult
-        Figures are means over shots, their intervals over frames and shots. Costs are means too (that of memory the
-        maximum), since shots call for different stages; worth is the geometric mean.
+    Measures are means over shots, with intervals over shots and frames. Times are means too (shots need different
+    stages), memory is the maximum, worth the geometric mean.
     """
     tables = [{r.name: r for r in c.results if r.absent_reason is None and not r.sweep} for c in comparisons]
-    joined = []
-    for name, first in tables[0].items() if tables else ():
-        each = [table[name] for table in tables if name in table]
-        if len(each) < len(tables):
-            continue
-        metrics = {}
-        for key in first.metrics:
-            parts = [r.metrics[key].values for r in each if key in r.metrics]
-            if len(parts) == len(each) and all(parts):
-                metrics[key] = summarize([v for part in parts for v in part], [len(part) for part in parts])
-        seconds = [r.seconds_per_megapixel for r in each if r.seconds_per_megapixel is not None]
-        cpu = [r.cpu_seconds_per_megapixel for r in each if r.cpu_seconds_per_megapixel is not None]
-        worths = [r.worth for r in each if r.worth is not None]
-        joined.append(
-            replace(
-                first,
-                settings={},
-                seconds_per_megapixel=float(np.mean(seconds)) if len(seconds) == len(each) else None,
-                spread=None,
-                cpu_seconds_per_megapixel=float(np.mean(cpu)) if len(cpu) == len(each) else None,
-                peak_bytes=max((r.peak_bytes for r in each if r.peak_bytes is not None), default=None),
-                metrics=metrics,
-                worth=math.exp(float(np.mean(np.log(worths)))) if len(worths) == len(each) else None,
-            )
-        )
-    return joined
+    common = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
+    return [_join_method([table[name] for table in tables]) for name in common]
+
+
+def _join_method(results: Sequence[MethodResult]) -> MethodResult:
+    """One result from those of one method on several shots."""
+    metrics = {}
+    for key in results[0].metrics:
+        values = [r.metrics[key].values for r in results if key in r.metrics]
+        if len(values) == len(results) and all(values):
+            metrics[key] = summarize([v for part in values for v in part], [len(part) for part in values])
+    log_worth = _mean_of_all([None if r.worth is None else math.log(r.worth) for r in results])
+    return replace(
+        results[0],
+        settings={},
+        seconds_per_megapixel=_mean_of_all([r.seconds_per_megapixel for r in results]),
+        spread=None,
+        cpu_seconds_per_megapixel=_mean_of_all([r.cpu_seconds_per_megapixel for r in results]),
+        peak_bytes=max((r.peak_bytes for r in results if r.peak_bytes is not None), default=None),
+        metrics=metrics,
+        worth=None if log_worth is None else math.exp(log_worth),
+    )
+
+
+def _mean_of_all(values: Sequence[float | None]) -> float | None:
+    """The mean; None if one of the values is unknown."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
-    """Name the best method by a measure, and those that cannot be told from it.
+    """Name the best method by a measure, and the methods that tie with it.
 
     Parameters
     ----------
     results : sequence of MethodResult
-        In any order.
     metric : Metric
-        The measure.
 
     Returns
     -------
     best : str, optional
-        The best mean's; None where no method has one.
+        None where no method has a mean.
     ties : set of str
-        Those whose difference to it is a tie.
-
-    Notes
-    -----
-    Two methods tie where the bootstrap interval of their differences frame by frame contains 0; where the
-    values of the frames are not known, where the intervals of the means overlap.
+        Methods tie where the bootstrap interval of their differences, frame by frame, contains 0; without values of
+        the frames, where the intervals of the means overlap.
     """
     rated = {r.name: r.metrics[metric.key] for r in results if metric.key in r.metrics}
     rated = {name: s for name, s in rated.items() if not math.isnan(s.mean)}
@@ -255,20 +192,15 @@ def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str 
 
 
 def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
-    """Name the methods that no other beats at the same cost or less, by rising cost.
+    """Name the methods that no other method beats at the same cost or less, by rising cost.
 
     Parameters
     ----------
     results : sequence of MethodResult
-        Those whose cost is not known, or whose measure is not finite, are left out.
+        Methods of unknown cost or with a mean that is not finite are excluded.
     metric : Metric
-        The measure.
     cost : str
         One of `COSTS`.
-
-    Returns
-    -------
-    list of str
     """
     points = [
         (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
@@ -288,61 +220,55 @@ def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) ->
 
 @dataclass(frozen=True)
 class StageValue:
-    """What one stage changes: figures with it minus figures without it."""
+    """Effect of one stage: measures with the stage minus measures without it."""
 
     stage: str
     base: str
     on: bool  # in the plan
-    gains: Mapping[str, float]  # of PSNR and temporal PSNR
-    told: tuple[str, ...]  # those whose change is no tie
+    gains: Mapping[str, float]  # by the keys of `MARKDOWN_METRICS`
+    significant: tuple[str, ...]  # keys of the gains that are no tie
     seconds: float | None
     cpu_seconds: float | None
 
 
 def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
-    """Find what each stage buys and costs.
-
-    Parameters
-    ----------
-    results : sequence of MethodResult
-        With the points of a sweep named "Stages".
-
-    Returns
-    -------
-    list of StageValue
-        Empty without such a sweep.
-    """
+    """Compute the effect of each stage from the points of the sweep "Stages"."""
     by_name = {r.name: r for r in results if r.absent_reason is None}
     values = []
     for variant in by_name.values():
         base = by_name.get(variant.base)
-        if variant.sweep != "Stages" or base is None:
-            continue
-        ((stage, state),) = variant.settings.items()
-        ways = (base, variant) if state == "off" else (variant, base)
-        gains, told = {}, []
-        for m in METRICS:
-            if m.key in MARKDOWN_METRICS and m.key in base.metrics and m.key in variant.metrics:
-                gains[m.key] = ways[0].metrics[m.key].mean - ways[1].metrics[m.key].mean
-                if not _tied(ways[0].metrics[m.key], ways[1].metrics[m.key]):
-                    told.append(m.key)
-        seconds, cpu = (
-            None if ends[0] is None or ends[1] is None else ends[0] - ends[1]
-            for ends in (
-                [way.seconds_per_megapixel for way in ways],
-                [way.cpu_seconds_per_megapixel for way in ways],
-            )
-        )
-        values.append(StageValue(stage, base.label, state == "off", gains, tuple(told), seconds, cpu))
+        if variant.sweep == "Stages" and base is not None:
+            ((stage, state),) = variant.settings.items()
+            on = state == "off"  # the sweep inverts the plan
+            values.append(_stage_value(str(stage), base.name, on, (base, variant) if on else (variant, base)))
     return values
 
 
+def _stage_value(stage: str, base: str, on: bool, pair: tuple[MethodResult, MethodResult]) -> StageValue:
+    """The effect of a stage from the results (with, without) it."""
+    having, lacking = pair
+    gains, significant = {}, []
+    for key in MARKDOWN_METRICS:
+        if key in having.metrics and key in lacking.metrics:
+            gains[key] = having.metrics[key].mean - lacking.metrics[key].mean
+            if not _tied(having.metrics[key], lacking.metrics[key]):
+                significant.append(key)
+    seconds = _difference(having.seconds_per_megapixel, lacking.seconds_per_megapixel)
+    cpu = _difference(having.cpu_seconds_per_megapixel, lacking.cpu_seconds_per_megapixel)
+    return StageValue(stage, base, on, gains, tuple(significant), seconds, cpu)
+
+
+def _difference(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b
+
+
 def _goodness(value: float, metric: Metric) -> float:
-    """A figure that is larger where the method is better."""
+    """A number that is larger where the method is better."""
     return {"higher": value, "lower": -value, "zero": -abs(value)}[metric.better]
 
 
 def _tied(a: Statistic, b: Statistic) -> bool:
+    """Whether the difference of two statistics is not significant."""
     if a.values and len(a.values) == len(b.values) and a.shots == b.shots:
         with np.errstate(invalid="ignore"):  # two perfect scores: inf − inf
             difference = np.subtract(a.values, b.values)
@@ -357,26 +283,23 @@ def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) 
     Parameters
     ----------
     results : sequence of MethodResult
-        In any order.
     metrics : sequence of Metric
-        Those to look for.
-
-    Returns
-    -------
-    list of Metric
     """
     return [m for m in metrics if any(m.key in r.metrics for r in results)]
 
 
 def settings_as_text(result: MethodResult) -> dict[str, str]:
-    """Print the settings for people: floats with four significant digits."""
+    """Format the settings for people: floats with four significant digits."""
     return {
         str(k).replace("_", " "): f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in result.settings.items()
     }
 
 
+# JSON
+
+
 def to_document(comparison: Comparison) -> dict[str, object]:
-    """All that a comparison holds, and what follows from it, as plain dicts: what ``results.json`` is."""
+    """Return the content of ``results.json`` as plain dicts: the comparison, its fronts, the effect of stages."""
     results, metrics = comparison.results, present_metrics(comparison.results, METRICS)
     return {
         "shot": comparison.shot,
@@ -389,15 +312,15 @@ def to_document(comparison: Comparison) -> dict[str, object]:
 
 
 def _plain(result: MethodResult) -> dict[str, object]:
-    """A result as plain dicts, settings as text: what they hold is the caller's business."""
-    # asdict copies mappings by their own type, which a MappingProxy does not survive.
+    """A result as plain dicts, its settings (objects of any kind) as text."""
+    # asdict copies mappings by their own type, which fails for MappingProxyType.
     metrics = {k: asdict(v) for k, v in result.metrics.items()}
-    values = {name: getattr(result, name) for name in result.__dataclass_fields__}
+    values = {f.name: getattr(result, f.name) for f in fields(result)}
     return {**values, "settings": settings_as_text(result), "metrics": metrics}
 
 
 def to_plain_numbers(value: object) -> object:
-    """What JSON can hold: NumPy's numbers as Python's, those that are not finite as text that ``float`` reads."""
+    """Convert to types of JSON: NumPy numbers to Python's, numbers that are not finite to strings."""
     if isinstance(value, Mapping):
         return {str(k): to_plain_numbers(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -410,25 +333,20 @@ def to_plain_numbers(value: object) -> object:
 
 
 def to_json(document: object, indent: int | None = None) -> str:
-    """Write JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both read.
+    """Write JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both parse.
 
     Parameters
     ----------
     document : object
-        Dicts, lists, text and numbers.
+        Dicts, lists, strings and numbers.
     indent : int, optional
-        Spaces of a level; all on one line without.
-
-    Returns
-    -------
-    str
-        JSON.
+        Spaces per level; default: all on one line.
     """
     return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def is_comparison(path: Path) -> bool:
-    """Whether a file is there that `read_comparison` can read."""
+    """Whether `read_comparison` can read the file."""
     try:
         read_comparison(path)
     except (OSError, ValueError):
@@ -437,47 +355,50 @@ def is_comparison(path: Path) -> bool:
 
 
 def read_comparison(path: Path) -> Comparison:
-    """Read the ``results.json`` that `hybrid.comparison.report.write_report` has left.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Comparison
-        Settings as text.
+    """Read a ``results.json``; settings are text.
 
     Raises
     ------
     ValueError
-        If it is no such file.
+        If the file holds anything else.
     """
     text = path.read_text(encoding="utf-8")
     try:
         document = json.loads(text)
-        results = []
-        for entry in document["results"]:
-            statistics = {}
-            for key, s in entry["metrics"].items():
-                mean, minimum, maximum, low, high = (
-                    float(s[end]) for end in ("mean", "minimum", "maximum", "low", "high")
-                )
-                values = tuple(map(float, s["values"]))
-                statistics[key] = Statistic(mean, minimum, maximum, low, high, values, tuple(s["shots"]))
-            fastest, slowest = map(float, entry["spread"] or (0, 0))
-            spread = None if entry["spread"] is None else (fastest, slowest)
-            numbers: dict[str, Callable[[Any], float]] = {"peak_bytes": int, "worth": float}
-            numbers |= dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel"), float)
-            kept: dict[str, Any] = {
-                name: None if entry[name] is None else kind(entry[name]) for name, kind in numbers.items()
-            }
-            kept |= {name: str(entry[name]) for name in ("name", "label", "family", "sweep", "base")}
-            kept |= {"settings": dict(entry["settings"]), "metrics": statistics, "spread": spread}
-            results.append(MethodResult(**{**entry, **kept}))
+        results = tuple(_read_result(entry) for entry in document["results"])
         facts = {str(name): str(value) for name, value in document["facts"].items()}
-        return Comparison(str(document["shot"]), tuple(results), facts)
+        return Comparison(str(document["shot"]), results, facts)
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise ValueError(f"{path} is no result of a comparison: {words}") from None
+
+
+def _read_result(entry: Mapping[str, Any]) -> MethodResult:
+    """The inverse of `_plain`."""
+
+    def optional(name: str, convert: Callable[[Any], Any]) -> Any:
+        return None if entry[name] is None else convert(entry[name])
+
+    def pair(values: Sequence[Any]) -> tuple[float, float]:
+        low, high = map(float, values)
+        return low, high
+
+    return MethodResult(
+        name=str(entry["name"]),
+        settings=dict(entry["settings"]),
+        family=str(entry["family"]),
+        sweep=str(entry["sweep"]),
+        base=str(entry["base"]),
+        seconds_per_megapixel=optional("seconds_per_megapixel", float),
+        spread=optional("spread", pair),
+        cpu_seconds_per_megapixel=optional("cpu_seconds_per_megapixel", float),
+        peak_bytes=optional("peak_bytes", int),
+        metrics={key: _read_statistic(statistic) for key, statistic in entry["metrics"].items()},
+        worth=optional("worth", float),
+        absent_reason=optional("absent_reason", str),
+    )
+
+
+def _read_statistic(entry: Mapping[str, Any]) -> Statistic:
+    numbers = {name: float(entry[name]) for name in ("mean", "minimum", "maximum", "low", "high")}
+    return Statistic(**numbers, values=tuple(map(float, entry["values"])), shots=tuple(entry["shots"]))

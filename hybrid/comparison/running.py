@@ -1,41 +1,37 @@
-"""Methods run over a shot, in turns, each in a process of its own, so that its peak memory is its own."""
+"""Timed runs of methods over a shot, in turns, each in a process of its own for a peak memory of its own."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, ParamSpec, Self, TypeVar, cast
+from typing import Any, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frame import Frame, MappedShot
-from hybrid.files.shots import Shot
+from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import peak_memory, start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
 
-Progress = Callable[[str, int, int], None]  # what is being done, steps done, steps in all
+OnStep = Callable[[str, int, int], None]  # description of the step, steps done, steps in total
 P = ParamSpec("P")
 T = TypeVar("T")
 
-#: A method whose runs have taken so long together is not run again, seconds: what meets a short run by chance is
-#: spread over a long one.
+#: Seconds in total after which a method is not run again: disturbances average out within a long run.
 ENOUGH = 5.0
-# Pixels on a side of what methods warm up with: frames of shots for tests are warmed up with as a whole, and of one of
-# 1920×1080 it is a fourteenth.
+# Pixels per side of the warm-up crop: covers the whole frame of test shots, and a fourteenth of 1920×1080.
 WARM_UP = 384
 
 
 @dataclass(frozen=True)
-class Run:
-    """What a method has cost: its frames together, seconds without the reading of files, peak bytes."""
+class RunCost:
+    """Cost of one run over all frames; seconds exclude reading of files."""
 
     megapixels: float
     seconds: float
@@ -45,7 +41,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Seconds:
-    """Seconds per megapixel of a method's runs: median, least and most by the wall clock, and the median CPU time."""
+    """Seconds per megapixel over runs: median, least and most wall time, and median CPU time."""
 
     median: float
     least: float
@@ -53,35 +49,23 @@ class Seconds:
     cpu: float
 
 
-def run_apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a module's function in a fresh process.
+def run_in_process(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a module-level function in a fresh process; BrokenProcessPool if the process dies.
 
     The process is not forked from this one, whose peak memory Linux would count as its own.
 
     Parameters
     ----------
     function : callable
-        Of a module, so that it can travel.
     *args, **kwargs : object
-        Its own.
-
-    Returns
-    -------
-    object
-        What it returns.
-
-    Raises
-    ------
-    BrokenProcessPool
-        If the process dies.
     """
-    let_waiting_threads_sleep()  # the libraries read it when the forked process first uses them
+    let_waiting_threads_sleep()  # libraries read the setting when the new process first uses them
     with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=reuse_freed_memory) as pool:
         return pool.submit(function, *args, **kwargs).result()
 
 
 class _Clock:
-    """Adds up the wall and the CPU seconds of ``with`` blocks."""
+    """Accumulates the wall and the CPU seconds of ``with`` blocks."""
 
     def __init__(self) -> None:
         self.seconds = self.cpu_seconds = 0.0
@@ -96,26 +80,22 @@ class _Clock:
         self.cpu_seconds += time.process_time() - cpu
 
 
-@contextmanager
-def _clock_reading(shot: Shot) -> Iterator[_Clock]:
-    """Count the time that `shot.read` takes, whoever calls it."""
-    owner: Any = getattr(shot, "reader", shot)  # frames in memory have no reader
-    clock = _Clock()
-    read: Callable[[int], Frame] = owner.read
+class _TimedFrames:
+    """The frames of a shot; `clock` accumulates the time of reading."""
 
-    def clocked(number: int) -> Frame:
-        with clock:
-            return read(number)
+    def __init__(self, shot: Frames) -> None:
+        self.numbers, self.step, self.shape, self.has = shot.numbers, shot.step, shot.shape, shot.has
+        self.clock = _Clock()
+        self._shot = shot
 
-    owner.read = clocked
-    try:
-        yield clock
-    finally:
-        del owner.read
+    def read(self, number: int) -> Frame:
+        """A frame of the shot."""
+        with self.clock:
+            return self._shot.read(number)
 
 
-def _middle_of(shot: Shot) -> Shot:
-    """The middle of every frame, at most `WARM_UP` pixels on a side, as a shot for a method to warm up with."""
+def _middle_of(shot: Frames) -> MappedShot:
+    """The middle of every frame, at most `WARM_UP` pixels per side, for the warm-up of a method."""
     height, width = (min(size, WARM_UP) for size in shot.shape)
 
     def cut(frame: Frame) -> Frame:
@@ -131,108 +111,102 @@ def _middle_of(shot: Shot) -> Shot:
         cuts |= {name: {key: part(a) for key, a in getattr(frame, name).items()} for name in ("aovs", "pass_colors")}
         return replace(frame, **cuts, resolution=frame.resolution or whole)
 
-    return cast("Shot", MappedShot(shot, cut, shape=(height, width)))  # of a shot methods ask for frames alone
+    return MappedShot(shot, cut, shape=(height, width))
 
 
-def run_method(method: Method, shot: Shot, name: str = "", store: FrameStore | None = None) -> Run:
+def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore | None = None) -> RunCost:
     """Run a method over a shot in this process.
 
-    The middle of the first frame is made before the clock starts: compilation and weights are paid for there.
+    A crop of the first frame is denoised before the clock starts, which excludes compilation and loading of weights.
 
     Parameters
     ----------
     method : Method
-        What to run.
-    shot : Shot
-        What to denoise.
+    shot : Frames
+        The noisy shot.
     name : str
-        Of the method, for the store.
+        Name of the method in the store.
     store : FrameStore, optional
-        Where its frames are kept.
-
-    Returns
-    -------
-    Run
-        What it has cost.
+        Receives the frames.
     """
     if method.threads:
         limit_threads(method.threads)
     next(method.run(_middle_of(shot)), None)
-    clock, pixels = _Clock(), 0
-    with _clock_reading(shot) as reading:
-        frames = method.run(shot)
-        while True:
-            with clock:
-                done = next(frames, None)
-            if done is None:
-                break
-            number, image = done
-            pixels += image.shape[0] * image.shape[1]
-            if store is not None:
-                store.save(name, number, image)
-    return Run(pixels / 1e6, clock.seconds - reading.seconds, clock.cpu_seconds - reading.cpu_seconds, peak_memory())
+    clock, pixels, timed = _Clock(), 0, _TimedFrames(shot)
+    frames = method.run(timed)
+    while True:
+        with clock:
+            done = next(frames, None)
+        if done is None:
+            break
+        number, image = done
+        pixels += image.shape[0] * image.shape[1]
+        if store is not None:
+            store.save(name, number, image)
+    seconds, cpu_seconds = clock.seconds - timed.clock.seconds, clock.cpu_seconds - timed.clock.cpu_seconds
+    return RunCost(pixels / 1e6, seconds, cpu_seconds, peak_memory())
+
+
+@dataclass(frozen=True)
+class TimedRuns:
+    """Runs of each method that ran, round by round, and the reasons why the others are absent."""
+
+    runs: Mapping[str, Sequence[RunCost]]
+    absent: Mapping[str, str]
 
 
 def time_methods(
     methods: Mapping[str, Method],
-    shot: Shot,
+    shot: Frames,
     rounds: int,
     store: FrameStore | None = None,
-    progress: Progress | None = None,
-) -> tuple[dict[str, list[Run]], dict[str, str]]:
-    """Run the methods in turns, so that whatever else the machine does meets all of them.
+    on_step: OnStep | None = None,
+) -> TimedRuns:
+    """Run the methods in turns, so that other load of the machine affects all of them.
 
     Parameters
     ----------
     methods : mapping of str to Method
-        By name.
-    shot : Shot
-        What to denoise.
+    shot : Frames
+        The noisy shot.
     rounds : int
-        How often each method runs; fewer times once its runs have taken `ENOUGH`.
+        Runs of each method; fewer once the runs have taken `ENOUGH` seconds.
     store : FrameStore, optional
-        Where the frames of the first round are kept.
-    progress : callable, optional
-        Is told what is being done.
-
-    Returns
-    -------
-    runs : dict of str to list of Run
-        Those of each method, a round after the other.
-    absent : dict of str to str
-        Why the others have none.
+        Receives the frames of the first round.
+    on_step : callable, optional
+        Called before each run.
     """
-    runs: dict[str, list[Run]] = {}
+    runs: dict[str, list[RunCost]] = {}
     absent: dict[str, str] = {}
     names = list(methods)
     for turn in range(rounds):
-        # Each round starts elsewhere, so that no method always follows the same one.
+        # Each round starts at another method, so that no method always follows the same one.
         start = turn * len(names) // rounds
         for done, name in enumerate(names[start:] + names[:start]):
-            if progress is not None:
-                progress(f"run {name}", turn * len(names) + done, rounds * len(names))
-            if name in absent or (turn and not methods[name].timed):
+            if on_step is not None:
+                on_step(f"run {name}", turn * len(names) + done, rounds * len(names))
+            if name in absent or (turn and methods[name].cost != "measured"):
                 continue
             if sum(run.seconds for run in runs.get(name, [])) >= ENOUGH:
                 continue
             try:
-                run = run_apart(run_method, methods[name], shot, name, None if turn else store)
+                run = run_in_process(run_method, methods[name], shot, name, None if turn else store)
             except ImportError as error:
                 absent[name] = str(error)
             except BrokenProcessPool:
-                absent[name] = "its process died, out of memory perhaps"
+                absent[name] = "its process died, possibly out of memory"
             else:
                 runs.setdefault(name, []).append(run)
-    return {name: runs[name] for name in names if name in runs and name not in absent}, absent
+    return TimedRuns({name: runs[name] for name in names if name in runs and name not in absent}, absent)
 
 
-def summarize_runs(runs: Sequence[Run]) -> Seconds:
+def summarize_runs(runs: Sequence[RunCost]) -> Seconds:
     """Reduce the runs of a method to seconds per megapixel.
 
     Notes
     -----
-    The median alone. Dividing out the load of a round (as all methods felt it), or of a run (by a fixed piece of work
-    between its frames), made ratios repeat no better on a machine under eight times its load: that changes
+    The median alone. Normalizing by the load of a round (measured over all methods), or of a run (by a fixed piece of
+    work between its frames), made ratios no more repeatable on a machine under eight times its load, which changes
     within seconds. More rounds do help.
     """
     wall = np.array([run.seconds / run.megapixels for run in runs])

@@ -1,4 +1,4 @@
-"""How many samples per pixel a denoiser is worth: the error of the noisy render against its samples."""
+"""The worth of a denoiser in samples per pixel: error of the noisy render against its number of samples."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from hybrid.files.shots import Shot
 
 
 def decibels(error: float | np.floating) -> str:
-    """PSNR of a mean squared error, in words; ∞ where it is zero, or less as an unbiased estimate may be."""
+    """Format a mean squared error as PSNR; ∞ for zero, and for negative unbiased estimates."""
     return f"{-10 * math.log10(error):.2f} dB" if error > 0 else "∞ dB"
 
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Mean squared error of the noisy render, measured at some numbers of samples, and the law between and beyond.
+    """Mean squared error of the noisy render as a function of its samples.
 
     Attributes
     ----------
     levels : tuple of (float, float)
-        (samples, error) pairs by rising samples; the first samples need not be the shot's own.
+        Measured (samples, error) by rising samples.
     samples : float
-        Those of the shot that was denoised.
+        Samples per pixel of the shot that was denoised.
     floor : float
-        The reference's own part in every measured error, taken off by `worth`; 0 where halves did that.
+        Contribution of the reference's noise to every measured error; 0 where halves have removed it.
     """
 
     levels: tuple[tuple[float, float], ...]
@@ -38,7 +38,7 @@ class NoiseLaw:
 
     @property
     def slope(self) -> float | None:
-        """Power with which the error, without the floor, goes with the samples: −1 by the law; None for one level."""
+        """Exponent of the error, without the floor, in the samples: −1 by theory; None for one level."""
         known = [(math.log(n), math.log(e - self.floor)) for n, e in self.levels if e > self.floor]
         if len(known) < 2:
             return None
@@ -46,10 +46,10 @@ class NoiseLaw:
         return float(np.polyfit(x, y, 1)[0])
 
     def worth(self, error: float) -> float:
-        """Times the shot's samples at which the noisy render would have this mean squared error.
+        """Factor on the shot's samples at which the noisy render would have this mean squared error.
 
-        Between measured levels on a straight line of the logarithms, beyond them by 1/n. Infinite where the
-        error cannot be told from the reference's noise; NaN where the noisy render has no error to compare with.
+        Interpolated linearly in the logarithms between levels, extrapolated by 1/n. Infinite where the error is within
+        the reference's noise; NaN where the noisy render has no error.
         """
         known = [(n, e - self.floor) for n, e in self.levels if e > self.floor]
         rest = error - self.floor
@@ -65,49 +65,36 @@ class NoiseLaw:
         return n * e / rest / self.samples
 
     def describe(self) -> str:
-        """Say in words where the figures come from, and whether the law holds."""
+        """Describe the measured levels, and whether the error follows 1/n."""
         measured = ", ".join(f"{n:g}: {decibels(e)}" for n, e in self.levels)
         if self.slope is None:
-            return "By the 1/n law from the noisy render's own error; not checked, no other level was given."
-        verdict = "as 1/n asks" if abs(self.slope + 1) < 0.1 else "not as 1/n, which is assumed beyond them"
+            return "By the 1/n law from the error of the noisy render; not verified, no other level was given."
+        verdict = "close to 1/n" if abs(self.slope + 1) < 0.1 else "not as 1/n, which is assumed beyond the levels"
         return (
             f"Measured at these samples per pixel: {measured}. The error goes as n^{self.slope:.2f}, {verdict}. "
-            "Between the levels interpolated, beyond them by 1/n."
+            "Interpolated between the levels, extrapolated by 1/n."
         ).replace("n^-", "n^−")
 
 
 def reference_floor(error: float, samples: float, reference_samples: float) -> float:
-    """Find the reference's part in a measured error.
+    """Return the reference's part a/m of a mean squared error a/n + a/m.
 
     Parameters
     ----------
     error : float
-        Measured mean squared error a/n + a/m.
+        a/n + a/m.
     samples : float
-        n, of the render that is judged.
+        n, of the evaluated render.
     reference_samples : float
         m, of the reference.
-
-    Returns
-    -------
-    float
-        a/m.
     """
     return error * samples / (samples + reference_samples)
 
 
 def fit_floor(levels: Sequence[tuple[float, float]]) -> float:
-    """Find what a reference of unknown samples adds to every error.
+    """Fit the constant b ≥ 0 that a reference adds to the errors a/n + b of two or more (n, error).
 
-    Parameters
-    ----------
-    levels : sequence of (float, float)
-        Two or more pairs of samples n and error a/n + b.
-
-    Returns
-    -------
-    float
-        b ≥ 0. Relative residuals are fitted, so that the noisiest level does not decide alone.
+    Relative residuals are minimized, so that the noisiest level does not dominate.
     """
     n, e = np.transpose(np.asarray(levels, np.float64))
     matrix = np.stack([1 / n, np.ones_like(n)], axis=1) / e[:, None]
@@ -116,7 +103,7 @@ def fit_floor(levels: Sequence[tuple[float, float]]) -> float:
 
 
 def samples_of(shot: Shot) -> int | None:
-    """Samples per pixel, where the header of the first frame tells them, as Cycles' does."""
+    """Samples per pixel from the header of the first frame, where Cycles wrote them."""
     for part in read_exr(shot.path(shot.numbers[0]), pixels=False).parts:
         for name, value in part.header.items():
             if name.startswith("cycles.") and name.endswith(".samples") and str(value).isdigit():

@@ -1,4 +1,4 @@
-"""The sweep of a comparison: one setting varied at a time, to see what accuracy costs and which stage buys it."""
+"""Variants of methods for `ravg compare --sweep`: one setting varied at a time."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
-from hybrid.comparison.methods import METHODS, Method
+from hybrid.comparison.methods import METHODS, Classical, Method, Network, Run, WindowSettings
 from hybrid.plan import Plan, Rules
-from hybrid.pseudo_reference import STANDARD, filter_window
+from hybrid.pseudo_reference import STANDARD, ClassicalPreset, filter_window
 
-# What is varied around: the middle of the classical presets, and the network.
+# Methods that are varied: the middle classical preset, and networks.
 CLASSICAL, NETWORK, KERNELS = "standard", "network without OIDN", "tKPCN"
 
 RADII = (0, 1, 2, 3)  # windows of 1, 3, 5 and 7 frames
@@ -26,70 +25,76 @@ THREADS = tuple(n for n in (1, 2, 4, 8, 16) if n <= (os.cpu_count() or 1))
 
 
 def sweep_methods(plan: Plan) -> dict[str, Method]:
-    """Name the variants that are worth comparing on a shot with this plan.
+    """Return the variants for a shot with this plan, by a name that states the varied setting.
 
-    Returns
-    -------
-    dict of str to Method
-        By a name that tells what is varied. Each stage of the plan is switched to what the plan did not choose;
-        the presets are among `METHODS` already.
+    Each stage is switched to the opposite of the plan; the presets are among `METHODS` already.
     """
     return dict([*_stages(plan), *_windows(), *_tvl1(), *_nlm(), *_network(), *_threads()])
 
 
-def _variant(sweep: str, base: str, settings: Mapping[str, object], **options: Any) -> tuple[str, Method]:
-    """The method `base` with other options, by a name that tells the settings."""
+def _variant(sweep: str, base: str, settings: Mapping[str, object], run: Run) -> tuple[str, Method]:
+    """Name and method of a variant of the method `base`."""
     words = " ".join(f"{key} {value}" for key, value in settings.items())
-    method = METHODS[base]
-    run = partial(method.run, **options)
-    return f"{base}, {words}", Method(run, method.family, settings=settings, sweep=sweep, base=base)
+    return f"{base}, {words}", Method(run, METHODS[base].family, settings=settings, sweep=sweep, base=base)
+
+
+def _classical(window: WindowSettings | None = None, preset: ClassicalPreset = STANDARD) -> Classical:
+    """`CLASSICAL` with other settings of its windows or its filters."""
+    return Classical(partial(filter_window, preset=preset), window or WindowSettings())
+
+
+def _network_run(base: str) -> Network:
+    run = METHODS[base].run
+    assert isinstance(run, Network)
+    return run
 
 
 def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
     for decision in plan.decisions:
-        turned = "off" if decision.on else "on"
-        settings, rules = {decision.stage: turned}, Rules(**{turned: frozenset({decision.stage})})
+        inverted = "off" if decision.on else "on"
+        settings, rules = {decision.stage: inverted}, Rules(**{inverted: frozenset({decision.stage})})
         if decision.stage == "dense-flow":
-            if not decision.on:  # there are vectors; without them this is what has to be run
-                yield _variant("Stages", CLASSICAL, settings, vectors=False)
-        elif decision.stage == "skip":  # tiles are the network's
-            yield _variant("Stages", NETWORK, settings, rules=rules)
-        elif decision.stage != "alpha":  # which has no part in the color
-            yield _variant("Stages", CLASSICAL, settings, rules=rules)
+            if not decision.on:  # there are vectors; dense flow replaces them
+                yield _variant("Stages", CLASSICAL, settings, _classical(WindowSettings(vectors=False)))
+        elif decision.stage == "skip":  # a stage of the networks' tiles
+            run = _network_run(NETWORK)
+            yield _variant("Stages", NETWORK, settings, replace(run, window=replace(run.window, rules=rules)))
+        elif decision.stage != "alpha":  # without effect on the color
+            yield _variant("Stages", CLASSICAL, settings, _classical(WindowSettings(rules=rules)))
     without = {"guided filter": replace(STANDARD, guided_radius=0), "NLM": replace(STANDARD, nlm_radius=0)}
     for stage, preset in without.items():
-        yield _variant("Stages", CLASSICAL, {stage: "off"}, denoise=partial(filter_window, preset=preset))
+        yield _variant("Stages", CLASSICAL, {stage: "off"}, _classical(preset=preset))
 
 
 def _windows() -> Iterator[tuple[str, Method]]:
     for radius in RADII:
-        yield _variant("Window", CLASSICAL, {"window": 2 * radius + 1}, radius=radius)
+        yield _variant("Window", CLASSICAL, {"window": 2 * radius + 1}, _classical(WindowSettings(radius=radius)))
 
 
 def _tvl1() -> Iterator[tuple[str, Method]]:
     for scales, warps, iterations in product(SCALES, WARPS, ITERATIONS):
         solver = {"scales": scales, "warps": warps, "iterations": iterations}
-        yield _variant("TV-L1", CLASSICAL, solver, solver=solver)
+        yield _variant("TV-L1", CLASSICAL, solver, _classical(WindowSettings(solver=solver)))
 
 
 def _nlm() -> Iterator[tuple[str, Method]]:
     for radius, patch in product(NLM_RADII, PATCH_RADII):
         preset = replace(STANDARD, nlm_radius=radius, nlm_patch_radius=patch)
-        settings = {"radius": radius, "patch": patch}
-        yield _variant("NLM", CLASSICAL, settings, denoise=partial(filter_window, preset=preset))
+        yield _variant("NLM", CLASSICAL, {"radius": radius, "patch": patch}, _classical(preset=preset))
 
 
 def _network() -> Iterator[tuple[str, Method]]:
-    for sweep, base, option, values in (
-        ("Kernel threshold", KERNELS, "threshold", THRESHOLDS),
-        ("Precision", NETWORK, "precision", PRECISIONS),
-        ("Tile", NETWORK, "tile", TILES),
-    ):
-        for value in values:
-            yield _variant(sweep, base, {option: value}, **{option: value})
+    for threshold in THRESHOLDS:
+        run = replace(_network_run(KERNELS), threshold=threshold)
+        yield _variant("Kernel threshold", KERNELS, {"threshold": threshold}, run)
+    for precision in PRECISIONS:
+        run = replace(_network_run(NETWORK), precision=precision)
+        yield _variant("Precision", NETWORK, {"precision": precision}, run)
+    for tile in TILES:
+        yield _variant("Tile", NETWORK, {"tile": tile}, replace(_network_run(NETWORK), tile=tile))
 
 
 def _threads() -> Iterator[tuple[str, Method]]:
     for base, threads in product((CLASSICAL, NETWORK), THREADS):
-        name, method = _variant("Threads", base, {"threads": threads})
+        name, method = _variant("Threads", base, {"threads": threads}, METHODS[base].run)
         yield name, replace(method, threads=threads)

@@ -1,7 +1,6 @@
-"""Templates, style and scripts of the page that a comparison leaves.
+"""Templates, style and scripts of the report's page.
 
-Jinja2 fills the templates and escapes whatever a name may hold. The page is one file: its style sheet and its scripts
-are put into it.
+Jinja2 fills the templates and escapes names. Style sheet and scripts are put into the page, which is one file.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from importlib.resources import files
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from hybrid import player
 from hybrid.comparison.results import settings_as_text
 from hybrid.comparison.tables import (
     column_title,
@@ -21,9 +21,8 @@ from hybrid.comparison.tables import (
     format_worth,
 )
 
-# In this order they are one module script: each file is named after the part of the page that it runs.
-SCRIPTS = ("dom.js", "chart.js", "pictures.js", "painter.js", "stage.js", "slices.js", "viewer.js", "controls.js",
-           "loops.js", "start.js")  # fmt: skip
+# In this order, after the player, they are one module script; each file is named after its part of the page.
+SCRIPTS = ("figures.js", "chart.js", "pictures.js", "painter.js", "slices.js", "viewer.js", "animations.js", "start.js")
 
 _templates = Environment(
     loader=PackageLoader("hybrid.comparison", "page"),
@@ -32,7 +31,7 @@ _templates = Environment(
     lstrip_blocks=True,
     undefined=StrictUndefined,
 )
-_templates.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # keys stay in their order
+_templates.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # without sorting keys
 _templates.filters |= {
     "column_title": column_title,
     "value": format_value,
@@ -41,28 +40,18 @@ _templates.filters |= {
     "bytes": format_bytes,
     "worth": format_worth,
     "settings": settings_as_text,
-    "px": lambda length: f"{length:.1f}",
 }
 
 
 def render(template: str, **values: object) -> Markup:
-    """Fill a template of this folder.
+    """Fill a template of this folder; a value that is missing raises `jinja2.UndefinedError`.
 
     Parameters
     ----------
     template : str
-        The name of its file.
+        Name of the file.
     **values : object
-        What it asks for, by name. Text is escaped unless it is `markupsafe.Markup`.
-
-    Returns
-    -------
-    Markup
-
-    Raises
-    ------
-    jinja2.UndefinedError
-        If it asks for something that is not given.
+        Text is escaped unless it is `markupsafe.Markup`.
     """
     return Markup(_templates.get_template(template).render(values))
 
@@ -74,9 +63,9 @@ def style() -> Markup:
 
 def script() -> Markup:
     """Return the page's scripts as the text of one module script."""
-    return Markup("\n").join(_source(name) for name in SCRIPTS)
+    return Markup("\n").join([Markup(player.script()), *map(_source, SCRIPTS)])
 
 
 def _source(name: str) -> Markup:
-    """A file of ours as it is: it holds no names."""
+    """A file of ours, not escaped: it holds no names."""
     return Markup((files(__name__) / name).read_text(encoding="utf-8"))

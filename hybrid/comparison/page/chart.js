@@ -1,10 +1,11 @@
-// The chart: axes and families are chosen; points tell their figures, and send their method to the viewer.
+// The charts: axes and families are chosen; points show their figures, and send their method to the viewer.
+// Groups of chart i are named chart{i}-point-{j}, -bar-{j} and -name-{j} for result j, and chart{i}-series-{f}.
 
 function startChart(viewer) {
   if (!find("plots")) return;
-  for (const point of document.querySelectorAll(".point")) listenToPoint(point, viewer);
+  for (const point of document.querySelectorAll('.plot [id*="-point-"]')) listenToPoint(point, viewer);
   for (const box of document.querySelectorAll(".legend input")) {
-    box.addEventListener("change", () => showFamily(box.dataset.family, box.checked));
+    box.addEventListener("change", () => showFamily(Number(box.dataset.family), box.dataset.name, box.checked));
   }
   find("axis-up").addEventListener("change", chooseAxes);
   find("axis-over").addEventListener("change", chooseAxes);
@@ -18,10 +19,16 @@ function chooseAxes() {
   takeTabStop();
 }
 
-function showFamily(family, visible) {
-  for (const mark of document.querySelectorAll(`.plot [data-family="${Number(family)}"]`)) {
-    mark.classList.toggle("off", !visible);
+// The result of a point, bar or name.
+function resultOf(element) {
+  return report.results[Number(element.id.split("-").at(-1))];
+}
+
+function showFamily(family, name, visible) {
+  for (const mark of document.querySelectorAll('.plot :is([id*="-point-"], [id*="-bar-"], [id*="-name-"])')) {
+    if (resultOf(mark).family === name) mark.classList.toggle("off", !visible);
   }
+  for (const line of document.querySelectorAll(`.plot [id$="-series-${family}"]`)) line.classList.toggle("off", !visible);
   takeTabStop();
 }
 
@@ -31,17 +38,19 @@ function shownPlot() {
 
 // The visible points from left to right.
 function visiblePoints() {
-  const left = (point) => Number(point.getAttribute("transform").match(/-?[\d.]+/)[0]);
-  return [...shownPlot().querySelectorAll(".point:not(.off)")].sort((a, b) => left(a) - left(b));
+  const left = (point) => point.getBoundingClientRect().left;
+  return [...shownPlot().querySelectorAll('[id*="-point-"]:not(.off)')].sort((a, b) => left(a) - left(b));
 }
 
 // One point at a time is in the order of the Tab key; the arrows go from one to the next.
 function takeTabStop(point = visiblePoints()[0]) {
-  for (const each of shownPlot().querySelectorAll(".point")) each.setAttribute("tabindex", each === point ? 0 : -1);
+  for (const each of shownPlot().querySelectorAll('[id*="-point-"]')) each.setAttribute("tabindex", each === point ? 0 : -1);
 }
 
 function listenToPoint(point, viewer) {
-  const choose = () => viewer?.choose(point.dataset.name);
+  const { name, seconds_per_megapixel: seconds } = resultOf(point), choose = () => viewer?.choose(name);
+  point.setAttribute("role", "button");
+  point.setAttribute("aria-label", `${name}: ${meanText(name, report.chart[0])}, ${secondsText(seconds)} per megapixel`);
   point.addEventListener("pointerenter", () => showTip(point, viewer));
   point.addEventListener("pointerleave", hideTip);
   point.addEventListener("focus", () => { takeTabStop(point); showTip(point, viewer); });
@@ -57,7 +66,7 @@ function listenToPoint(point, viewer) {
   });
 }
 
-// The point that a key leads to; none for keys that lead nowhere.
+// The point that a key leads to, if any.
 function neighbourByKey(point, key) {
   const all = visiblePoints(), last = all.length - 1;
   const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[key];
@@ -69,9 +78,9 @@ function hideTip() {
 }
 
 function showTip(point, viewer) {
-  const tip = find("tip"), result = results.get(point.dataset.name);
+  const tip = find("tip"), result = resultOf(point);
   tip.dataset.name = result.name;
-  tip.replaceChildren(make("strong", result.label), tipList(result));
+  tip.replaceChildren(make("strong", result.name), tipList(result));
   if (viewer?.has(result.name)) {
     tip.append(make("p", "Click or Enter: show it in the viewer, on the right."));
     viewer.thumbnail(result.name).then((canvas) => {
@@ -82,7 +91,7 @@ function showTip(point, viewer) {
   placeTip(tip, point);
 }
 
-// What a method has reached and cost, and its settings.
+// Accuracy, cost and settings of a method.
 function tipList(result) {
   const list = make("dl");
   const row = (term, value) => list.append(make("dt", term), make("dd", value));
@@ -98,10 +107,9 @@ function tipList(result) {
   return list;
 }
 
-// Beside the point, on the side where there is room.
+// Next to the point, on the side where there is space.
 function placeTip(tip, point) {
-  const box = find("plots").getBoundingClientRect();
-  const at = point.querySelector("polygon").getBoundingClientRect();
+  const box = find("plots").getBoundingClientRect(), at = point.getBoundingClientRect();
   const x = at.left + at.width / 2 - box.left, y = at.top + at.height / 2 - box.top;
   const left = x + 20 + tip.offsetWidth < box.width ? x + 20 : x - 20 - tip.offsetWidth;
   tip.style.left = Math.max(0, left) + "px";

@@ -26,11 +26,24 @@ function scaleOfView(view) {
   return view === "error" || /flip|error/i.test(view) ? MAGMA : VIRIDIS;
 }
 
+// A source of the player.
 class Painter {
-  constructor(pictures, ev) {
-    this.pictures = pictures;
-    this.tiles = new Map(); // finished pictures, by all that they depend on
-    this.expose(ev);
+  constructor(pictures) {
+    Object.assign(this, { pictures, frames: pictures.frames, sources: pictures.sources });
+    this.tiles = new Map(); // finished pictures, by source, view and frame, at the exposure of `expose`
+  }
+
+  size() {
+    return this.pictures;
+  }
+
+  label(source) {
+    const { name } = this.sources[source];
+    return [name, meanText(name, report.chart[0])];
+  }
+
+  image(source, { view, frame }) {
+    return this.tile(source, view, frame);
   }
 
   // The tone curve at an exposure, and its sRGB bytes, of every code.
@@ -66,7 +79,7 @@ class Painter {
     const { count, lost } = this.pictures, codes = await this.pictures.colors(source, frame);
     for (let i = 0; i < count; i++) {
       const red = codes[i], green = codes[count + i], blue = codes[2 * count + i];
-      if (red === lost || green === lost || blue === lost) put(out, i, 255, 0, 255);
+      if (red === lost || green === lost || blue === lost) put(out, i, 255, 0, 255); // magenta: not finite
       else put(out, i, this.display[red], this.display[green], this.display[blue]);
     }
   }

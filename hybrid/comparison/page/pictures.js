@@ -1,6 +1,6 @@
-// The pictures and maps that the page holds, as hybrid/comparison/embedding.py has encoded them.
+// Pictures and maps of the page, encoded by hybrid/comparison/embedding.py.
 
-// Codes of `pictures`, each picture decoded when it is first asked for. Source 0 is the reference.
+// Codes of all pictures, each decoded on demand. Source 0 is the reference.
 class Pictures {
   constructor(info) {
     Object.assign(this, info); // width, height, origin, frames, sources …: see embed_pictures
@@ -60,7 +60,7 @@ function undoPrediction(folded, channels, width, height, levels) {
   return out;
 }
 
-// Stored are green, red − green and blue − green; wanted are red, green and blue.
+// From green, red − green and blue − green to red, green and blue.
 function undoColorDifferences(planes, count, levels) {
   const mask = levels - 1, half = levels >> 1;
   for (let i = 0; i < count; i++) {

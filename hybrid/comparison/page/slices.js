@@ -8,14 +8,14 @@ class Slices {
   }
 
   addBands(source, isReference) {
-    const name = make("div", source.label), figure = meanText(source.name, "temporal_psnr");
+    const name = make("div", source.name), figure = meanText(source.name, "temporal_psnr");
     if (figure) name.append(make("small", `temporal PSNR ${figure}`));
     const { width, frames } = this.pictures;
     const bands = ["picture", "difference from the reference"].map((what) => {
       const band = makeCanvas(width, frames.length);
       band.style.height = clamp(84 / frames.length, 5, 14) * frames.length + "px";
       band.setAttribute("role", "img");
-      band.setAttribute("aria-label", `${source.label}: ${what}, one row through time`);
+      band.setAttribute("aria-label", `${source.name}: ${what}, one row through time`);
       return band;
     });
     if (isReference) bands[1].style.visibility = "hidden";
@@ -28,7 +28,7 @@ class Slices {
     for (let source = 0; source < sources.length; source++) {
       const shown = new ImageData(width, frames.length), wrong = new ImageData(width, frames.length);
       for (let frame = 0; frame < frames.length; frame++) await this.paintRow(shown.data, wrong.data, source, frame);
-      if (mine !== this.draws) return; // something newer is on its way
+      if (mine !== this.draws) return; // a newer one is in progress
       this.bands[source][0].getContext("2d").putImageData(shown, 0, 0);
       this.bands[source][1].getContext("2d").putImageData(wrong, 0, 0);
     }

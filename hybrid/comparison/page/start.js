@@ -1,2 +1,2 @@
 startChart(report.pictures ? startViewer(report.pictures) : null);
-if (report.loops) startLoops(report.loops);
+if (report.animations) startAnimations(report.animations);

@@ -52,24 +52,24 @@ def test_without_jinja_the_page_is_refused_before_anything_runs(shots: tuple[Pat
     assert done.returncode == 1
     assert done.stderr.strip().splitlines() == [
         "error: the page of --output needs jinja2, which is not installed; "
-        'expected: pip install "jinja2" (the table alone is made without)'
+        'expected: pip install "jinja2" (the table alone needs neither)'
     ]
     assert not (tmp_path / "report").exists()
 
 
-def test_heavier_loops_lie_beside_the_page_where_asked(shots: tuple[Path, Path], tmp_path: Path) -> None:
+def test_movies_are_written_next_to_the_page_on_request(shots: tuple[Path, Path], tmp_path: Path) -> None:
     pytest.importorskip("av")
     noisy, clean = map(str, shots)
-    words = ["compare", noisy, "--reference", clean, "--methods", "noisy", "--rounds", "1", "--loops"]
+    words = ["compare", noisy, "--reference", clean, "--methods", "noisy", "--rounds", "1", "--movies"]
     assert main([*words, "-o", str(tmp_path / "report"), "--fps", "25"]) == 0
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     for name in ("00_reference.mp4", "01_noisy.mp4"):
-        assert f'href="loops/{name}"' in page
-        assert (tmp_path / "report" / "loops" / name).is_file()
+        assert f'href="movies/{name}"' in page
+        assert (tmp_path / "report" / "movies" / name).is_file()
     assert '<option value="25" selected>' in page
     assert main(words) == 2
     # Somebody else's folder of that name is left alone.
-    (tmp_path / "other" / "loops").mkdir(parents=True)
+    (tmp_path / "other" / "movies").mkdir(parents=True)
     assert main([*words, "-o", str(tmp_path / "other")]) == 1
 
 

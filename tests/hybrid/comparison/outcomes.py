@@ -14,7 +14,7 @@ EVIL = "</script><img src=x onerror='window.pwned=1'> {{data}} & \"q\" | `x`"
 def result(name: str, psnr: float | list[float], seconds: float | None, **more: Any) -> MethodResult:
     values = psnr if isinstance(psnr, list) else [psnr - 0.5, psnr, psnr + 0.5]
     metrics = {"psnr": summarize(values), "relmse": summarize([10 ** (-v / 10) for v in values])}
-    settings = {"label": name.title(), "seconds_per_megapixel": seconds, "metrics": metrics, **more}
+    settings = {"seconds_per_megapixel": seconds, "metrics": metrics, **more}
     return MethodResult(name, **settings)
 
 
@@ -24,7 +24,7 @@ RESULTS = (
     result("slow", 27.0, 2.0, peak_bytes=400 << 20),
     result("final", 34.0, 4.0, peak_bytes=600 << 20, worth=14.2, spread=(3.8, 4.3), settings={"window": 5}),
     result("other", 33.0, None, family="External"),
-    MethodResult("gone", "Gone", absent_reason="torch is not installed"),
+    MethodResult("gone", absent_reason="torch is not installed"),
 )
 
 

@@ -1,4 +1,4 @@
-"""The chart: axes, labels, markers and lines, and its two drawings."""
+"""The chart: axes, labels, markers and lines, as SVG and as PNG."""
 
 # ruff: noqa: E402 - skipped by name without the extra `compare`
 
@@ -12,104 +12,124 @@ import cv2
 import numpy as np
 import pytest
 
-for _package in ("jinja2", "resvg_py", "font_manrope"):
+for _package in ("jinja2", "matplotlib"):
     pytest.importorskip(_package)
 
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+
 from hybrid.comparison import chart
-from hybrid.comparison.results import Metric
+from hybrid.comparison.results import MethodResult, Metric
 from tests.hybrid.comparison.outcomes import EVIL, PSNR, RELMSE, RESULTS, SECONDS, SWEPT, result, swept
 
 
-def at(layout: chart.Chart, name: str) -> chart.Point:
-    return next(p for p in layout.points if p.result.name == name)
+def draw(results: tuple[MethodResult, ...] | list[MethodResult], metric: Metric = PSNR) -> Figure:
+    figure = chart.draw_chart(results, metric, SECONDS)
+    assert figure is not None
+    figure.draw_without_rendering()
+    return figure
+
+
+def lines(figure: Figure, kind: str) -> dict[int, Line2D]:
+    """The lines named ``kind-number``, by number."""
+    named = [line for line in figure.axes[0].lines if (line.get_gid() or "").startswith(f"{kind}-")]
+    return {int(str(line.get_gid()).split("-")[1]): line for line in named}
+
+
+def pixel_of(figure: Figure, index: int) -> tuple[float, float]:
+    """Where a point is, in dots from the bottom left."""
+    ((x, y),) = figure.axes[0].transData.transform(lines(figure, "point")[index].get_xydata())
+    return x, y
 
 
 @pytest.mark.parametrize("metric", [PSNR, RELMSE])
 def test_better_is_up_dearer_is_right_and_the_axis_is_logarithmic(metric: Metric) -> None:
-    layout = chart.lay_out([*RESULTS, result("ten", 20.0, 0.02), result("eleven", 20.0, 20.0)], metric, SECONDS)
-    assert layout is not None
-    assert at(layout, "final").y < at(layout, "average").y < at(layout, "noisy").y
-    a, b, c = (at(layout, n).x for n in ("ten", "average", "slow"))
-    assert b - a == pytest.approx(c - b)  # 0.02, 0.2, 2
-    assert at(layout, "noisy").x < layout.box[0]  # costs nothing: beside a logarithmic axis
-    assert at(layout, "other").x > layout.box[2]  # not known
-    assert [p.result.name for p in layout.points if p.on_front][-1] == "final"
+    figure = draw([*RESULTS, result("ten", 20.0, 0.02), result("eleven", 20.0, 20.0)], metric)
+    at = {r.name: pixel_of(figure, i) for i, r in enumerate(RESULTS[:5])}
+    ten, eleven = pixel_of(figure, 6), pixel_of(figure, 7)
+    assert at["final"][1] > at["average"][1] > at["noisy"][1]
+    assert at["average"][0] - ten[0] == pytest.approx(at["slow"][0] - at["average"][0])  # 0.02, 0.2, 2
+    assert at["noisy"][0] < ten[0] < eleven[0] < at["other"][0]  # costs nothing; unknown
+    assert [tick.get_text() for tick in figure.axes[0].get_xticklabels()][-2:] == ["nothing", "unknown"]
 
 
 def test_labels_lie_inside_and_never_on_each_other() -> None:
     rng = np.random.default_rng(3)
     crowd = [result(f"method {i:02d}", float(rng.uniform(28, 32)), float(rng.uniform(0.5, 3))) for i in range(30)]
-    layout = chart.lay_out(crowd, PSNR, SECONDS)
-    assert layout is not None
-    boxes = []
-    for p in layout.points:
-        if p.label:
-            x, y, text = p.label
-            boxes.append((x, y - 10, x + chart._text_width(text), y + 2))
+    figure = draw(crowd)
+    labels = [text for text in figure.axes[0].findobj(Text) if (text.get_gid() or "").startswith("name-")]
+    boxes = [label.get_window_extent() for label in labels]
     assert len(boxes) >= 5
-    assert all(b[0] >= 0 and b[2] <= chart.WIDTH for b in boxes)
-    assert not any(chart._overlap(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
-
-
-def pixels_of(layout: chart.Chart) -> np.ndarray:
-    """The PNG as red, green and blue."""
-    return cv2.imdecode(np.frombuffer(chart.to_png(layout), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert all(box.x0 >= 0 and box.x1 <= figure.bbox.width for box in boxes)
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 def test_families_differ_in_shape_and_colour_and_dominated_points_are_hollow() -> None:
-    pairs = {(i % len(chart.COLORS), i % len(chart.SHAPES)) for i in range(63)}
+    pairs = {(i % len(chart.COLORS), i % len(chart.MARKERS)) for i in range(63)}
     assert len(pairs) == 63
-    layout = chart.lay_out(RESULTS, PSNR, SECONDS)
-    assert layout is not None
-    pixels = pixels_of(layout)
-    for name, filled in (("final", True), ("slow", False)):
-        p = at(layout, name)
-        color = "#" + pixels[round(p.y * chart.SCALE), round(p.x * chart.SCALE)].tobytes().hex()
-        assert color == (chart.COLORS[p.family] if filled else "#ffffff")
-
-
-def test_the_picture_has_text_of_our_own_font_whatever_the_system_has() -> None:
-    layout = chart.lay_out(RESULTS, PSNR, SECONDS)
-    assert layout is not None
-    pixels = pixels_of(layout)
+    figure = draw(RESULTS)
+    pixels = cv2.imdecode(np.frombuffer(chart.to_png(figure), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert pixels.shape[1] == 1600
-    title = pixels[: round(20 * chart.SCALE)]
-    inked = np.flatnonzero(title.max(axis=-1).min(axis=0) < 128) / chart.SCALE
-    # From 2 pixels off the edge to where the font says; what is blank around a letter, or the arrow, is below 4 pixels.
-    assert 2 <= inked[0] < 6
-    assert inked[-1] == pytest.approx(2 + chart._text_width("PSNR (dB), better ↑", 600), abs=4)
-    assert chart._text_width("PSNR", 600) > chart._text_width("PSNR", 400)
+    for index, expected in ((3, chart.COLORS[1]), (2, "#ffffff")):  # final is on the front, slow is not
+        x, y = np.array(pixel_of(figure, index)) * chart.PNG_DPI / figure.dpi
+        assert "#" + pixels[pixels.shape[0] - round(y), round(x)].tobytes().hex() == expected
+
+
+def test_the_front_leads_up_to_its_end() -> None:
+    figure = draw(RESULTS)
+    (front,) = [line for line in figure.axes[0].lines if line.get_gid() is None]
+    heights = [float(y) for y in np.asarray(front.get_ydata())]
+    assert heights == pytest.approx([22, 28, 34, 34])
+    assert front.get_drawstyle() == "steps-post"
 
 
 def test_the_legend_has_every_family_and_as_many_rows_as_it_takes() -> None:
-    names = [f"a family with a long name, number {i}" for i in range(9)]
-    places = chart._lay_out_legend(names)
-    assert [(family, name) for _, _, family, name in places] == list(enumerate(names))
-    assert len({y for _, y, *_ in places}) > 1
-    assert all(x + 2 * chart.RADIUS + chart._text_width(name) <= chart.WIDTH for x, _, _, name in places)
+    names = [f"_a family $number {i}" for i in range(9)]
     crowd = [result(name, 30.0 + i, 1.0 + i, family=name) for i, name in enumerate(names)]
-    layout, small = chart.lay_out(crowd, PSNR, SECONDS), chart.lay_out(crowd[:1], PSNR, SECONDS)
-    assert layout is not None
+    figure, small = (chart.draw_chart(some, PSNR, SECONDS, legend=True) for some in (crowd, crowd[:1]))
+    assert figure is not None
     assert small is not None
-    assert pixels_of(layout).shape[0] > pixels_of(small).shape[0]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == names
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0  # noqa: PT018
+    assert figure.bbox.height > small.bbox.height
 
 
-def test_a_line_joins_what_varies_one_number_in_its_order() -> None:
-    layout = chart.lay_out([*SWEPT, swept("window 5", [33.0, 33.1, 33.2], 3.6, window=5)], PSNR, SECONDS)
-    assert layout is not None
-    ((family, line),) = layout.series  # stages are no numbers
+def test_a_line_joins_the_points_of_a_sweep_in_the_order_of_its_number() -> None:
+    figure = draw([*SWEPT, swept("window 5", [33.0, 33.1, 33.2], 3.6, window=5)])
+    ((family, line),) = lines(figure, "series").items()  # stages are no numbers
     assert chart.families(SWEPT)[family] == "Methods"
-    assert line == [(at(layout, n).x, at(layout, n).y) for n in ("window 1", "window 3", "window 5")]
+    np.testing.assert_allclose(line.get_xdata(), [2.5, 3.0, 3.6])
 
 
 def test_svg_is_well_formed_whatever_the_names_are() -> None:
-    layout = chart.lay_out([replace(RESULTS[3], label=EVIL, name='"><b'), RESULTS[1]], PSNR, SECONDS)
-    assert layout is not None
-    tree = ElementTree.fromstring(chart.to_svg(layout))
-    points = [e for e in tree.iter() if "point" in e.get("class", "").split()]
-    assert [e.get("data-name") for e in points] == ["average", '"><b']
-    assert EVIL in points[1].get("aria-label", "")
+    figure = draw([replace(RESULTS[3], name=EVIL), replace(RESULTS[1], name="$x$ \\frac"), RESULTS[0]])
+    text = chart.to_svg(figure, "chart0")
+    assert "http" not in text
+    tree = ElementTree.fromstring(text.replace("xlink:", ""))
+    ids = {element.get("id") for element in tree.iter()}
+    assert {"chart0-point-0", "chart0-point-1", "chart0-name-0", "chart0-bar-2"} <= ids
+    assert {EVIL[:33] + "…", "$x$ \\frac"} <= {element.text for element in tree.iter()}
+
+
+def test_charts_of_one_page_share_no_id() -> None:
+    first, second = (chart.to_svg(draw(RESULTS), prefix) for prefix in ("chart0", "chart1"))
+    ids = [
+        {element.get("id") for element in ElementTree.fromstring(text.replace("xlink:", "")).iter("path")} - {None}
+        for text in (first, second)
+    ]
+    assert ids[0]
+    assert not ids[0] & ids[1]
+
+
+def test_a_marker_is_a_polygon_around_the_origin() -> None:
+    for family in range(len(chart.MARKERS)):
+        corners = np.array([pair.split(",") for pair in chart.marker(family).split()], float)
+        assert len(corners) >= 4
+        assert np.abs(corners).max() < 11
 
 
 def test_a_chart_of_nothing_finite_is_none() -> None:
-    assert chart.lay_out([result("a", [math.inf, math.inf], 1.0)], PSNR, SECONDS) is None
+    assert chart.draw_chart([result("a", [math.inf, math.inf], 1.0)], PSNR, SECONDS) is None

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hybrid.comparison import compare
-from hybrid.comparison.compare import compare_shot
+from hybrid.comparison.compare import CompareOptions, compare_shot
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
-from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, REFERENCE, FrameStore
+from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, MAP_TITLES, REFERENCE, FrameStore
 from hybrid.files.frame import Frame
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 from tests.hybrid.comparison.test_running import killed, not_installed
@@ -65,25 +65,24 @@ def test_a_finished_sequence_is_judged_and_not_timed() -> None:
 def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
     shot, reference = make_shots()
     methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
-    compare_shot(shot, reference, methods, maps=True, folder=tmp_path)
+    compare_shot(shot, reference, methods, CompareOptions(maps=True), folder=tmp_path)
     store = FrameStore(tmp_path)
-    assert set(store.map_titles("noisy", 5)) <= {FLIP_MAP, CHANGE_MAP}
-    assert "Confidence" in store.map_titles("mapped", 5)
+    assert [title for title in MAP_TITLES if store.has("noisy", 5, title)] == [FLIP_MAP, CHANGE_MAP]
     assert store.load("mapped", 5, "Confidence").shape == SIZE
 
 
 def test_large_frames_have_maps_in_the_middle_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("font_manrope")
+    pytest.importorskip("matplotlib")
     from hybrid.comparison.report import report_images
 
     shot, reference = make_shots()
     methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
     monkeypatch.setattr(compare, "LARGE", SIZE[0] * SIZE[1] - 1)
-    comparison = compare_shot(shot, reference, methods, maps=True, folder=tmp_path)
+    comparison = compare_shot(shot, reference, methods, CompareOptions(maps=True), folder=tmp_path)
     middle = shot.numbers[len(shot.numbers) // 2]
-    assert f"of frame {middle} alone" in comparison.facts["Maps"]
-    images, _ = report_images(FrameStore(tmp_path), comparison, shot.numbers)
-    maps = next(image.maps for image in images if image.name == "mapped")
+    assert f"of frame {middle} only" in comparison.facts["Maps"]
+    images = report_images(FrameStore(tmp_path), comparison, shot.numbers)
+    maps = next(image.maps for image in images.methods if image.name == "mapped")
     assert [number for number in shot.numbers if maps["Confidence"](number) is not None] == [middle]
     assert all(maps[FLIP_MAP](number) is not None for number in shot.numbers)
 
@@ -93,10 +92,14 @@ def test_progress_says_what_is_being_done() -> None:
     told: list[str] = []
     methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps), "gone": Method(not_installed, "Tests", with_maps)}
     compare_shot(
-        shot, reference, methods, maps=True, progress=lambda what, done, total: told.append(f"{done}/{total} {what}")
+        shot,
+        reference,
+        methods,
+        CompareOptions(maps=True),
+        on_step=lambda what, done, total: told.append(f"{done}/{total} {what}"),
     )
     assert told == [
-        "0/10 look at the shot, its motion and the reference",
+        "0/10 read the shot, its motion and the reference",
         "1/10 run noisy",
         "2/10 run mapped",
         "3/10 run gone",
@@ -108,9 +111,10 @@ def test_progress_says_what_is_being_done() -> None:
     ]
 
 
-def test_what_is_seen_meanwhile_is_a_fact() -> None:
+def test_findings_of_the_background_check_are_a_fact() -> None:
     shot, reference = make_shots()
-    facts = compare_shot(shot, reference, NOISY, said=["no depth"], look=lambda: ["a cut"]).facts
+    options = CompareOptions(findings=["no depth"], check_shot=lambda: ["a cut"])
+    facts = compare_shot(shot, reference, NOISY, options).facts
     assert facts["Layers"] == "no depth; a cut"
 
 
@@ -131,7 +135,7 @@ def test_wrong_input_is_found_before_any_method_runs(monkeypatch: pytest.MonkeyP
 
     def refuses(words: str, methods: dict[str, Method] = NOISY, *, reference=reference, **more: object) -> None:
         with pytest.raises(ValueError, match=words):
-            compare_shot(shot, reference, methods, **more)
+            compare_shot(shot, reference, methods, CompareOptions(**more))
 
     refuses("frame 4 of reference is 31x24, expected 32x24", reference=small)
     refuses("frame 4 of reference is 31x24, expected 32x24", reference=(reference, small))
@@ -141,7 +145,7 @@ def test_wrong_input_is_found_before_any_method_runs(monkeypatch: pytest.MonkeyP
     def look() -> list[str]:
         raise ValueError("this shot is cut")
 
-    refuses("this shot is cut", look=look)
+    refuses("this shot is cut", check_shot=look)
     refuses("levels need the samples per pixel of the shot", levels=[(shot, 4)])
     refuses("expected the method 'noisy'", ways(perfect=perfect), samples=8, levels=[(shot, 4)])
     refuses("expected some of 4–6", samples=8, levels=[(make_shots((8, 9))[0], 4)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid.comparison import embedding
-from hybrid.comparison.embedding import ReportImages, embed_pictures
+from hybrid.comparison.embedding import MethodImages, ShotImages, embed_pictures
 
 
 def decompress(text: str, shape: tuple[int, int, int], levels: int) -> np.ndarray:
@@ -53,16 +53,16 @@ def test_codes_keep_radiance_to_a_percent_and_mark_what_is_not_finite() -> None:
     assert embedding.to_codes(lost, level).tolist() == [[[embedding.NOT_FINITE, embedding.NOT_FINITE, 0]]]
 
 
-def test_what_is_left_out_is_said_and_the_limit_kept() -> None:
+def test_what_is_left_out_is_said_and_the_limit_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     noise = {n: rng.exponential(1.0, (270, 480, 3)).astype(np.float32) for n in (8, 9, 10)}
     noise[9][:, :240] = 1  # like the reference
     still = np.ones((270, 480, 3), np.float32)
-    images = [ReportImages("average", lambda n: noise[n])]
+    images = ShotImages([MethodImages("average", lambda n: noise[n])], lambda n: still, [8, 9, 10])
 
     def embed(limit: float) -> tuple[dict[str, Any], int]:
-        pictures = embed_pictures(images, {"average": "Average"}, lambda n: still, [8, 9, 10], limit)
-        assert pictures.extent == pictures.info["extent"]
+        monkeypatch.setattr(embedding, "LIMIT", limit)
+        pictures = embed_pictures(images)
         return pictures.info, sum(len(text) for _, text in pictures.elements)
 
     info, size = embed(24e6)
@@ -82,6 +82,7 @@ def test_what_is_left_out_is_said_and_the_limit_kept() -> None:
 
 
 def test_pictures_of_another_shape_are_refused() -> None:
-    images = [ReportImages("a", lambda n: np.ones((6, 8, 3), np.float32), {"M": lambda n: np.ones((6, 7), np.float32)})]
+    maps = {"M": lambda n: np.ones((6, 7), np.float32)}
+    method = MethodImages("a", lambda n: np.ones((6, 8, 3), np.float32), maps)
     with pytest.raises(ValueError, match=r"a, M has the shape \(6, 7\), expected \(6, 8\)"):
-        embed_pictures(images, {}, lambda n: np.ones((6, 8, 3), np.float32), [1], 1e6)
+        embed_pictures(ShotImages([method], lambda n: np.ones((6, 8, 3), np.float32), [1]))

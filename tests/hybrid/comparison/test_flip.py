@@ -8,9 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from hybrid.comparison import flip
-from hybrid.comparison.flip import find_exposures, flip_map, flip_maps
+from hybrid.comparison.flip import find_exposures, flip_maps
 
 Array = NDArray[np.float32]
+
+
+def flip_map(image: Array, reference: Array) -> Array:
+    return flip_maps([image], reference)[0]
 
 
 @pytest.fixture(params=[(40, 56), (41, 55)])  # an even and an odd number of pixels: medians differ

@@ -22,7 +22,7 @@ from tests.exr_files import write_layers
 from tests.scenes import Scene, only
 
 SCENE = Scene(frames=3, height=32, width=40)
-NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch", "scikit-image": "pywt", "OpenCV": "pywt"}
+NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch"}
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +62,6 @@ def test_of_ravg_s_own_files_what_it_has_written_is_read(shot: Shot, tmp_path: P
     write_layers(tmp_path / f"a.{SCENE.first}.exr", layers, attributes={MADE_FROM: "{}"})
     pictures = dict(methods.finished(shot, other=open_shot(tmp_path)))
     assert pictures[SCENE.first].mean() == 1
-
-
-def test_noise_of_a_tone_mapped_frame_is_found() -> None:
-    pytest.importorskip("pywt")
-    rng = np.random.default_rng(2)
-    slope = np.linspace(0.2, 0.6, 121, dtype=np.float32)[None, :, None] * np.ones((81, 1, 3), np.float32)
-    noisy = slope + 0.03 * rng.normal(size=slope.shape).astype(np.float32)
-    # A median of 7200 values has a standard error of 1.4 %.
-    assert methods._noise_of(noisy) == pytest.approx(0.03, rel=0.05)
 
 
 class TestMaps:

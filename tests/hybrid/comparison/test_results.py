@@ -38,7 +38,7 @@ def test_a_difference_smaller_than_its_scatter_is_a_tie_and_a_steady_one_is_not(
 
 def test_without_frames_overlapping_intervals_tie() -> None:
     a, b, c = Statistic(30, 29, 31, 29.5, 30.5), Statistic(29.4, 28, 30, 29, 29.6), Statistic(28, 27, 29, 27.5, 28.5)
-    methods = [MethodResult(n, n, metrics={"psnr": s}) for n, s in zip("abc", (a, b, c), strict=True)]
+    methods = [MethodResult(n, metrics={"psnr": s}) for n, s in zip("abc", (a, b, c), strict=True)]
     assert best_and_ties(methods, PSNR) == ("a", {"b"})
 
 
@@ -50,8 +50,8 @@ def test_two_perfect_scores_tie_and_a_lost_frame_never_wins() -> None:
 
 
 def test_lower_and_nearest_to_zero_are_better_where_the_metric_says_so() -> None:
-    bias = Metric("bias", "Bias", "", better="zero")
-    methods = [MethodResult(str(v), "", metrics={"bias": summarize([v])}) for v in (-0.5, 0.1, 0.3)]
+    bias = Metric("bias", "Bias", better="zero")
+    methods = [MethodResult(str(v), metrics={"bias": summarize([v])}) for v in (-0.5, 0.1, 0.3)]
     assert best_and_ties(methods, bias)[0] == "0.1"
     assert best_and_ties(RESULTS, RELMSE)[0] == "final"
 
@@ -79,10 +79,10 @@ def test_stages_are_worth_what_switching_them_changes() -> None:
     assert (gate.stage, gate.on, refine.on) == ("gate", True, False)
     assert gate.gains["psnr"] == pytest.approx(1.0)  # 34 with it, 33 without
     assert gate.seconds == pytest.approx(0.5)
-    assert gate.told == ("psnr",)
+    assert gate.significant == ("psnr",)
     assert refine.gains["psnr"] == pytest.approx(-1 / 30)  # what it would change if it were on
     assert refine.seconds == pytest.approx(5.0)
-    assert refine.told == ()  # a tie
+    assert refine.significant == ()  # a tie
 
 
 def test_several_shots_are_put_together_over_those_that_all_have() -> None:

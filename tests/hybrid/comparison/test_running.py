@@ -14,7 +14,7 @@ import pytest
 
 from hybrid.comparison import running
 from hybrid.comparison.methods import METHODS, Method
-from hybrid.comparison.running import Run, Seconds, run_method, summarize_runs, time_methods
+from hybrid.comparison.running import RunCost, Seconds, run_method, summarize_runs, time_methods
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frame import Frame
 from hybrid.oidn import denoise_oidn
@@ -49,7 +49,7 @@ def test_peak_memory_is_the_methods_own() -> None:
     shot, _ = make_shots()
     ballast = np.ones(300 * 2**18, np.float32)  # 300 MiB in this process
     methods = ways(hungry=partial(hungry, megabytes=200), modest=partial(hungry, megabytes=1))
-    runs, _ = time_methods(methods, shot, 1)
+    runs = time_methods(methods, shot, 1).runs
     assert ballast.nbytes == 300 * 2**20
     # The interpreter and its libraries are in both, and vary by a few MiB from run to run.
     (large,), (small,) = runs["hungry"], runs["modest"]
@@ -112,7 +112,7 @@ def test_methods_warm_up_with_the_middle_of_large_frames(monkeypatch: pytest.Mon
 
 
 def test_times_are_medians_with_their_range() -> None:
-    runs = [Run(0.5, seconds, seconds / 2, 0) for seconds in (1.0, 40.0, 2.0)]  # one met something else
+    runs = [RunCost(0.5, seconds, seconds / 2, 0) for seconds in (1.0, 40.0, 2.0)]  # one met something else
     assert summarize_runs(runs) == Seconds(median=4.0, least=2.0, most=80.0, cpu=2.0)
 
 
@@ -125,20 +125,20 @@ def test_rounds_take_turns_and_what_is_there_already_runs_once(tmp_path: Path) -
 
     methods = NOISY | ways(a=perfect, gone=not_installed, dead=killed)
     store = FrameStore(tmp_path)
-    runs, absent = time_methods(methods, shot, 2, store, progress)
+    timed = time_methods(methods, shot, 2, store, progress)
     # The second round starts half-way through.
     order = ["noisy", "a", "gone", "dead", "gone", "dead", "noisy", "a"]
     assert asked == [f"run {name} {done}/8" for done, name in enumerate(order)]
-    assert {name: len(series) for name, series in runs.items()} == {"noisy": 1, "a": 2}
-    assert absent == {"gone": "needs the package unheard-of", "dead": "its process died, out of memory perhaps"}
+    assert {name: len(series) for name, series in timed.runs.items()} == {"noisy": 1, "a": 2}
+    assert timed.absent == {"gone": "needs the package unheard-of", "dead": "its process died, possibly out of memory"}
     assert store.has("a", 5)
 
 
 def test_what_has_taken_long_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
     shot, _ = make_shots()
     seconds = {"a": 1.2 * running.ENOUGH, "b": 0.6 * running.ENOUGH, "c": 0.1 * running.ENOUGH}
-    monkeypatch.setattr(running, "run_apart", lambda _, method, shot, name, store: Run(1.0, seconds[name], 1.0, 0))
-    runs, _ = time_methods(ways(a=perfect, b=perfect, c=perfect), shot, 4)
+    monkeypatch.setattr(running, "run_in_process", lambda _, __, ___, name, store: RunCost(1.0, seconds[name], 1.0, 0))
+    runs = time_methods(ways(a=perfect, b=perfect, c=perfect), shot, 4).runs
     assert {name: len(series) for name, series in runs.items()} == {"a": 1, "b": 2, "c": 4}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,13 +65,14 @@ def test_settings_of_the_solver_reach_it(shot: Shot, monkeypatch: pytest.MonkeyP
         return arguments[1]
 
     monkeypatch.setattr(methods, "refine_flow", spy)
-    run = partial(METHODS[CLASSICAL].run, solver={"scales": 1, "warps": 2, "iterations": 10})
-    next(run(shot))
+    run = METHODS[CLASSICAL].run
+    solver = {"scales": 1, "warps": 2, "iterations": 10}
+    next(replace(run, window=replace(run.window, solver=solver))(shot))
     assert seen
     assert all({"scales": 1, "warps": 2, "iterations": 10}.items() <= settings.items() for settings in seen)
 
 
 def test_a_threshold_changes_the_network(shot: Shot) -> None:
     pytest.importorskip("torch")
-    low, high = (next(partial(METHODS[KERNELS].run, threshold=t)(shot))[1] for t in (0.0, 0.75))
+    low, high = (next(replace(METHODS[KERNELS].run, threshold=t)(shot))[1] for t in (0.0, 0.75))
     assert not np.array_equal(low, high)

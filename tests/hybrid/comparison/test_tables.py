@@ -1,10 +1,8 @@
-"""Results as text: figures, and tables for a terminal, for Markdown and for spreadsheets."""
+"""Results as text: numbers, and tables for a terminal and for Markdown."""
 
 from __future__ import annotations
 
-import csv
 import io
-import json
 import math
 from dataclasses import replace
 
@@ -20,13 +18,12 @@ from hybrid.comparison.tables import (
     format_worth,
     markdown_table,
     result_table,
-    to_csv,
 )
 from tests.hybrid.comparison.outcomes import EVIL, PSNR, RELMSE, RESULTS, SECONDS, result
 
 
 def test_markdown_marks_the_best_and_keeps_a_name_in_its_cell() -> None:
-    evil = replace(RESULTS[1], name="evil", label=EVIL)
+    evil = replace(RESULTS[1], name=EVIL)
     other = Comparison("Other", (result("final", 30.0, 1.0), result("average", 31.0, 1.0)))
     rows = markdown_table([Comparison("Hall", (*RESULTS, evil)), other], SECONDS).splitlines()
     assert "| **34.00** | **" not in rows[5]
@@ -48,9 +45,9 @@ def printed(results: tuple[MethodResult, ...]) -> str:
 def test_a_terminal_sees_every_method_and_why_one_is_absent() -> None:
     text = printed(RESULTS)
     for r in RESULTS:
-        assert f"{r.label} " in text
-    assert "absent – Gone: torch is not installed" in text
-    row = next(line for line in text.splitlines() if "Final " in line)
+        assert f"{r.name} " in text
+    assert "absent – gone: torch is not installed" in text
+    row = next(line for line in text.splitlines() if line.startswith("final "))
     assert "34.00" in row
     assert " 4 " in row
     assert "600 MiB" in row
@@ -62,8 +59,7 @@ def test_no_figure_and_no_word_breaks_at_80_columns() -> None:
     assert len(shown) == 4
     values = {"psnr": 42.27, "temporal_psnr": 44.92, "relmse": 0.0123, "flip": 0.0456}
     full = replace(
-        result("final", 42.27, 1.0),
-        label="aligned robust average",
+        result("aligned robust average", 42.27, 1.0),
         metrics={m.key: summarize([values[m.key]]) for m in shown},
         seconds_per_megapixel=24.7,
         cpu_seconds_per_megapixel=48.1,
@@ -82,20 +78,13 @@ def test_no_figure_and_no_word_breaks_at_80_columns() -> None:
 @pytest.mark.parametrize("name", ["[/bold] [red]", "[link=x]y", "a\\[b]"])
 def test_markup_in_a_name_is_shown_as_it_is(name: str) -> None:
     """It raised an error, or took a part of the name away."""
-    text = printed((result("a", 30.0, 1.0, label=name), MethodResult("b", name, absent_reason=name)))
+    text = printed((result(name, 30.0, 1.0), MethodResult(f"{name} 2", absent_reason=name)))
     assert [line.startswith(f"{name} ") for line in text.splitlines()].count(True) == 2
-    assert f"absent – {name}: {name}" in text
-
-
-def test_a_spreadsheet_has_a_row_for_each_method() -> None:
-    rows = list(csv.DictReader(io.StringIO(to_csv([replace(RESULTS[3], label=EVIL), RESULTS[5]], METRICS[:1]))))
-    assert (rows[0]["label"], rows[0]["psnr_mean"], rows[0]["seconds_low"]) == (EVIL, "34.0", "3.8")
-    assert json.loads(rows[0]["settings"]) == {"window": "5"}
-    assert (rows[1]["absent_reason"], rows[1]["psnr_mean"]) == ("torch is not installed", "")
+    assert f"absent – {name} 2: {name}" in text
 
 
 def test_figures_are_printed_as_their_metric_asks() -> None:
-    digits = Metric("x", "X", "", digits=4)
+    digits = Metric("x", "X", digits=4)
     assert [format_value(v, PSNR) for v in (34.126, -1.0, math.inf, -math.inf, math.nan)] == [
         "34.13", "−1.00", "∞", "−∞", "–",
     ]  # fmt: skip

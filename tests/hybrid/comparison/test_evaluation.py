@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from flow.motion import CYCLES, MotionConvention
-from hybrid.comparison import judging
-from hybrid.comparison.compare import compare_shot
-from hybrid.comparison.flip import flip_map
-from hybrid.comparison.judging import motion_between
+from hybrid.comparison import evaluation
+from hybrid.comparison.compare import CompareOptions, compare_shot
+from hybrid.comparison.evaluation import motion_between
+from hybrid.comparison.flip import flip_maps
 from hybrid.comparison.methods import external
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FrameStore
 from hybrid.files.frame import Frame
@@ -31,12 +31,11 @@ def test_worth_in_samples_follows_the_levels() -> None:
 
     _, reference = make_shots()
     methods = NOISY | {"better": external(render(16, 1))}
-    comparison = compare_shot(
-        render(8, 2), reference, methods, samples=8, levels=[(render(4, 3), 4), (render(64, 4), 64)]
-    )
+    options = CompareOptions(samples=8, levels=[(render(4, 3), 4), (render(64, 4), 64)])
+    comparison = compare_shot(render(8, 2), reference, methods, options)
     # 6912 squared errors: 1.7 % each of method and level, doubled by the reading between levels.
     assert comparison.results[1].worth == pytest.approx(2, rel=0.07)
-    assert "as 1/n asks" in comparison.facts["Worth in samples"]
+    assert "close to 1/n" in comparison.facts["Worth in samples"]
     # A clean reference: what is left for its noise is far below the least error that was measured.
     assert "measured levels" in comparison.facts["Reference"]
 
@@ -53,7 +52,7 @@ def test_static_pixels_flicker_by_what_was_put_in() -> None:
         color = (tone / (1 - tone)).astype(np.float32)
         frames[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
     comparison = compare_shot(MemoryShot(frames), clean, NOISY)
-    assert comparison.facts["Pixels that stand still"] == "100.0%"
+    assert comparison.facts["Static pixels"] == "100.0%"
     # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
     assert comparison.results[0].metrics["static_std"].mean == pytest.approx(sigma, rel=0.03)
 
@@ -69,7 +68,7 @@ def test_what_changes_between_frames_is_kept_as_a_map(tmp_path: Path) -> None:
     reference = MemoryShot({n: Frame(n, np.full((*SIZE, 3), 1.0, np.float32)) for n in tones})
     compare_shot(MemoryShot(frames), reference, NOISY, folder=tmp_path)
     store = FrameStore(tmp_path)
-    assert CHANGE_MAP in store.map_titles("noisy", 1)
+    assert store.has("noisy", 1, CHANGE_MAP)
     maps = {number: store.load("noisy", number, CHANGE_MAP) for number in tones}
     # The frame after a gap has none before it: gray.
     expected = {1: 0.5, 2: 0.5, 3: 0.75, 4: 0.25, 6: 0.5}
@@ -81,8 +80,10 @@ def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
     """At the exposure of the comparison, of every frame."""
     shot, reference = make_shots((1, 2, 4))
     methods = NOISY | ways(perfect=perfect)
-    results = compare_shot(shot, reference, methods, exposure=2.0, folder=tmp_path).results
-    expected = [flip_map(2 * shot.read(n).color, 2 * reference.read(n).color).mean() for n in shot.numbers]
+    results = compare_shot(shot, reference, methods, CompareOptions(exposure=2.0), folder=tmp_path).results
+    expected = [
+        flip_maps([2 * shot.read(n).color], 2 * reference.read(n).color)[0].mean() for n in shot.numbers
+    ]
     assert results[0].metrics["flip"].values == pytest.approx(expected, rel=1e-5)  # means of float32
     assert results[1].metrics["flip"].mean == 0
     store = FrameStore(tmp_path)
@@ -92,7 +93,7 @@ def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
 def test_frames_are_measured_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two frames wait for each other; the figures are in the order of the frames."""
     both = Barrier(2, timeout=60)
-    monkeypatch.setattr(judging, "AT_ONCE", 2)
+    monkeypatch.setattr(evaluation, "AT_ONCE", 2)
     shot, reference = make_shots((1, 2))
     alone = compare_shot(shot, reference, NOISY).results[0].metrics
 
@@ -100,7 +101,7 @@ def test_frames_are_measured_side_by_side(monkeypatch: pytest.MonkeyPatch) -> No
         both.wait()
         return float(image.mean())
 
-    monkeypatch.setitem(judging.MEASURES, "smape", meet)
+    monkeypatch.setitem(evaluation.MEASURES, "smape", meet)
     together = compare_shot(shot, reference, NOISY).results[0].metrics
     assert together["smape"].values == tuple(float(shot.read(number).color.mean()) for number in (1, 2))
     assert together["psnr"] == alone["psnr"]
@@ -141,7 +142,7 @@ def test_without_vectors_there_is_no_temporal_figure() -> None:
     comparison = compare_shot(MemoryShot(still), reference, NOISY)
     assert not {"temporal_psnr", "static_std"} & set(comparison.results[0].metrics)
     assert "psnr" in comparison.results[0].metrics
-    assert comparison.facts["Pixels that stand still"] == "0.0%"
+    assert comparison.facts["Static pixels"] == "0.0%"
 
 
 class TestMotionBetween:

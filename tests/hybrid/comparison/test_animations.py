@@ -1,4 +1,4 @@
-"""Loops hold the frames of every method in their order, small enough, and as movies in their own size."""
+"""Animations hold the frames of every method in their order, small enough, and as movies in their own size."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.comparison.embedding import ReportImages
-from hybrid.comparison.loops import QUALITY, TALLEST, embed_loops, mid_exposure, write_loops
+from hybrid.comparison import animations
+from hybrid.comparison.animations import QUALITY, TALLEST, embed_animations, mid_exposure, write_movies
+from hybrid.comparison.embedding import MethodImages, ShotImages
 from hybrid.files.png import encode_srgb
 from tests.hybrid.comparison.test_report import scene
 
@@ -29,11 +30,9 @@ def expected(level: float, number: int, exposure: float) -> float:
 
 @pytest.mark.parametrize("exposure", [1.0, 4.0])
 def test_a_sheet_holds_all_frames_of_a_method(exposure: float) -> None:
-    loops = embed_loops(
-        [ReportImages("dark", scene(0.1))], {"dark": "Dark"}, scene(0.5), FRAMES, exposure=exposure, rate=25, limit=1e6
-    )
-    assert [source["label"] for source in loops.info["sources"]] == ["Reference", "Dark"]
-    assert (loops.info["rate"], loops.info["frames"], loops.info["columns"]) == (25, FRAMES, 1)
+    loops = embed_animations(ShotImages([MethodImages("dark", scene(0.1))], scene(0.5), FRAMES, exposure))
+    assert [source["name"] for source in loops.info["sources"]] == ["reference", "dark"]
+    assert (loops.info["frames"], loops.info["columns"]) == (FRAMES, 1)
     width, height = loops.info["width"], loops.info["height"]
     assert (width, height) == (32, 18)
     for (name, text), level in zip(loops.elements, (0.5, 0.1), strict=True):
@@ -44,18 +43,20 @@ def test_a_sheet_holds_all_frames_of_a_method(exposure: float) -> None:
             assert part.mean() == pytest.approx(expected(level, number, exposure), abs=3)  # WebP has loss
 
 
-def test_many_frames_stand_in_columns_and_large_ones_are_made_smaller() -> None:
+def test_many_frames_stand_in_columns_and_large_ones_are_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     def tall(number: int) -> np.ndarray:
         return scene(0.5, (400, 100))(8)
 
     count = TALLEST // 400 + 1
-    loops = embed_loops([], {}, tall, range(count), exposure=1, rate=24, limit=1e9)
+    monkeypatch.setattr(animations, "LIMIT", 1e9)
+    loops = embed_animations(ShotImages([], tall, range(count)))
     assert loops.info["columns"] == 2
     assert max(sheet(loops.elements[0][1]).shape) <= TALLEST
     rng = np.random.default_rng(0)
     noise = rng.random((2, 300, 400, 3)).astype(np.float32)
-    full = embed_loops([], {}, lambda n: noise[n], [0, 1], exposure=1, rate=24, limit=1e9)
-    small = embed_loops([], {}, lambda n: noise[n], [0, 1], exposure=1, rate=24, limit=20_000)
+    full = embed_animations(ShotImages([], lambda n: noise[n], [0, 1]))
+    monkeypatch.setattr(animations, "LIMIT", 20_000)
+    small = embed_animations(ShotImages([], lambda n: noise[n], [0, 1]))
     assert len(full.elements[0][1]) > 20_000 >= len(small.elements[0][1])
     assert small.info["width"] < full.info["width"] == 400
     assert QUALITY < 90  # at which noise would need far more
@@ -63,11 +64,11 @@ def test_many_frames_stand_in_columns_and_large_ones_are_made_smaller() -> None:
 
 def test_movies_have_the_size_of_the_frames_and_names_that_are_none_of_the_users(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
-    images = [ReportImages("../up <b>", scene(0.1)), ReportImages("noisy", scene(2.0))]
-    names = write_loops(tmp_path / "loops", images, scene(0.5), FRAMES, exposure=1, rate=24)
+    images = [MethodImages("../up <b>", scene(0.1)), MethodImages("noisy", scene(2.0))]
+    names = write_movies(tmp_path / "movies", ShotImages(images, scene(0.5), FRAMES), 24)
     assert names == {"reference": "00_reference.mp4", "../up <b>": "01__up_b_.mp4", "noisy": "02_noisy.mp4"}
-    assert sorted(path.name for path in (tmp_path / "loops").iterdir()) == sorted(names.values())
-    with av.open(str(tmp_path / "loops" / "02_noisy.mp4")) as movie:
+    assert sorted(path.name for path in (tmp_path / "movies").iterdir()) == sorted(names.values())
+    with av.open(str(tmp_path / "movies" / "02_noisy.mp4")) as movie:
         shown = [frame.to_ndarray(format="rgb24") for frame in movie.decode(video=0)]
     assert [picture.shape for picture in shown] == [(18, 32, 3)] * 3
     for number, picture in zip(FRAMES, shown, strict=True):

@@ -1,35 +1,8 @@
-// What every part of the page uses: what was measured, elements, and figures as text.
+// What was measured, and figures as text.
 
 const report = JSON.parse(find("data").textContent);
 const results = new Map(report.results.map((result) => [result.name, result]));
 const metrics = new Map(report.metrics.map((metric) => [metric.key, metric]));
-
-function find(id) {
-  return document.getElementById(id);
-}
-
-function make(tag, text = "", kind = "") {
-  const element = document.createElement(tag);
-  element.textContent = text;
-  if (kind) element.className = kind;
-  return element;
-}
-
-function makeCanvas(width, height) {
-  const canvas = document.createElement("canvas");
-  canvas.width = width;
-  canvas.height = height;
-  return canvas;
-}
-
-function clamp(x, low, high) {
-  return Math.min(Math.max(x, low), high);
-}
-
-// A number with so many significant digits, and without zeros at its end.
-function rounded(value, digits) {
-  return Number(Number(value).toPrecision(digits));
-}
 
 function figureText(value, metric) {
   const number = Number(value);
@@ -40,12 +13,12 @@ function figureText(value, metric) {
 }
 
 function secondsText(value) {
-  if (value === null) return "not known";
+  if (value === null) return "unknown";
   return value === 0 ? "nothing" : rounded(value, 3) + " s";
 }
 
 function memoryText(value) {
-  if (value === null) return "not known";
+  if (value === null) return "unknown";
   return value < 2 ** 30 ? (value / 2 ** 20).toFixed(0) + " MiB" : (value / 2 ** 30).toFixed(2) + " GiB";
 }
 

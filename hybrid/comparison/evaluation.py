@@ -1,4 +1,4 @@
-"""The frames that methods have left, measured against the reference: each by itself, in pairs, and through time."""
+"""Evaluation of the methods' frames against the reference: per frame, per pair of frames, and over time."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from hybrid.comparison.metrics import (
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
-from hybrid.files.frame import Frame
-from hybrid.files.shots import Shot
+from hybrid.files.frame import Frame, Frames
 from hybrid.plan import STILL
 
 Array = NDArray[np.float32]
 Measure = Callable[[Array, Reference, float], float]  # of image, reference, exposure
+Level = tuple[Frames, float]  # a render of the shot, and its samples per pixel
 
 
 def _whole(reference: Reference) -> NDArray[np.floating]:
-    """The reference as one image: the mean of its halves, where it comes in halves."""
+    """The reference as one image: the mean of its halves."""
     return (reference[0] + reference[1]) / 2 if isinstance(reference, tuple) else reference
 
 
-# Frames that are measured side by side: each of 1920×1080 takes half a gigabyte, in double precision.
+# Frames measured in parallel: each of 1920×1080 takes half a gigabyte, in double precision.
 AT_ONCE = min(os.cpu_count() or 1, 4)
-# What is measured on a frame by itself, beside FLIP and the measures over time.
+# Measures of single frames, without FLIP.
 MEASURES: dict[str, Measure] = {
     "psnr": lambda x, r, e: psnr(x, r, exposure=e),
     "ssim": lambda x, r, e: ssim(x, _whole(r), exposure=e),
@@ -54,29 +54,29 @@ MEASURES: dict[str, Measure] = {
     "smape": lambda x, r, e: smape(x, _whole(r), exposure=e),
     "mean_bias": lambda x, r, _: mean_bias(x, _whole(r)),
 }
-# A pixel's light stands still where the 9×9 means of the reference change by less than this, on the tone curve: well
-# above their noise (a ninth of the pixels'), well below what anyone would call a change.
-STEADY = 0.02
-# How much brighter the map of changes shows them: a change of a fiftieth of the tone curve is black or white.
-AMPLIFIED = 25
+# Static light: 9×9 means of the reference change by less than this on the tone curve. Well above their noise (a ninth
+# of the pixels'), well below a visible change.
+STATIC_CHANGE = 0.02
+# Gain of the map of changes: a change of a fiftieth of the tone curve is black or white.
+CHANGE_GAIN = 25
 
 
 @dataclass(frozen=True)
-class Judge:
-    """What all methods are measured with.
+class Evaluator:
+    """Evaluates the frames of methods in a store.
 
     Attributes
     ----------
     store : FrameStore
-        With the frames of the methods, the reference, and the flow of each pair.
+        Holds the methods' frames, the reference, and the flow of each pair.
     numbers : sequence of int
-        Of the frames that are judged.
+        Frames to evaluate.
     pairs : sequence of (int, int)
         Neighbouring frames with a flow between them, from `store_flows`.
     exposure : float
         Factor before the tone curve, one for the whole shot.
     static : (H, W) array of bool
-        Pixels that stand still, from `find_static_pixels`.
+        Static pixels, from `find_static_pixels`.
     """
 
     store: FrameStore
@@ -86,17 +86,12 @@ class Judge:
     static: NDArray[np.bool_]
 
     def map_flip(self, names: Sequence[str]) -> None:
-        """Keep the maps of FLIP of several methods: what the reference looks like is found out once for all.
-
-        Parameters
-        ----------
-        names : sequence of str
-            The methods'.
+        """Store the FLIP maps of several methods at once: they share the computations on the reference.
 
         Raises
         ------
         ValueError
-            If one has left a frame out.
+            If a method has left out a frame.
         """
         for name in names:
             self._check_frames(name)
@@ -104,26 +99,26 @@ class Judge:
             list(threads.map(partial(self._map_flip, names), self.numbers))
 
     def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
-        """Measure the frames of a method, and pairs of them, side by side.
+        """Measure the frames of a method, and pairs of frames.
 
         Parameters
         ----------
         name : str
-            The method's.
+            Name of the method.
         flip : bool
-            Whether by FLIP too, whose maps `map_flip` has made.
+            Include FLIP, from the maps of `map_flip`.
         change : bool
-            Whether the map of what changes between frames is kept too.
+            Store the maps of changes between frames.
 
         Returns
         -------
         dict of str to Statistic
-            By measure; those over time are there where there are pairs, or pixels that stand still.
+            By measure; measures over time only with pairs or static pixels.
 
         Raises
         ------
         ValueError
-            If the method has left a frame out.
+            If the method has left out a frame.
         """
         self._check_frames(name)
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
@@ -143,62 +138,63 @@ class Judge:
         return {key: summarize(series) for key, series in values.items() if series}
 
     def _check_frames(self, name: str) -> None:
+        """Raise ValueError if the method has left out a frame."""
         missing = [number for number in self.numbers if not self.store.has(name, number)]
         if missing:
             raise ValueError(f"method {name!r} gave no frame {missing[0]}, expected all of {len(self.numbers)}")
 
     def _map_flip(self, names: Sequence[str], number: int) -> None:
-        """Keep the methods' maps of FLIP of a frame."""
+        """Store the methods' FLIP maps of a frame."""
         images = [self.store.load(name, number, lazily=True) for name in names]
         maps = flip_maps(images, self.store.load(REFERENCE, number), self.exposure)
         for name, errors in zip(names, maps, strict=True):
             self.store.save(name, number, errors, FLIP_MAP)
 
     def _map_change(self, name: str, number: int) -> None:
-        """Keep what a frame changes along the motion, amplified, on the tone curve: 0.5 is still, (H, W) in [0, 1].
+        """Store the map of motion-compensated changes on the tone curve, amplified: (H, W) in [0, 1], 0.5: no change.
 
-        With W the warp of the frame before, it is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5 where
-        no motion leads to a pixel. Unlike temporal PSNR it also shows what changes in truth: light, what mirrors show.
+        With W the warp of the previous frame, the map is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5
+        where no motion leads to a pixel. Unlike temporal PSNR it also shows real changes: light, reflections.
         """
         current = tone_map(self.store.load(name, number), self.exposure)
-        before = next((pair[0] for pair in self.pairs if pair[1] == number), None)
-        shown = np.full(current.shape[:2], 0.5, np.float32)
-        if before is not None:
+        previous = next((pair[0] for pair in self.pairs if pair[1] == number), None)
+        changes = np.full(current.shape[:2], 0.5, np.float32)
+        if previous is not None:
             motion = self.store.load(REFERENCE, number, FLOW)
-            earlier = tone_map(self.store.load(name, before), self.exposure).astype(np.float32)
-            change = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
-            known = (motion[..., 2] > 0) & np.isfinite(change)
-            shown[known] = np.clip(0.5 + AMPLIFIED * change[known], 0, 1)
-        self.store.save(name, number, shown, CHANGE_MAP)
+            earlier = tone_map(self.store.load(name, previous), self.exposure).astype(np.float32)
+            difference = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
+            valid = (motion[..., 2] > 0) & np.isfinite(difference)
+            changes[valid] = np.clip(0.5 + CHANGE_GAIN * difference[valid], 0, 1)
+        self.store.save(name, number, changes, CHANGE_MAP)
 
     def _measure_frame(self, name: str, number: int) -> dict[str, float]:
-        image, truth = self.store.load(name, number), self.store.load_reference(number)
-        return {key: measure(image, truth, self.exposure) for key, measure in MEASURES.items()}
+        image, reference = self.store.load(name, number), self.store.load_reference(number)
+        return {key: measure(image, reference, self.exposure) for key, measure in MEASURES.items()}
 
     def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
         images = [self.store.load(name, number) for number in pair]
-        truths = [self.store.load_reference(number) for number in pair]
+        references = [self.store.load_reference(number) for number in pair]
         motion = self.store.load(REFERENCE, pair[1], FLOW)
         flows, valid = [motion[..., :2]], [motion[..., 2] > 0]
-        return float(temporal_psnr(images, truths, flows, valid, exposure=self.exposure)[0])
+        return float(temporal_psnr(images, references, flows, valid, exposure=self.exposure)[0])
 
     def find_noise_law(
         self,
         noisy: Statistic,
         samples: float | None,
-        levels: Sequence[tuple[Shot, float]],
+        levels: Sequence[Level],
         reference_samples: float | None,
     ) -> tuple[NoiseLaw, str]:
-        """Find how the error of the noisy render falls with its samples.
+        """Measure the error of the noisy render against its samples.
 
         Parameters
         ----------
         noisy : Statistic
-            The PSNR of the noisy frames.
+            PSNR of the noisy frames.
         samples : float, optional
-            Theirs per pixel; without, only ratios can be told.
-        levels : sequence of (Shot, float)
-            Further renders of the shot with their samples per pixel.
+            Samples per pixel of the noisy frames; if unknown, `worth` is a ratio without a scale in samples.
+        levels : sequence of (Frames, float)
+            Renders of the shot at other samples per pixel.
         reference_samples : float, optional
             Samples per pixel of the reference.
 
@@ -206,14 +202,14 @@ class Judge:
         -------
         NoiseLaw
         str
-            What is known of the reference's noise, in words.
+            Description of the reference's noise.
         """
-        known = [(samples or 1.0, _mean_error(noisy.values))]
+        known = [(samples or 1.0, error_of(noisy))]
         for shot, count in levels:
             common = [number for number in self.numbers if shot.has(number)]
-            truths = map(self.store.load_reference, common)
-            scores = [psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in zip(common, truths, strict=True)]
-            known.append((count, _mean_error(scores)))
+            references = map(self.store.load_reference, common)
+            pairs = zip(common, references, strict=True)
+            known.append((count, _mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
         known.sort()
         floor, words = self._find_floor(known, samples, reference_samples)
         return NoiseLaw(tuple(known), samples or 1.0, floor), words
@@ -221,34 +217,34 @@ class Judge:
     def _find_floor(
         self, known: Sequence[tuple[float, float]], samples: float | None, reference_samples: float | None
     ) -> tuple[float, str]:
-        """The reference's part in the errors of `known`, and in words what is known of its noise."""
+        """The reference's part in the errors of `known`, and a description of its noise."""
         if isinstance(self.store.load_reference(self.numbers[0]), tuple):
             level = decibels(np.mean([self._error_of_halves(number) for number in self.numbers]))
             return 0.0, (
-                f"Two independent halves; their mean has a noise of {level} PSNR. PSNR, temporal PSNR "
-                "and relMSE are products of the errors against both, free of it; the others are taken against the mean."
+                f"Two independent halves; their mean has a noise of {level} PSNR. PSNR, temporal PSNR and relMSE are "
+                "products of the errors against both halves, free of that noise; the other measures use their mean."
             )
         if samples is not None and reference_samples is not None:
             floor = reference_floor(known[-1][1], known[-1][0], reference_samples)
             source = f"by the 1/n law of its {reference_samples:g} samples per pixel"
         elif len(known) > 1:
             floor = fit_floor(known)
-            source = "by what the measured levels have in common"
+            source = "from the common part of the measured levels"
         else:
-            return 0.0, "One render; its noise is not known and counts as error of the methods."
+            return 0.0, "One render; its noise is unknown and counts as error of the methods."
         return floor, (
-            f"One render with a noise of {decibels(floor)} PSNR, {source}. It counts as error of the methods and "
-            "compresses differences between those that come near it; it is taken off only for the worth in samples."
+            f"One render with a noise of {decibels(floor)} PSNR, {source}. The noise counts as error of the methods "
+            "and reduces differences between methods close to it; it is subtracted for the worth in samples only."
         )
 
     def _error_of_halves(self, number: int) -> float:
-        """Mean squared error of the mean of the reference's halves: half of half of that between them."""
+        """Mean squared error of the mean of the reference's halves: a quarter of that between the halves."""
         a, b = (tone_map(self.store.load(REFERENCE, number, half), self.exposure) for half in HALVES)
         return float(np.mean((a - b) ** 2)) / 4
 
 
 def error_of(statistic: Statistic) -> float:
-    """Mean squared error of frames whose PSNR is known."""
+    """Mean squared error from the PSNR of frames."""
     return _mean_error(statistic.values)
 
 
@@ -256,20 +252,18 @@ def _mean_error(scores: Sequence[float]) -> float:
     return float(np.mean([float(10 ** (-score / 10)) for score in scores]))
 
 
-# What is made ready before any method is judged
+# Prepared once for all methods
 
 
-def store_reference(store: FrameStore, halves: Sequence[Shot], numbers: Sequence[int]) -> None:
-    """Keep the reference of every frame: the mean of its halves, and the halves where there are two.
+def store_reference(store: FrameStore, halves: Sequence[Frames], numbers: Sequence[int]) -> None:
+    """Store the reference of every frame: the mean of its halves, and the halves if there are two.
 
     Parameters
     ----------
     store : FrameStore
-        Where it is kept.
-    halves : sequence of Shot
-        One reference, or two independent ones.
+    halves : sequence of Frames
+        One reference, or two independent halves.
     numbers : sequence of int
-        Of the frames.
     """
     for number in numbers:
         images = [half.read(number).color for half in halves]
@@ -279,22 +273,14 @@ def store_reference(store: FrameStore, halves: Sequence[Shot], numbers: Sequence
                 store.save(REFERENCE, number, image, half)
 
 
-def store_flows(store: FrameStore, shot: Shot, numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Keep flow and validity of the pairs of neighbouring frames, once for all methods.
+def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Store flow and validity of neighbouring frames from the shot's vectors; return the pairs that have a flow.
 
     Parameters
     ----------
     store : FrameStore
-        Where they are kept.
-    shot : Shot
-        Whose vectors lead from frame to frame.
+    shot : Frames
     numbers : sequence of int
-        Of the frames.
-
-    Returns
-    -------
-    list of (int, int)
-        The pairs that have a flow.
     """
     pairs = []
     for a, b in pairwise(numbers):
@@ -308,16 +294,15 @@ def store_flows(store: FrameStore, shot: Shot, numbers: Sequence[int]) -> list[t
 def find_static_pixels(
     store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
 ) -> NDArray[np.bool_]:
-    """Find where nothing moves from the first frame to the last, and the reference's light stays what it is.
+    """Find pixels without motion and without a change of the reference's light, from the first frame to the last.
 
     Parameters
     ----------
     store : FrameStore
-        With the reference and the flows.
+        Holds the reference and the flows.
     numbers : sequence of int
-        Of the frames.
     pairs : sequence of (int, int)
-        From `store_flows`; unless they are all, nothing is known to stand still.
+        From `store_flows`; unless all neighbouring frames have a flow, no pixel counts as static.
     exposure : float
         Factor before the tone curve.
 
@@ -332,7 +317,7 @@ def find_static_pixels(
     for number in numbers:
         tone = cv2.blur(tone_map(store.load(REFERENCE, number), exposure), (9, 9))
         least, most = np.minimum(least, tone), np.maximum(most, tone)
-    static = np.all(most - least < STEADY, axis=-1)
+    static = np.all(most - least < STATIC_CHANGE, axis=-1)
     for _, number in pairs:
         motion = store.load(REFERENCE, number, FLOW)
         static &= (np.hypot(motion[..., 0], motion[..., 1]) < STILL) & (motion[..., 2] > 0)
@@ -340,7 +325,7 @@ def find_static_pixels(
 
 
 def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.bool_]] | None:
-    """Find where the pixels of a frame were one frame before, by the renderer's vectors.
+    """Return the flow from `current` to `previous` by the renderer's vectors, and its validity; None without vectors.
 
     Parameters
     ----------
@@ -350,31 +335,32 @@ def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.b
     Returns
     -------
     flow : (H, W, 2) array
-        Pixels, from `current` to `previous`. None, and no mask, where neither has vectors between them.
+        Pixels.
     valid : (H, W) array of bool
-        True where it leads to the same point of the scene: inside the frame, and back again by the previous
-        frame's own vectors; where it has none, to the same albedo.
+        True where the flow leads to the same point of the scene: inside the frame, and back again by the previous
+        frame's vectors, or without these to the same albedo.
 
     References
     ----------
     Sundaram et al. 2010, doi:10.1007/978-3-642-15549-9_32, eq. 5
     """
-    here, before = current.flows(), previous.flows()
-    known, back = here and here.to_previous, before and before.to_next
+    current_flows, previous_flows = current.flows(), previous.flows()
+    known = current_flows and current_flows.to_previous
+    back = previous_flows and previous_flows.to_next
     if known is None and back is not None:
         known = Vectors(*invert_flow(back.flow, valid=back.valid, depth=previous.depth))
     if known is None:
         return None
     flow, valid = known
     if back is not None:
-        there, inside = warp(back.flow, flow)
-        lengths = np.sum(flow**2, axis=-1) + np.sum(there**2, axis=-1)
+        warped_back, inside = warp(back.flow, flow)
+        lengths = np.sum(flow**2, axis=-1) + np.sum(warped_back**2, axis=-1)
         # Sundaram's eq. 5: a hundredth of the motion, and half a square pixel for interpolation.
         agree = forward_backward_error(flow, back.flow) ** 2 < 0.01 * lengths + 0.5
     elif previous.albedo is not None and current.albedo is not None:
-        there, inside = warp(previous.albedo, flow)
+        warped_albedo, inside = warp(previous.albedo, flow)
         # Albedo is in [0, 1]. Another surface seldom differs by less; film sampling and a lens by less than this.
-        agree = np.max(np.abs(there - current.albedo), axis=-1) < 0.1
+        agree = np.max(np.abs(warped_albedo - current.albedo), axis=-1) < 0.1
     else:
         _, inside = warp(flow, flow)
         agree = np.ones_like(inside)
