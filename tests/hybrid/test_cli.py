@@ -456,7 +456,7 @@ def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, ca
     # Finished reports are joined without running anything; the old name of the option is accepted.
     words = ["compare", "--with-report", out, "--beside", out, "-o", out / "both", "--markdown"]
     _, table, err = run(capsys, *words)
-    assert "--beside is the old name of --with-report" in err
+    assert "--beside is now --with-report" in err
     assert table.splitlines()[0].count("hall: PSNR") == 2
     assert "All shots" in (out / "both" / "report.html").read_text()
 
