@@ -63,7 +63,7 @@ class Job:
             raise ValueError(f"{reason} ({Path(pattern).parent})")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
         network = ["denoise", f"--preset={chosen.preset}"]
-        how = ["pseudoref", "--estimate=auto"] if chosen.preset == "average" else network
+        how = ["denoise", "--method=classical", "--first-pass=auto"] if chosen.preset == "average" else network
         arguments = [settings.executable(), *how, pattern, f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")

@@ -58,7 +58,7 @@ def main() -> int:
         ravg("simulate", kind, "-o", shots, *RENDER, *drawn)
     # Whole frames, of which training takes crops.
     ravg(
-        "prepare",
+        "make-clips",
         *sorted(shots.iterdir()),
         "-o",
         clips,
@@ -66,7 +66,7 @@ def main() -> int:
         "target",
         "--tile",
         0,
-        "--estimate",
+        "--first-pass",
         "oidn-fast",
         "--frames",
         "2-6",

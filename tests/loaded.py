@@ -25,7 +25,7 @@ with tempfile.TemporaryDirectory() as _folder, open(os.devnull, "w") as _nowhere
         os.dup2(_nowhere.fileno(), _descriptor)
     _noisy = str(Scene().write(Path(_folder, "in")))
     for _preset in ("draft", "standard", "final"):
-        main(["pseudoref", _noisy, "-o", str(Path(_folder, _preset)), "--preset", _preset])
+        main(["denoise", _noisy, "-o", str(Path(_folder, _preset)), "--preset", _preset])
     for _words in (["denoise", "--help"], ["inspect", _noisy]):
         main(_words)
 for _descriptor, _original in zip((1, 2), _kept, strict=True):

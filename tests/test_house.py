@@ -194,9 +194,9 @@ def without_torch(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
-def test_inspect_and_pseudoref_work_without_torch(shot_folder, tmp_path):
+def test_inspect_and_classical_methods_work_without_torch(shot_folder, tmp_path):
     assert without_torch("inspect", str(shot_folder)).returncode == 0
-    done = without_torch("pseudoref", str(shot_folder), "-o", str(tmp_path), "--preset", "draft")
+    done = without_torch("denoise", str(shot_folder), "-o", str(tmp_path), "--preset", "draft")
     assert done.returncode == 0, done.stderr
     assert len(list(tmp_path.glob("*.exr"))) == 3
 

@@ -56,8 +56,7 @@ class ShotInput:
         with usage():
             if self.frames is not None:
                 parse_frames(self.frames)
-            if self.motion not in (None, "auto", "none"):
-                parse_motion(self.motion or "")
+        parse_input(self.profile, self.motion)
 
     def open(self) -> Shot:
         """Open the shot; warnings are logged."""
@@ -66,7 +65,7 @@ class ShotInput:
             self.shot,
             frames=self.frames,
             layers=parse_layers(self.layer),
-            profile=parse_profile(self.profile),
+            profile=parse_input(self.profile, self.motion),
             motion=self.motion,
             aovs=tuple(self.aovs),
             keep=0,  # the stream of windows holds what is made of a frame
@@ -77,9 +76,11 @@ class ShotInput:
         return opened
 
 
-def parse_profile(profile: str | None) -> Profile | None:
-    """Open the profile that is asked for."""
+def parse_input(profile: str | None, motion: str | None) -> Profile | None:
+    """Return the profile that is asked for; BadParameter for a motion that is no convention."""
     with usage():
+        if motion not in (None, "auto", "none"):
+            parse_motion(motion or "")
         return None if profile is None else open_profile(profile)
 
 

@@ -27,7 +27,7 @@ from hybrid.commands.options import (
     choose,
     usage,
 )
-from hybrid.commands.shots import import_neural, judge_alike, parse_layers, parse_profile, say_cuts
+from hybrid.commands.shots import import_neural, judge_alike, parse_input, parse_layers, say_cuts
 from network.training.config import SamplerConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def make_clips(
 
     with usage():
         samples = None if levels is None else parse_samples(levels)
-    roles, chosen = parse_layers(layer), parse_profile(profile)
+    roles, chosen = parse_layers(layer), parse_input(profile, motion)
     found = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
     names = [name for name, _, _ in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):

@@ -109,7 +109,7 @@ def test_an_option_of_one_name_stands_in_one_group_of_every_help():
     assert {option for option, named in groups.items() if len(named) > 1} <= SAID_BY_EACH
 
 
-@pytest.mark.parametrize("command", [["denoise", "-o", "x"], ["pseudoref", "-o", "x"], ["inspect"]])
+@pytest.mark.parametrize("command", [["denoise", "-o", "x"], ["denoise", "--method=classical", "-o", "x"], ["inspect"]])
 def test_a_pattern_that_the_shell_has_replaced_is_to_be_quoted(shot_folder, capsys, command):
     """The error named the other files alone."""
     files = sorted(shot_folder.glob("*.exr"))
@@ -159,13 +159,13 @@ def test_inspect_names_channels_and_decisions(shot_folder, capsys):
         assert word in out
 
 
-def test_pseudoref_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):
+def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):
     scene = Scene()
     folder, out = scene.write(tmp_path / "in"), tmp_path / "out"
     preview = tmp_path / "look.png"
     code, _, err = run(
         capsys,
-        "pseudoref",
+        "denoise",
         folder / "shot.####.exr",
         "-o",
         out / "done.####.exr",
@@ -196,13 +196,13 @@ def test_pseudoref_writes_denoised_frames_that_keep_everything_else(tmp_path, ca
 
 
 def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
-    _, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-stages", "warp")
+    _, _, err = run(capsys, "denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-stages", "warp")
     assert "not run: warp (forced" in " ".join(err.split())
 
 
 def test_a_hole_is_a_warning_where_nobody_asked_for_it(shot_folder, tmp_path, capsys):
     (shot_folder / "shot.1003.exr").rename(shot_folder / "shot.1004.exr")
-    code, _, err = run(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft")
+    code, _, err = run(capsys, "denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft")
     assert code == 0
     assert "warning: missing frames 1003" in err
 
@@ -210,7 +210,7 @@ def test_a_hole_is_a_warning_where_nobody_asked_for_it(shot_folder, tmp_path, ca
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_a_frame_that_was_asked_for_and_is_not_there_is_an_error(shot_folder, tmp_path, capsys, keep_going):
     (shot_folder / "shot.1002.exr").unlink()
-    words = ["pseudoref", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--frames", "1001-1003"]
+    words = ["denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--frames", "1001-1003"]
     code, _, err = run(capsys, *words, *(["--keep-going"] if keep_going else []))
     assert code == 1
     made = {path.name for path in (tmp_path / "o").glob("*.exr")}
@@ -228,7 +228,7 @@ def test_frames_that_cannot_be_made_are_told_by_the_exit_code(tmp_path, capsys, 
     victim = folder / "shot.1004.exr"
     victim.write_bytes(victim.read_bytes()[:-2000])
     options = ["--preset", "draft", *(["--keep-going"] if keep_going else [])]
-    assert run(capsys, "pseudoref", folder, "-o", out, *options)[0] == 1
+    assert run(capsys, "denoise", "--method=classical", folder, "-o", out, *options)[0] == 1
     made = {int(path.name.split(".")[1]) for path in out.glob("*.exr")}
     code, text, _ = run(capsys, "status", out, "--json")
     document = json.loads(text)
@@ -261,7 +261,7 @@ def test_frames_of_different_size_are_named(shot_folder, tmp_path, capsys):
     Scene(height=44).write(tmp_path / "other")
     os.replace(tmp_path / "other" / "shot.1002.exr", shot_folder / "shot.1002.exr")
     out = tmp_path / "o"
-    assert "56x4" in one_line_error(capsys, "pseudoref", shot_folder, "-o", out)
+    assert "56x4" in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", out)
     assert not list(out.glob("*.exr"))
 
 
@@ -272,7 +272,7 @@ def test_fireflies_are_counted_in_every_window_they_are_in(tmp_path, capsys):
 
     folder, out = Scene().write(tmp_path / "in", edit=sparks), tmp_path / "out"
     stages = ["--stages", "outliers", "--no-stages", "fireflies"]  # which would take them out of their frame before
-    code, _, err = run(capsys, "pseudoref", folder, "-o", out, "--preset", "draft", *stages)
+    code, _, err = run(capsys, "denoise", folder, "-o", out, "--preset", "draft", *stages)
     assert code == 0, err
     ((_, report),) = read_records(out)
     assert report["outliers"] == 2 * 3  # two, in each of three windows; vectors are whole pixels
@@ -282,7 +282,7 @@ def test_a_truncated_file_is_named_and_leaves_no_partial_output(tmp_path, capsys
     folder, out = Scene(frames=7).write(tmp_path / "in"), tmp_path / "o"
     victim = folder / "shot.1007.exr"
     victim.write_bytes(victim.read_bytes()[:-2000])
-    assert "shot.1007.exr" in one_line_error(capsys, "pseudoref", folder, "-o", out, "--preset", "draft")
+    assert "shot.1007.exr" in one_line_error(capsys, "denoise", folder, "-o", out, "--preset", "draft")
     # Windows of five frames: those without it are finished, and nothing else is there but the record.
     finished = {path.name for path in out.iterdir()} - {"ravg"}
     assert finished == {f"shot.{number}.exr" for number in range(1001, 1005)}
@@ -292,17 +292,17 @@ def test_a_truncated_file_is_named_and_leaves_no_partial_output(tmp_path, capsys
 
 def test_the_input_is_not_overwritten(shot_folder, capsys):
     before = {path: path.read_bytes() for path in shot_folder.iterdir()}
-    assert "overwrite" in one_line_error(capsys, "pseudoref", shot_folder, "-o", shot_folder)
+    assert "overwrite" in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", shot_folder)
     assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("command", ["pseudoref", pytest.param("denoise", marks=pytest.mark.neural)])
-def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, command):
-    if command == "denoise":
+@pytest.mark.parametrize("method", ["classical", pytest.param("network", marks=pytest.mark.neural)])
+def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, method):
+    if method == "network":
         pytest.importorskip("torch")
     theirs = Path(shutil.copytree(shot_folder, tmp_path / "theirs"))
     before = {path: path.read_bytes() for path in theirs.iterdir()}
-    words = (command, shot_folder, "--estimate", theirs, "-o", theirs)
+    words = ("denoise", "--method", method, shot_folder, "--first-pass", theirs, "-o", theirs)
     assert "would overwrite an input: estimate" in one_line_error(capsys, *words)
     assert {path: path.read_bytes() for path in theirs.iterdir()} == before
 
@@ -314,7 +314,7 @@ def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys,
     """The second pass reads what the first has made, and used to write over what that was made from."""
     pytest.importorskip("torch")
     before = {path: path.read_bytes() for path in shot_folder.iterdir()}
-    words = ["denoise", shot_folder, "--estimate", "nlm", "--passes", passes]
+    words = ["denoise", shot_folder, "--first-pass", "nlm", "--passes", passes]
     if option == "-o":
         words += ["-o", shot_folder / "shot.####.exr"]
     else:
@@ -329,19 +329,21 @@ def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys,
 def test_a_read_only_folder_is_named(shot_folder, tmp_path, capsys):
     out = tmp_path / "o"
     out.mkdir(mode=0o500)
-    assert str(out) in one_line_error(capsys, "pseudoref", shot_folder, "-o", out)
+    assert str(out) in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", out)
 
 
 def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
     (tmp_path / "o").write_text("not a folder")
-    assert str(tmp_path / "o") in one_line_error(capsys, "pseudoref", shot_folder, "-o", tmp_path / "o" / "x.####.exr")
+    assert str(tmp_path / "o") in one_line_error(
+        capsys, "denoise", "--method=classical", shot_folder, "-o", tmp_path / "o" / "x.####.exr"
+    )
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["pseudoref"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--preset", "best"],
+        ["denoise"],
+        ["denoise", "SHOT", "-o", "OUT", "--preset", "best"],
         ["inspect", "SHOT", "--layer", "color"],
         ["inspect", "SHOT", "--layer", "sound=beauty"],
         ["inspect", "SHOT", "--frames", "first-last"],
@@ -349,22 +351,22 @@ def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
         ["inspect", "SHOT", "--no-such-option"],
         ["inspect", "SHOT", "--quiet", "--verbose"],
         ["inspect", "SHOT", "--log-format", "prose"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--estimate", "best"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "much"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "0"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "8"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", ""],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--first-pass", "best"],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-memory", "much"],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-memory", "0"],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-memory", "8"],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-memory", ""],
         ["denoise", "SHOT", "-o", "OUT", "--tile", "0"],
         ["denoise", "SHOT", "-o", "OUT", "--tile", "1e9"],
         ["inspect", "SHOT", "--frames", ""],
         ["inspect", "SHOT", "--frames", "1001-1003x0"],
         ["inspect", "SHOT", "--frames", "1-999999999999"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-memory", "9" * 400],
-        ["pseudoref", "SHOT", "-o", "OUT", "--max-pixels", "0"],
-        ["pseudoref", "SHOT", "-o", ""],
-        ["pseudoref", "SHOT", "-o", "OUT.tif"],
-        ["pseudoref", "SHOT", "-o", "out.####.PNG"],
-        ["pseudoref", "SHOT", "-o", "OUT", "--layer", "color="],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-memory", "9" * 400],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--max-pixels", "0"],
+        ["denoise", "--method=classical", "SHOT", "-o", ""],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT.tif"],
+        ["denoise", "--method=classical", "SHOT", "-o", "out.####.PNG"],
+        ["denoise", "--method=classical", "SHOT", "-o", "OUT", "--layer", "color="],
         ["compare", "SHOT", "--reference", "SHOT", "--clock", "sun"],
         ["compare", "SHOT", "--reference", "SHOT", "--samples", "0"],
         ["simulate", "random", "-o", "OUT", "--size", "large"],
@@ -394,7 +396,7 @@ def test_the_bundled_network_makes_the_estimates_where_asked(shot_folder, tmp_pa
     words = ["denoise", shot_folder, "-o", tmp_path / "out", "--frames", Scene().first, "--verbose"]
     pictures = []
     for source in ("bundled", "nlm"):
-        code, _, _ = run(capsys, *words, "--estimate", source)
+        code, _, _ = run(capsys, *words, "--first-pass", source)
         assert code == 0
         pictures.append(read_exr(tmp_path / "out" / f"shot.{Scene().first}.exr").pixels(("ViewLayer.Combined.R",)))
     assert not np.array_equal(*pictures)
@@ -410,10 +412,10 @@ def test_the_bundled_network_makes_the_estimates_where_asked(shot_folder, tmp_pa
         ["denoise", "SHOT", "-o", "OUT", "--tile", "3"],
         ["denoise", "SHOT", "-o", "OUT", "--passes", "0"],
         ["denoise", "SHOT", "-o", "OUT", "--preset", "auto", "--budget", "soon"],
-        ["prepare", "SHOT", "-o", "OUT", "--window", "4"],
-        ["prepare", "SHOT", "-o", "OUT", "--levels", "many"],
-        ["prepare", "SHOT", "-o", "OUT", "--estimate", "best"],
-        ["denoise", "SHOT", "-o", "OUT", "--estimate", "none", "--breakdown", "weights.jpg"],
+        ["make-clips", "SHOT", "-o", "OUT", "--window", "4"],
+        ["make-clips", "SHOT", "-o", "OUT", "--levels", "many"],
+        ["make-clips", "SHOT", "-o", "OUT", "--first-pass", "best"],
+        ["denoise", "SHOT", "-o", "OUT", "--first-pass", "none", "--breakdown", "weights.jpg"],
         ["train", "SHOT", "-o", "OUT"],
         ["train", "SHOT", "-o", "OUT", "--steps", "1", "--threads", "0"],
         ["train", "SHOT", "-o", "OUT", "--steps", "1", "--preset", "best"],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.cli import main
+from hybrid.cli import OLD_OPTIONS, main
 from hybrid.records import read_records
 from tests.scenes import Scene
 
@@ -39,7 +39,7 @@ OPTIONS = ["--preset", "standard"]
 def whole(shot, tmp_path_factory):
     """The bytes of every frame, made in one run."""
     out = tmp_path_factory.mktemp("whole") / "out"
-    assert main(["pseudoref", str(shot), "-o", str(out), *OPTIONS]) == 0
+    assert main(["denoise", str(shot), "-o", str(out), *OPTIONS]) == 0
     frames = contents(out)
     assert len(frames) == FRAMES
     return frames
@@ -52,7 +52,7 @@ def contents(folder):
 def test_frames_differ_in_their_plans(whole, shot, tmp_path):
     """Or the tests beside this one would show nothing."""
     out = tmp_path / "out"
-    assert main(["pseudoref", str(shot), "-o", str(out), *OPTIONS]) == 0
+    assert main(["denoise", str(shot), "-o", str(out), *OPTIONS]) == 0
     ((_, record),) = read_records(out)
     assert len({tuple(entry["stages"]) for entry in record["frames"].values()}) > 1
     assert contents(out) == whole
@@ -61,7 +61,7 @@ def test_frames_differ_in_their_plans(whole, shot, tmp_path):
 def test_frame_by_frame_and_backwards(shot, whole, tmp_path, capsys):
     out = tmp_path / "out"
     for number in reversed(range(1001, 1001 + FRAMES)):
-        assert main(["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--frames", str(number)]) == 0
+        assert main(["denoise", str(shot), "-o", str(out), *OPTIONS, "--frames", str(number)]) == 0
     assert contents(out) == whole
     assert len(list((out / "ravg").glob("*.json"))) == FRAMES
     capsys.readouterr()
@@ -71,7 +71,7 @@ def test_frame_by_frame_and_backwards(shot, whole, tmp_path, capsys):
 
 def test_chunks_of_three_by_four_processes_at_once(shot, whole, tmp_path):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "hybrid.cli", "pseudoref", str(shot), "-o", str(out), *OPTIONS]
+    command = [sys.executable, "-m", "hybrid.cli", "denoise", str(shot), "-o", str(out), *OPTIONS]
     chunks = ["1010", "1007-1009", "1004-1006", "1001-1003"]
     running = [subprocess.Popen([*command, "--frames", chunk, "--quiet"], cwd=ROOT) for chunk in chunks]
     assert [process.wait() for process in running] == [0] * 4
@@ -119,7 +119,7 @@ def test_open_job_description_runs_chunks_and_reads_their_progress(openjd, tmp_p
     for words in ("openjd_progress: 50.0", "openjd_progress: 100.0", "openjd_status: frame 1003"):
         assert words in done.stdout
     at_once = tmp_path / "whole"
-    assert main(["denoise", str(shot), "-o", str(at_once / "done.####.exr"), "--estimate", "nlm"]) == 0
+    assert main(["denoise", str(shot), "-o", str(at_once / "done.####.exr"), "--first-pass", "nlm"]) == 0
     assert contents(out) == contents(at_once)
     assert len(contents(out)) == 3
 
@@ -130,7 +130,7 @@ def test_the_template_asks_for_frames_that_the_command_knows():
     options = {line.split()[1] for line in text.splitlines() if line.strip().startswith("- --")}
     assert options == {"--output", "--frames", "--preset", "--estimate", "--resume", "--keep-going", "--log-format"}
     shown = _help()
-    assert all(option in shown for option in options)
+    assert all(OLD_OPTIONS.get(option, option) in shown for option in options)
 
 
 def _help():

@@ -320,7 +320,7 @@ def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkey
     monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
     monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **mode: 0.5 * color)
     folder, out = SCENE.write(tmp_path / "noisy"), tmp_path / "out"
-    words = ["pseudoref", str(folder), "-o", str(out), "--estimate", "oidn", "--keep-estimates"]
+    words = ["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "oidn", "--keep-first-pass"]
     for place in (out, tmp_path / "noisy" / ".." / "out", out / "shot.%04d.exr"):
         assert main([*words, str(place)]) == 1
         assert re.search("keep-estimates .* would overwrite output", capfd.readouterr().err)
@@ -358,18 +358,34 @@ def test_oidn_estimates_come_out_stable(tmp_path):
 def test_the_command_says_what_was_taken(tmp_path, capfd):
     folder = SCENE.write(tmp_path / "noisy", edit=denoised)
     out = tmp_path / "out"
-    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", "auto"]) == 0
+    assert main(["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "auto"]) == 0
     assert "first pass: file (the file holds a denoised picture)" in capfd.readouterr().err
     assert open_shot(out).numbers == open_shot(folder).numbers
     assert [record["estimate"] for _, record in read_records(out)] == ["file"]
-    assert main(["pseudoref", str(folder), "-o", str(out), "--estimate", str(tmp_path / "no.####.exr")]) == 1
+    assert (
+        main(
+            [
+                "denoise",
+                "--method=classical",
+                str(folder),
+                "-o",
+                str(out),
+                "--first-pass",
+                str(tmp_path / "no.####.exr"),
+            ]
+        )
+        == 1
+    )
 
 
 def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
     """Cycles with OIDN and its passes stored, adaptive sampling, one seed for all frames (examples/render_shot.py)."""
     folder = Path(__file__).parents[1] / "data" / "defaults"
     out = tmp_path / "stable.####.exr"
-    assert main(["pseudoref", str(folder / "noisy.####.exr"), "-o", str(out), "--estimate", "auto"]) == 0
+    assert (
+        main(["denoise", "--method=classical", str(folder / "noisy.####.exr"), "-o", str(out), "--first-pass", "auto"])
+        == 0
+    )
     said = capfd.readouterr().err
     assert "first pass: file" in said
     assert "fixed-noise" in said
@@ -400,8 +416,16 @@ def late(folder, by, step=(3, 1)):
 def test_pictures_of_the_neighbouring_frames_are_refused(tmp_path, capsys, by, other):
     """Each frame came out as the one beside it, with exit code 0."""
     late(tmp_path / "done", by).write(tmp_path / "in")
-    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "1002-1007"]
-    assert main([*words, "--estimate", str(tmp_path / "done")]) == 1
+    words = [
+        "denoise",
+        "--method=classical",
+        str(tmp_path / "in"),
+        "-o",
+        str(tmp_path / "out"),
+        "--frames",
+        "1002-1007",
+    ]
+    assert main([*words, "--first-pass", str(tmp_path / "done")]) == 1
     assert f"each picture belongs to the {other} frame" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.exr"))
 
@@ -409,5 +433,13 @@ def test_pictures_of_the_neighbouring_frames_are_refused(tmp_path, capsys, by, o
 @pytest.mark.parametrize(("by", "step"), [(0, (3, 1)), (1, (0, 0))])
 def test_pictures_that_are_alike_are_taken(tmp_path, by, step):
     late(tmp_path / "done", by, step).write(tmp_path / "in")
-    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "1002-1007"]
-    assert main([*words, "--estimate", str(tmp_path / "done")]) == 0
+    words = [
+        "denoise",
+        "--method=classical",
+        str(tmp_path / "in"),
+        "-o",
+        str(tmp_path / "out"),
+        "--frames",
+        "1002-1007",
+    ]
+    assert main([*words, "--first-pass", str(tmp_path / "done")]) == 0

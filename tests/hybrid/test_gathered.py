@@ -121,8 +121,8 @@ def test_without_pyoidn_the_command_says_so(tmp_path, monkeypatch, capfd) -> Non
     _device.cache_clear()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     made = str(folder / "shot.####.exr")  # any finished sequence will do as the first look
-    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "gathered"]
-    assert main([*words, "--estimate", made]) == 1
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "pooled"]
+    assert main([*words, "--first-pass", made]) == 1
     assert 'pip install "pyoidn"' in capfd.readouterr().err
 
 
@@ -158,7 +158,7 @@ class TestWithOidn:
     def test_the_command_takes_the_cheapest_first_look(self, tmp_path, capfd) -> None:
         folder = SCENE.write(tmp_path / "noisy")
         out = tmp_path / "out"
-        assert main(["pseudoref", str(folder), "-o", str(out), "--preset", "gathered", "--frames", str(MIDDLE)]) == 0
+        assert main(["denoise", str(folder), "-o", str(out), "--preset", "pooled", "--frames", str(MIDDLE)]) == 0
         assert "first pass: oidn-fast" in capfd.readouterr().err
         made, given = open_shot(out).read(MIDDLE), open_shot(folder).read(MIDDLE)
         assert psnr(made.color, truth(given)) > psnr(given.color, truth(given)) + 10

@@ -10,7 +10,9 @@ import hybrid
 from hybrid import job
 from hybrid.cli import main
 from hybrid.files.exr import read_exr
+from hybrid.job import PRESETS, DenoiseOptions, replace_options
 from hybrid.pipeline import Failed
+from hybrid.records import read_records
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +28,7 @@ def same(made, expected):
 
 
 @pytest.mark.parametrize(("preset", "estimate"), [("draft", None), ("draft", "nlm")])
-def test_without_a_network_it_is_pseudoref(shot_folder, tmp_path, preset, estimate):
+def test_without_a_network_it_is_the_command(shot_folder, tmp_path, preset, estimate):
     shot = hybrid.open_shot(shot_folder)
     made = list(hybrid.denoise_shot(shot, tmp_path / "made", preset=preset, first_pass=estimate or ""))
     assert [frame.number for frame in made] == [1001, 1002, 1003]
@@ -36,7 +38,7 @@ def test_without_a_network_it_is_pseudoref(shot_folder, tmp_path, preset, estima
 
 
 @pytest.mark.neural
-def test_with_a_network_it_is_denoise(shot_folder, tmp_path):
+def test_with_a_network_it_is_the_command(shot_folder, tmp_path):
     pytest.importorskip("torch")
     shot = hybrid.open_shot(shot_folder)
     assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="fast", first_pass="nlm"))) == 3
@@ -101,3 +103,125 @@ def test_the_input_is_spared(shot_folder):
 def test_there_is_nothing_else():
     with pytest.raises(AttributeError, match="no attribute 'denoise'"):
         hybrid.denoise  # noqa: B018
+
+
+def states(folder, **options):
+    """Whether each frame was there, by `denoise_shot` with resume."""
+    return [frame.resumed for frame in hybrid.denoise_shot(hybrid.open_shot(folder), resume=True, **options)]
+
+
+def command(folder, out, *words):
+    """Whether each frame was there, by the command with --resume."""
+    assert main(["denoise", str(folder), "-o", str(out), "--resume", *words]) == 0
+    *_, (_, record) = read_records(out)
+    return [entry["state"] == "there" for entry in record["frames"].values()]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"preset": "draft"}, ["--preset", "draft"]),
+        pytest.param(
+            {"first_pass": "nlm", "stages": ["warp"], "tile": 64, "passes": 2},
+            ["--first-pass", "nlm", "--stages", "warp", "--tile", "64", "--passes", "2"],
+            marks=pytest.mark.neural,
+        ),
+    ],
+)
+def test_the_command_and_the_api_continue_each_other(shot_folder, tmp_path, options, words):
+    """Each made every frame of the other again, to the same pixels."""
+    if "tile" in options:
+        pytest.importorskip("torch")
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert states(shot_folder, output=first, **options) == [False] * 3
+    assert command(shot_folder, first, *words) == [True] * 3
+    assert command(shot_folder, second, *words) == [False] * 3
+    assert states(shot_folder, output=second, **options) == [True] * 3
+    files = [{path.name: path.read_bytes() for path in out.glob("*.exr")} for out in (first, second)]
+    assert files[0] == files[1]
+    assert command(shot_folder, first, *words, "--no-stages", "gate") == [False] * 3
+
+
+@pytest.mark.neural
+def test_the_preset_is_that_which_was_asked_for(shot_folder, tmp_path):
+    pytest.importorskip("torch")
+    for preset in ("fast", "balanced"):
+        options = {"preset": preset, "first_pass": "nlm", "precision": "float32"}
+        assert len(
+            list(hybrid.denoise_shot(hybrid.open_shot(shot_folder, frames="1002"), tmp_path / preset, **options))
+        )
+        words = ["--preset", preset, "--first-pass", "nlm", "--precision", "float32", "--frames", "1002"]
+        assert main(["denoise", str(shot_folder), "-o", str(tmp_path / f"{preset} too"), *words]) == 0
+        same(tmp_path / preset, tmp_path / f"{preset} too")
+    made = [
+        read_exr(tmp_path / preset / "shot.1002.exr").channel("ViewLayer.Combined.R") for preset in ("fast", "balanced")
+    ]
+    assert not np.array_equal(*made)
+
+
+@pytest.mark.parametrize("passes", [1, pytest.param(2, marks=pytest.mark.neural)])
+def test_progress_counts_the_frames_of_all_passes(shot_folder, tmp_path, passes):
+    options = {"preset": "draft"}
+    if passes > 1:
+        pytest.importorskip("torch")
+        options = {"first_pass": "nlm", "passes": passes}
+    steps = []
+    shot = hybrid.open_shot(shot_folder)
+    assert len(list(hybrid.denoise_shot(shot, tmp_path / "out", progress=steps.append, **options))) == 3
+    assert [(step.run, step.done, step.total) for step in steps] == [
+        (1 + index // 3, index + 1, 3 * passes) for index in range(3 * passes)
+    ]
+    assert not list((tmp_path / "out").glob("pass*"))
+
+
+def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
+    shot = hybrid.open_shot(Scene(frames=9).write(tmp_path / "in"))
+    ended = hybrid.denoise_shot(shot, tmp_path / "a", preset="draft", progress=lambda step: step.done < 2)
+    assert len(list(ended)) == 1  # the second is written, and not returned any more
+    closed = hybrid.denoise_shot(shot, tmp_path / "b", preset="draft")
+    next(closed)
+    closed.close()
+    for out in (tmp_path / "a", tmp_path / "b"):
+        written = sorted(out.iterdir())
+        assert 1 <= len(written) <= 4
+        for path in written:
+            assert read_exr(path).channel_names == read_exr(tmp_path / "in" / path.name).channel_names
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"preset": "best"}, "expected one of fast, balanced"),
+        ({"method": "magic"}, "expected one of network, classical, pooled"),
+        ({"method": "classical", "preset": "fast"}, "expected one of standard, draft, final with method classical"),
+        ({"preset": "auto"}, "budget chooses the preset"),
+        ({"threshold": 1.0}, "expected 0 <= threshold < 1"),
+        ({"tile": 3}, "tile is 3, expected at least 16"),
+        ({"passes": 0}, "passes is 0, expected at least 1"),
+        ({"precision": "float8"}, "expected one of auto, float32, bfloat16"),
+        ({"aov_sum": "both"}, "expected one of layers, beauty"),
+        ({"stages": ["polish"]}, "stage is 'polish'"),
+        ({"max_memory": "much"}, "max-memory is 'much'"),
+        ({"preset": "draft", "breakdown": Path("b.png")}, "breakdown is of the network"),
+        ({"colour": 1}, "option 'colour' is not there"),
+    ],
+)
+def test_options_are_validated_before_a_file_is_opened(options, words):
+    with pytest.raises(ValueError, match=words):
+        replace_options(None, options)
+
+
+def test_presets_and_methods_belong_together():
+    assert [DenoiseOptions(preset=name).method for name in ("quality", "draft", "pooled", "gathered")] == [
+        "network",
+        "classical",
+        "pooled",
+        "pooled",
+    ]
+    assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["fast", "standard", "pooled"]
+    assert [DenoiseOptions(method=name).first_pass for name in PRESETS] == ["auto", "none", "oidn-fast"]
+
+
+def test_the_old_name_of_the_first_pass_is_accepted():
+    with pytest.warns(DeprecationWarning, match="estimate is now first_pass"):
+        assert replace_options(None, {"estimate": "nlm"}).first_pass == "nlm"

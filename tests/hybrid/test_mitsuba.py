@@ -72,7 +72,7 @@ def test_what_mitsuba_renders_is_found_and_denoised(tmp_path: Path, capsys: pyte
     found = [str(layer) for layer in (layers.color, layers.alpha, layers.albedo, layers.normal, layers.depth)]
     assert found == ["RGB", "A", "alb.RGB", "nn.XYZ", "dd.T"]
     assert layers.motion is None
-    assert main(["pseudoref", str(spec), "-o", str(tmp_path / "out"), "--frames", "2", "--preset", "draft"]) == 0
+    assert main(["denoise", str(spec), "-o", str(tmp_path / "out"), "--frames", "2", "--preset", "draft"]) == 0
     assert "warning" not in capsys.readouterr().err
     reference = open_shot(render(tmp_path, "reference", 256, range(2, 3))).read(2).color
     noisy = open_shot(spec).read(2).color

@@ -66,7 +66,7 @@ def test_where_its_library_is_missing_auto_does_without_and_says_so(monkeypatch,
 
     monkeypatch.setitem(sys.modules, "pyoidn", None if how == "absent" else Broken("pyoidn"))
     folder = Scene(frames=1).write(tmp_path / "in")
-    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--estimate"]
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--first-pass"]
     assert main([*words, "auto"]) == 0
     said = capsys.readouterr().err
     expected = {"absent": "pyoidn is not installed", "broken": "libOpenImageDenoise.so.2: no such file"}
@@ -201,7 +201,7 @@ class TestDevices:
     def test_the_command_names_what_was_asked_for_and_what_is_there(self, tmp_path, capsys):
         missing = next(kind for kind in oidn.DEVICES if not oidn._has_device(kind))
         shot, out = Scene(frames=3).write(tmp_path / "in"), tmp_path / "out"
-        words = ["pseudoref", str(shot), "-o", str(out), "--preset", "draft", "--estimate", "oidn-fast", "-q"]
+        words = ["denoise", str(shot), "-o", str(out), "--preset", "draft", "--first-pass", "oidn-fast", "-q"]
         assert main([*words, "--device", missing]) == 1
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith(f"error: device is '{missing}', expected one that OIDN can use here: auto, ")
@@ -210,7 +210,7 @@ class TestDevices:
 
     def test_the_record_and_the_file_say_where_it_ran(self, tmp_path):
         shot, out = Scene(frames=1).write(tmp_path / "in"), tmp_path / "out"
-        words = ["pseudoref", str(shot), "-o", str(out), "--preset", "draft", "-q", "--estimate"]
+        words = ["denoise", str(shot), "-o", str(out), "--preset", "draft", "-q", "--first-pass"]
         for estimate, expected in (("oidn-fast", {"oidn": "cpu"}), ("none", {})):
             assert main([*words, estimate, "--device", "cpu"]) == 0
             *_, (_, record) = read_records(out)

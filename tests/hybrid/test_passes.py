@@ -268,7 +268,7 @@ def test_only_what_was_multiplied_by_the_albedo_is_divided_by_it():
 def test_a_beauty_is_no_sum_of_what_does_not_add_up_to_it(tmp_path, capsys):
     write(tmp_path / "in", lambda k: {"RGBA": 0.5 * both(k), "RGBA_key": a(k), "RGBA_fill": b(k)})
     command = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--aov", "all"]
-    assert main([*command, "--give-way", "beauty"]) == 1
+    assert main([*command, "--aov-sum", "beauty"]) == 1
     assert "together have 2.00 times its light" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.exr"))
     assert main(command) == 0

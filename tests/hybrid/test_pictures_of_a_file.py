@@ -34,7 +34,7 @@ def view(truth: Truth, name: str = "", *, other: bool = False) -> Channels:
 
 
 def run(spec: Path, out: Path, *options: str) -> Path:
-    arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
+    arguments = ["denoise", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
     assert main(arguments) == 0
     return out
 
@@ -157,7 +157,7 @@ def test_two_passes_and_the_breakdown_of_both_eyes_are_those_of_mono_files(tmp_p
 def test_kept_estimates_of_both_eyes_lie_apart(mono: dict[str, bytes], tmp_path: Path) -> None:
     pytest.importorskip("pyoidn")
     spec, kept = stereo(tmp_path / "in"), tmp_path / "kept"
-    options = ["--estimate", "oidn-fast", "--keep-estimates"]
+    options = ["--first-pass", "oidn-fast", "--keep-first-pass"]
     first = run(spec, tmp_path / "first", *options, str(kept))
     places = sorted(path.relative_to(kept).as_posix() for path in kept.rglob("*.0010.exr"))
     assert places == ["ViewLayer.Combined.left/shot.0010.exr", "ViewLayer.Combined.right/shot.0010.exr"]
@@ -195,20 +195,22 @@ def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.Capture
     for eye in ("left", "right"):
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
     spec = str(tmp_path / "%V" / "shot.####.exr")
-    assert main(["pseudoref", spec, "-o", str(tmp_path / "out")]) == 2
+    assert main(["denoise", "--method=classical", spec, "-o", str(tmp_path / "out")]) == 2
     assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert main(["pseudoref", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
+    assert (
+        main(["denoise", "--method=classical", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
+    )
     assert "no view is there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("--keep-estimates", "kept"),
-        ("--keep-estimates", "kept/e.####.exr"),
+        ("--keep-first-pass", "kept"),
+        ("--keep-first-pass", "kept/e.####.exr"),
         ("--preview", "x.png"),
-        ("--contact", "x.png"),
-        ("--estimate", "left/shot.####.exr"),
+        ("--contact-sheet", "x.png"),
+        ("--first-pass", "left/shot.####.exr"),
         ("--layer", "albedo=left/shot.####.exr"),
         ("--output", "out_%v"),
     ],
@@ -220,7 +222,7 @@ def test_two_eyes_share_nothing(
     monkeypatch.chdir(tmp_path)
     for eye in ("left", "local"):
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
-    assert main(["pseudoref", "%V/shot.####.exr", "--output", "out_%V", "--preset", "draft", option, value]) == 2
+    assert main(["denoise", "%V/shot.####.exr", "--output", "out_%V", "--preset", "draft", option, value]) == 2
     assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["left", "local"]
 
@@ -232,7 +234,7 @@ def test_kept_estimates_of_pictures_called_alike_lie_apart(tmp_path: Path) -> No
         channels = {n.replace("ViewLayer.", "A B."): p for n, p in view(truth).items()}
         channels |= {n.replace("ViewLayer.", "A_B."): p for n, p in view(truth, other=True).items()}
         save(tmp_path / "in" / f"shot.{truth.number:04d}.exr", channels)
-    run(tmp_path / "in", tmp_path / "out", "--estimate", "oidn-fast", "--keep-estimates", str(tmp_path / "kept"))
+    run(tmp_path / "in", tmp_path / "out", "--first-pass", "oidn-fast", "--keep-first-pass", str(tmp_path / "kept"))
     folders = sorted(path.name for path in (tmp_path / "kept").iterdir())
     assert len(folders) == 2
     assert folders[0] == "A_B.Combined"

@@ -100,7 +100,15 @@ def test_a_divider_leaves_both_sides_where_they_are():
 def test_the_denoised_side_of_what_blender_has_denoised_is_ours(tmp_path, capsys):
     """Such a file keeps its Noisy Image, which a new look would take for the picture again."""
     source = Path(shutil.copytree(DEFAULTS, tmp_path / "in"))
-    words = ["pseudoref", str(source / "noisy.####.exr"), "-o", str(tmp_path / "out"), "--estimate", "auto"]
+    words = [
+        "denoise",
+        "--method=classical",
+        str(source / "noisy.####.exr"),
+        "-o",
+        str(tmp_path / "out"),
+        "--first-pass",
+        "auto",
+    ]
     assert main([*words, "--preview", str(tmp_path / "a.png")]) == 0, capsys.readouterr().err
     picture = cv2.imread(str(tmp_path / "a.png")).astype(np.float32)
     noisy, denoised = np.split(picture, 2, axis=1)
@@ -113,15 +121,17 @@ def test_a_layer_that_was_named_is_the_one_that_is_shown(tmp_path, capsys):
         layers["ViewLayer.Combined"][:, ::2] *= 4
 
     folder = Scene().write(tmp_path / "in", edit=another)
-    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--layer", "color=Beauty", "--preset", "draft"]
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--layer", "color=Beauty", "--preset", "draft"]
     assert main([*words, "--preview", str(tmp_path / "a.png")]) == 0, capsys.readouterr().err
     picture = cv2.imread(str(tmp_path / "a.png")).astype(np.float32)
     assert picture.std() < 5, "of one gray, noisy and denoised"
 
 
-@pytest.mark.parametrize(("option", "name"), [("--preview", "a.gif"), ("--preview", "a"), ("--contact", "a.mp4")])
+@pytest.mark.parametrize(("option", "name"), [("--preview", "a.gif"), ("--preview", "a"), ("--contact-sheet", "a.mp4")])
 def test_what_is_no_preview_is_refused_before_anything_is_made(shot_folder, tmp_path, capsys, option, name):
-    code = main(["pseudoref", str(shot_folder), "-o", str(tmp_path / "out"), option, str(tmp_path / name)])
+    code = main(
+        ["denoise", "--method=classical", str(shot_folder), "-o", str(tmp_path / "out"), option, str(tmp_path / name)]
+    )
     assert code == 2
     assert "expected a name that ends in .png" in " ".join(capsys.readouterr().err.replace("│", "").split())
     assert not (tmp_path / "out").exists()
@@ -134,8 +144,8 @@ def test_a_missing_library_is_said_before_anything_is_made(monkeypatch, tmp_path
 
 
 def test_both_are_written_by_one_command(shot_folder, tmp_path, capsys):
-    words = ["pseudoref", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--fps", "12"]
-    code = main([*words, "--preview", str(tmp_path / "a.webp"), "--contact", str(tmp_path / "sheet.png")])
+    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--fps", "12"]
+    code = main([*words, "--preview", str(tmp_path / "a.webp"), "--contact-sheet", str(tmp_path / "sheet.png")])
     assert code == 0, capsys.readouterr().err
     with Image.open(tmp_path / "a.webp") as image:
         image.seek(image.n_frames - 1)

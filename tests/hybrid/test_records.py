@@ -176,7 +176,7 @@ def run(capsys, *arguments):
 
 def test_status_of_two_chunks(shot_folder, tmp_path, capsys):
     out = tmp_path / "out" / "done.####.exr"
-    words = ["pseudoref", shot_folder, "-o", out, "--preset", "draft"]
+    words = ["denoise", shot_folder, "-o", out, "--preset", "draft"]
     assert run(capsys, *words, "--frames", "1001-1002")[0] == 0
     code, text, _ = run(capsys, "status", out)
     assert code == 0

@@ -33,7 +33,7 @@ def pictures(folder: Path) -> dict[int, np.ndarray]:
 
 
 def denoised(spec: Path, out: Path, *options: str) -> tuple[dict[int, np.ndarray], str]:
-    said = run("pseudoref", spec, out, *options)
+    said = run("denoise", spec, out, "--method=classical", *options)
     return pictures(out), said
 
 

@@ -410,7 +410,7 @@ def test_the_network_makes_its_pictures_so(tmp_path):
     shot = scene.write(tmp_path / "in")
 
     def run(name, *words):
-        given = ["denoise", str(shot), "-o", str(tmp_path / name), "--estimate", "bundled", "--preset", "fast"]
+        given = ["denoise", str(shot), "-o", str(tmp_path / name), "--first-pass", "bundled", "--preset", "fast"]
         assert main([*given, "--frames", "1002", "-q", *words]) == 0
         *_, (_, record) = read_records(tmp_path / name)
         return read_exr(tmp_path / name / "shot.1002.exr").pixels(("ViewLayer.Combined.R",)), record

@@ -58,7 +58,7 @@ def quality(spec: Path, out: Path, *options: str) -> tuple[float, str]:
 
 def stops(spec: Path) -> bool:
     """Whether --strict does."""
-    return main(["pseudoref", str(spec), "-o", str(spec.parent / "strict"), "--strict"]) == 1
+    return main(["denoise", "--method=classical", str(spec), "-o", str(spec.parent / "strict"), "--strict"]) == 1
 
 
 def warnings(said: str) -> list[str]:
@@ -378,7 +378,10 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
     assert "cut between frames 10 and 11" in " ".join(err.split())
     assert "cut between frames 10 and 11" in json.loads(out)["judged"][-1]["message"]
     assert main(["inspect", str(spec), "--motion", "none", "--strict"]) == 1
-    assert main(["pseudoref", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"]) == 1
+    assert (
+        main(["denoise", "--method=classical", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"])
+        == 1
+    )
     assert not list((tmp_path / "o").glob("*.exr"))  # not even what comes before the cut
 
 

@@ -188,7 +188,7 @@ def test_what_fireflies_take_with_them_is_counted(tmp_path):
 
 def test_the_mean_of_a_shot_with_and_without_fireflies_is_on_record(tmp_path):
     folder = CALM.write(tmp_path / "in", edit=burnt)
-    words = ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--frames", "1008-1010"]
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--frames", "1008-1010"]
     assert main(words) == 0
     ((_, record),) = read_records(tmp_path / "out")
     shot = open_shot(folder, frames="1008-1010")

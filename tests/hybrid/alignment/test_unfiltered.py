@@ -25,7 +25,7 @@ from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 SIZE = (40, 56)
-COMMANDS = [["pseudoref", "--preset", "draft"], ["denoise", "--preset", "fast"]]
+COMMANDS = [["denoise", "--preset", "draft"], ["denoise", "--preset", "fast"]]
 BLOCK = slice(12, 28), slice(16, 36)
 
 
@@ -129,7 +129,7 @@ def test_parts_keep_their_negative_light(tmp_path):
         assert image.channel(f"{name}.R")[15:25, 19:33].mean() == pytest.approx(mean, rel=0.06)
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, ["pseudoref", "--preset", "gathered"]])
+@pytest.mark.parametrize("command", [*COMMANDS, ["denoise", "--preset", "pooled"]])
 def test_gray_stays_gray(tmp_path, command):
     """Networks that learned from colors tinted it by half a percent."""
     found = read_exr(denoised(tmp_path, colors(), command, half=False)).pixels(("color.R", "color.G", "color.B"))
@@ -143,7 +143,7 @@ def test_both_views_of_a_gray_stereo_file_are_denoised(tmp_path):
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "multiView": ["left", "right"]}
         channels = {"left.Y": left[..., 0].copy(), "right.Y": right[..., 0].copy()}
         OpenEXR.File([OpenEXR.Part(header, channels, "")]).write(str(tmp_path / f"a.{number:04d}.exr"))
-    assert main(["pseudoref", str(tmp_path), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
+    assert main(["denoise", str(tmp_path), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
     before, after = (read_exr(folder / "a.0001.exr") for folder in (tmp_path, tmp_path / "out"))
     for name in ("left.Y", "right.Y"):
         assert after.channel(name).std() < 0.95 * before.channel(name).std()

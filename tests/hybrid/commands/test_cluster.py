@@ -74,7 +74,7 @@ def contents(folder):
 @pytest.fixture(scope="module")
 def whole(shot, tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "out"
-    assert main(["pseudoref", str(shot), "-o", str(out), *OPTIONS]) == 0
+    assert main(["denoise", str(shot), "-o", str(out), *OPTIONS]) == 0
     return contents(out)
 
 
@@ -134,7 +134,7 @@ def test_random_shots_are_rendered_by_the_workers(cluster, tmp_path, capsys):
 def test_clips_are_made_by_the_workers(cluster, tmp_path, capsys):
     pytest.importorskip("torch")
     shots = [str(Scene(frames=3).write(tmp_path / name)) for name in ("one", "two")]
-    words = ["prepare", *shots, "-o", str(tmp_path / "clips"), "--tile", "0", "--estimate", "nlm", "--window", "3"]
+    words = ["make-clips", *shots, "-o", str(tmp_path / "clips"), "--tile", "0", "--first-pass", "nlm", "--window", "3"]
     assert main([*words, "--scheduler", cluster[0]]) == 0, capsys.readouterr().err
     assert {path.name for path in (tmp_path / "clips").glob("*.safetensors")} == {
         "one.0000.safetensors",
@@ -153,7 +153,7 @@ def test_a_shot_is_the_same_bytes_though_a_worker_dies(cluster, shot, whole, tmp
         workers[0].send_signal(signal.SIGKILL)
 
     threading.Thread(target=kill, daemon=True).start()
-    words = ["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--scheduler", address, "--chunk", "2"]
+    words = ["denoise", str(shot), "-o", str(out), *OPTIONS, "--scheduler", address, "--chunk", "2"]
     code = main(words)
     err = capsys.readouterr().err
     assert code == 0, err
@@ -167,7 +167,7 @@ def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
     folder, out = Scene(frames=8).write(tmp_path / "in"), tmp_path / "out"
     victim = folder / "shot.1008.exr"
     victim.write_bytes(victim.read_bytes()[:-2000])
-    words = ["pseudoref", str(folder), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "4"]
+    words = ["denoise", str(folder), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "4"]
     assert main(words) == 1
     err = capsys.readouterr().err
     assert "shot.1008.exr" in err
@@ -179,7 +179,7 @@ def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
 @pytest.mark.usefixtures("interrupts")
 def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_path):
     out = tmp_path / "out"
-    words = ["pseudoref", str(shot), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "1"]
+    words = ["denoise", str(shot), "-o", str(out), *OPTIONS, "--scheduler", cluster[0], "--chunk", "1"]
     run = subprocess.Popen([sys.executable, "-m", "hybrid.cli", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True)
     while not any(out.glob("*.exr")):
         assert run.poll() is None
@@ -193,12 +193,20 @@ def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_
 
 def test_what_cannot_be_written_is_refused_before_anything_is_handed_out(shot, tmp_path, capsys):
     """A preview was looked at when all frames were there."""
-    words = ["pseudoref", str(shot), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]
+    words = [
+        "denoise",
+        "--method=classical",
+        str(shot),
+        "-o",
+        str(tmp_path / "out"),
+        "--scheduler",
+        "tcp://127.0.0.1:9",
+    ]
     assert main([*words, "--preview", str(tmp_path / "x.tif")]) == 2
     assert "expected a name that ends in .png" in " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert main([*words, "--contact", str(tmp_path / "x.png"), "--preview", str(tmp_path / "x.png")]) == 1
+    assert main([*words, "--contact-sheet", str(tmp_path / "x.png"), "--preview", str(tmp_path / "x.png")]) == 1
     assert "would overwrite preview" in capsys.readouterr().err
-    assert main(["pseudoref", str(shot), "-o", str(shot), "--scheduler", "tcp://127.0.0.1:9"]) == 1
+    assert main(["denoise", "--method=classical", str(shot), "-o", str(shot), "--scheduler", "tcp://127.0.0.1:9"]) == 1
     assert "would overwrite an input" in capsys.readouterr().err
 
 
@@ -210,13 +218,21 @@ def test_the_preview_of_several_pictures_is_that_of_the_first(cluster, tmp_path)
             picture = np.random.default_rng(frame).uniform(size=(12, 16)).astype(np.float32)
             channels |= {f"{name}.Combined.{c}": picture for c in "RGB"}
         save(tmp_path / "in" / f"shot.{frame:04d}.exr", channels)
-    words = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *OPTIONS, "--scheduler", cluster[0]]
+    words = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *OPTIONS, "--scheduler", cluster[0]]
     assert main([*words, "--preview", str(tmp_path / "x.png")]) == 0
     assert (tmp_path / "x.png").is_file()
 
 
 def test_no_scheduler_is_one_line(shot, tmp_path, capsys):
     pytest.importorskip("distributed")
-    words = ["pseudoref", str(shot), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]
+    words = [
+        "denoise",
+        "--method=classical",
+        str(shot),
+        "-o",
+        str(tmp_path / "out"),
+        "--scheduler",
+        "tcp://127.0.0.1:9",
+    ]
     assert main(words) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith("error: no Dask scheduler answers at tcp://127.0.0.1:9")

@@ -118,7 +118,7 @@ def ravg(*arguments, **options):
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_a_closed_pipe_does_not_end_the_work(shot_folder, tmp_path, stream):
-    command, options = ravg("pseudoref", shot_folder, "-o", tmp_path / "out", "--preset", "draft")
+    command, options = ravg("denoise", shot_folder, "-o", tmp_path / "out", "--preset", "draft")
     read, write = os.pipe()
     os.close(read)  # whoever read it has gone before the first word
     other = "stderr" if stream == "stdout" else "stdout"
@@ -146,7 +146,7 @@ def test_terminals_that_know_only_ascii(shot_folder, environment):
 
 def test_the_first_run_says_that_it_compiles_and_later_ones_do_not(shot_folder, tmp_path):
     cache = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command, options = ravg("pseudoref", shot_folder, "-o", tmp_path / "out", "--preset", "draft", env=cache)
+    command, options = ravg("denoise", shot_folder, "-o", tmp_path / "out", "--preset", "draft", env=cache)
     said = [subprocess.run(command, **options, capture_output=True, text=True, check=True).stderr for _ in range(2)]
     assert ["compiling for this processor" in words for words in said] == [True, False]
     assert said[0].count("compiling") == 1

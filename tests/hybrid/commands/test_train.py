@@ -69,14 +69,26 @@ def test_what_makes_no_sense_at_one_level_is_left_out_of_the_clips(shot, tmp_pat
         layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
         layers["ViewLayer.Denoising Albedo"][:] = 0
         write_layers(path, layers)
-    options = (kept, "-o", tmp_path / "clips", "--levels", "a=24,b=24", "--tile", 0, "--estimate", "nlm", "--window", 3)
-    assert run("prepare", *options, "--strict") == 1
+    options = (
+        kept,
+        "-o",
+        tmp_path / "clips",
+        "--levels",
+        "a=24,b=24",
+        "--tile",
+        0,
+        "--first-pass",
+        "nlm",
+        "--window",
+        3,
+    )
+    assert run("make-clips", *options, "--strict") == 1
     assert not list((tmp_path / "clips").glob("*.safetensors"))
-    assert run("prepare", *options, "--motion", "none") == 0
+    assert run("make-clips", *options, "--motion", "none") == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "b: albedo (ViewLayer.Denoising Albedo.RGB) is black: left out" in said
     assert "a: albedo" not in said
-    assert run("prepare", *options, "--motion", "sideways") == 2
+    assert run("make-clips", *options, "--motion", "sideways") == 2
 
 
 def test_a_cut_is_said_of_the_shot_that_has_it(shot, tmp_path, capsys):
@@ -86,8 +98,8 @@ def test_a_cut_is_said_of_the_shot_that_has_it(shot, tmp_path, capsys):
     image = read_exr(last)
     layers = {layer.name: image.pixels(layer.channels)[::-1, ::-1].copy() for layer in image.layers}
     write_layers(last, layers)
-    options = ("--levels", "a=24", "--tile", 0, "--estimate", "nlm", "--window", 3, "--motion", "none")
-    words = ("prepare", tmp_path / "one", tmp_path / "cut", "-o", tmp_path / "clips", *options)
+    options = ("--levels", "a=24", "--tile", 0, "--first-pass", "nlm", "--window", 3, "--motion", "none")
+    words = ("make-clips", tmp_path / "one", tmp_path / "cut", "-o", tmp_path / "clips", *options)
     assert run(*words) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "cut: cut between frames 1002 and 1003" in said
@@ -100,8 +112,8 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
     kept = tmp_path / "wall"
     shutil.copytree(shot, kept)
     (kept / f"reference.{SCENE.first}.exr").unlink()
-    levels = ("--levels", "a=24,c=8", "--tile", 0, "--estimate", "nlm", "--window", 3)
-    assert run("prepare", kept, "-o", tmp_path / "clips", *levels, "--reference") == 0
+    levels = ("--levels", "a=24,c=8", "--tile", 0, "--first-pass", "nlm", "--window", 3)
+    assert run("make-clips", kept, "-o", tmp_path / "clips", *levels, "--reference") == 0
     clips = open_clips(tmp_path / "clips")
     assert len(clips) == SCENE.frames - 1  # those that have one
     assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]
@@ -112,12 +124,12 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
 
 
 def test_clips_are_prepared_towards_the_pseudo_references_of_a_level_where_asked(shot, tmp_path, capsys):
-    options = (shot, "-o", tmp_path / "clips", "--tile", 0, "--estimate", "nlm")
+    options = (shot, "-o", tmp_path / "clips", "--tile", 0, "--first-pass", "nlm")
     levels = ("--levels", "a=24,b=24,c=8")
-    assert run("prepare", *options, *levels, "--target", "d") == 1
+    assert run("make-clips", *options, *levels, "--target", "d") == 1
     assert "target: expected a level of wall that is not the only one, a, b, c, got 'd'" in capsys.readouterr().err
-    assert run("prepare", *options, *levels, "--target", "b", "--reference") == 2
-    assert run("prepare", *options, *levels, "--target", "b", "--frames", SCENE.first + 1) == 0
+    assert run("make-clips", *options, *levels, "--target", "b", "--reference") == 2
+    assert run("make-clips", *options, *levels, "--target", "b", "--frames", SCENE.first + 1) == 0
     clips = open_clips(tmp_path / "clips")
     both = [[(level, kind) for kind in ("reference", "rendered")] for level in range(2)]
     assert clips.pairs(0) == both  # b is none of them
@@ -125,8 +137,8 @@ def test_clips_are_prepared_towards_the_pseudo_references_of_a_level_where_asked
 
 def test_one_sequence_is_prepared_towards_the_reference_beside_it(shot, tmp_path):
     (tmp_path / "wall.b.0000.safetensors").touch()  # another shot's, whose name begins alike
-    options = ("--tile", 0, "--estimate", "nlm", "--window", 3, "--reference", "--frames", SCENE.first)
-    assert run("prepare", shot / "a.####.exr", "-o", tmp_path, *options) == 0
+    options = ("--tile", 0, "--first-pass", "nlm", "--window", 3, "--reference", "--frames", SCENE.first)
+    assert run("make-clips", shot / "a.####.exr", "-o", tmp_path, *options) == 0
     assert (tmp_path / "wall.0000.safetensors").is_file()
 
 
@@ -158,9 +170,9 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
     clips, out = tmp_path / "clips", tmp_path / "w.safetensors"
     other = tmp_path / "other"
     shutil.copytree(shot, other)
-    options = ["--levels", "a=24,b=24,c=8", "--window", "3", "--estimate", "nlm"]
-    assert run("prepare", shot, "-o", clips, "--tile", "32", "--tiles", "2", *options) == 0
-    assert run("prepare", shot, other, "-o", clips, "--tile", "0", *options) == 0  # the first is there already
+    options = ["--levels", "a=24,b=24,c=8", "--window", "3", "--first-pass", "nlm"]
+    assert run("make-clips", shot, "-o", clips, "--tile", "32", "--tiles", "2", *options) == 0
+    assert run("make-clips", shot, other, "-o", clips, "--tile", "0", *options) == 0  # the first is there already
     found = open_clips(clips)
     assert (found.shots, len(found.of(["other"]))) == (["other", "wall"], 3)
     assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
@@ -179,7 +191,9 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
 
     # On one's own footage, one level and no reference, from weights there are.
     own = tmp_path / "own"
-    assert run("prepare", shot / "a.####.exr", "-o", own, "--tile", "32", "--window", "3", "--estimate", "nlm") == 0
+    assert (
+        run("make-clips", shot / "a.####.exr", "-o", own, "--tile", "32", "--window", "3", "--first-pass", "nlm") == 0
+    )
     tuned = tmp_path / "tuned.safetensors"
     assert run("train", own, "-o", tuned, "--init", out, "--steps", "1", "--crop", "32", "--rate", "1e-4") == 0
     assert load_model(tuned).config == load_model(out).config
@@ -282,7 +296,7 @@ def test_training_writes_over_no_clip_and_not_over_what_it_starts_from(tmp_path,
 
 def test_a_breakdown_is_written_and_printed(shot, weights, tmp_path, capsys):
     picture = tmp_path / "parts.png"
-    options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--breakdown", picture]
+    options = ["--weights", weights, "--first-pass", "nlm", "--precision", "float32", "--breakdown", picture]
     assert run("denoise", shot / "a.####.exr", "-o", tmp_path / "out", *options) == 0
     assert picture.stat().st_size > 1000
     printed = capsys.readouterr().out
@@ -310,9 +324,9 @@ def test_layers_in_the_file_add_up_to_the_beauty_in_it(give_way, weights, tmp_pa
         layers["ViewLayer.Combined"] = np.dstack([color, np.ones((40, 48), np.float32)])
 
     folder = scene.write(tmp_path / "in", edit=split)
-    options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", "--frames", scene.first + 1]
+    options = ["--weights", weights, "--first-pass", "nlm", "--precision", "float32", "--frames", scene.first + 1]
     parts = ("DiffDir", "GlossDir")
-    assert run("denoise", folder, "-o", tmp_path / "out", *options, "--aov", "all", "--give-way", give_way) == 0
+    assert run("denoise", folder, "-o", tmp_path / "out", *options, "--aov", "all", "--aov-sum", give_way) == 0
     frame = open_shot(tmp_path / "out", aovs=(*parts, "DiffCol")).read(scene.first + 1)
     together = frame.aovs["DiffDir"] * frame.aovs["DiffCol"] + frame.aovs["GlossDir"]
     assert abs((together - frame.color).mean()) < 1e-4 * frame.color.mean()
@@ -336,7 +350,7 @@ def test_a_second_pass_reaches_further_in_time(weights, tmp_path, capsys):
         first = []
         for folder in folders:
             out = tmp_path / f"{folder.name}{passes}"
-            options = ["--weights", weights, "--estimate", folder, "--precision", "float32", "--stages", "warp"]
+            options = ["--weights", weights, "--first-pass", folder, "--precision", "float32", "--stages", "warp"]
             code = run("denoise", folder, "-o", out, "--passes", passes, "--no-stages", "refine,stabilize", *options)
             assert code == 0, capsys.readouterr().err
             left = {item.name for item in out.iterdir()}  # nothing of the first pass
@@ -356,9 +370,9 @@ def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, 
     folder = Scene(height=40, width=48, frames=5).write(tmp_path / "in")
     monkeypatch.setattr("hybrid.files.exr.MAX_PIXELS", 100)  # so that all passes have to know of --max-pixels
     options = ["--weights", weights, "--precision", "float32", "--passes", 2, "--max-pixels", 4000, *STAGES]
-    code = run("denoise", folder, "-o", tmp_path / "all", "--estimate", "nlm", *options)
+    code = run("denoise", folder, "-o", tmp_path / "all", "--first-pass", "nlm", *options)
     assert code == 0, capsys.readouterr().err
-    assert run("denoise", folder, "-o", tmp_path / "one", "--estimate", "nlm", "--frames", "1003", *options) == 0
+    assert run("denoise", folder, "-o", tmp_path / "one", "--first-pass", "nlm", "--frames", "1003", *options) == 0
     name = "shot.1003.exr"
     assert {path.name for path in (tmp_path / "one").iterdir()} == {"ravg", name}
     one, every = (read_exr(tmp_path / folder / name) for folder in ("one", "all"))
@@ -370,7 +384,7 @@ def test_a_second_pass_of_some_frames_is_that_of_all(weights, tmp_path, capsys, 
     for path in sorted(folder.iterdir()):
         assert path.name in one.parts[0].header[MADE_FROM]
     capsys.readouterr()
-    words = ["denoise", folder, "-o", tmp_path / "all", "--estimate", "nlm", "--resume", *options]
+    words = ["denoise", folder, "-o", tmp_path / "all", "--first-pass", "nlm", "--resume", *options]
     assert run(*words) == 0
     assert "5 of 5 frames were finished already" in capsys.readouterr().err
     os.utime(folder / "shot.1001.exr", (0, 0))
@@ -384,7 +398,7 @@ def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
     noisy = []
     for passes in (1, 2):
         pictures = tmp_path / f"preview{passes}.png", tmp_path / f"parts{passes}.png"
-        options = ["--weights", weights, "--estimate", "nlm", "--precision", "float32", *STAGES]
+        options = ["--weights", weights, "--first-pass", "nlm", "--precision", "float32", *STAGES]
         options += ["--passes", passes, "--preview", pictures[0], "--breakdown", pictures[1]]
         assert run("denoise", folder, "-o", tmp_path / f"out{passes}", *options) == 0
         noisy.append([cv2.imread(str(path))[: SCENE.height, : SCENE.width] for path in pictures])
@@ -396,7 +410,7 @@ def test_pictures_of_two_passes_show_what_was_rendered(weights, tmp_path):
 def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):
     """Frames made without one used to pass for finished, and have no such layers; and if all were, there was a bug."""
     folder = SCENE.write(tmp_path / "in")
-    words = ["denoise", folder, "-o", tmp_path / "out", "--weights", weights, "--estimate", "nlm", "--resume"]
+    words = ["denoise", folder, "-o", tmp_path / "out", "--weights", weights, "--first-pass", "nlm", "--resume"]
     picture = tmp_path / "parts.png"
     assert run(*words) == 0
     assert run(*words, "--breakdown", picture) == 0
@@ -417,9 +431,9 @@ def test_a_network_without_estimates_says_so(tmp_path, capsys):
     path = tmp_path / "small.safetensors"
     save_model(path, unet(frames=3))
     folder = SCENE.write(tmp_path / "in")
-    words = ["denoise", folder, "--weights", path, "-o", tmp_path / "out", "--estimate"]
+    words = ["denoise", folder, "--weights", path, "-o", tmp_path / "out", "--first-pass"]
     assert run(*words, "oidn") == 1
-    assert "estimate is 'oidn', expected auto or none: the network of small.safetensors takes none" in (
+    assert "first-pass is 'oidn', expected auto or none: the network of small.safetensors takes none" in (
         capsys.readouterr().err
     )
     assert not (tmp_path / "out").exists()

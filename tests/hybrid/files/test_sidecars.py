@@ -50,7 +50,7 @@ def split(folder: Path, names: dict[str, str]) -> None:
 
 
 def made(spec: Path, out: Path, *options: str) -> bytes:
-    arguments = ["pseudoref", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
+    arguments = ["denoise", str(spec), "-o", str(out), "--frames", "10", "--preset", "draft", *options]
     assert main(arguments) == 0
     image = read_exr(next(out.glob("*0010*exr")))
     return b"".join(image.channel(name).tobytes() for name in "RGBA")
@@ -199,7 +199,7 @@ def test_renderers_that_write_a_file_for_each_output(profile: str, names: dict[s
 
 def test_a_layer_that_was_made_again_makes_the_frame_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split(tmp_path / "in", APART)
-    command = ["pseudoref", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "9", "--preset", "draft"]
+    command = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--frames", "9", "--preset", "draft"]
     assert main([*command, "--resume"]) == 0
     finished = tmp_path / "out" / "beauty.0009.exr"
     first = finished.stat().st_mtime_ns
@@ -218,7 +218,7 @@ def test_sequences_of_one_name_in_several_folders_are_told_apart(
     """A folder for each layer, with equal names in all: what stood for one of them stood for all."""
     split(tmp_path, {name: f"{name}/####.exr" for name in (*ROLES, "color")})
     named = [word for name in ROLES for word in ("--layer", f"{name}={tmp_path / name / '####.exr'}")]
-    words = ["pseudoref", str(tmp_path / "color"), "-o", str(tmp_path / "out"), "--preset", "draft", *named]
+    words = ["denoise", str(tmp_path / "color"), "-o", str(tmp_path / "out"), "--preset", "draft", *named]
     assert main(words) == 0
     path = tmp_path / role / "0010.exr"
     os.utime(path, (1e9, 1e9))

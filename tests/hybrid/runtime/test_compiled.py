@@ -139,7 +139,7 @@ sys.exit(code)
 def test_the_longest_loop_is_compiled_beside_the_first_run_and_found_there(shot_folder, tmp_path):
     """Where it were compiled for other types, the first run would wait for it, and compile it again."""
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    words = ["pseudoref", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
+    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
     made = [
         subprocess.run(
             [sys.executable, "-c", COUNT, *words], env=env, cwd=ROOT, capture_output=True, text=True, check=True
