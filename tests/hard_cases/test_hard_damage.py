@@ -123,7 +123,7 @@ DAMAGES = cut_short, flip_bits, change_header, change_size, move_pieces
 
 def run_case(source: Path, output: Path) -> bool:
     """Run the command on one file; whether it was refused."""
-    words = ["pseudoref", source, "-o", output / "done.exr", "--preset", "draft"]
+    words = ["denoise", source, "-o", output / "done.exr", "--preset", "draft"]
     done = ravg(*words, seconds=60, memory=64 * 2**30, most=MOST).ends("either")
     if done.code == 0:
         read_exr(output / "done.exr")

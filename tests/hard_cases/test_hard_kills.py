@@ -1,6 +1,6 @@
 """Commands that are killed, stopped, starved and doubled at random moments: --resume gives the bytes of one run.
 
-`pseudoref` belongs to the quick tests, `denoise` to `pytest -m reliability`.
+The classical chain belongs to the quick tests, the network to `pytest -m reliability`.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class Bench:
 
 
 COMMANDS = [
-    "pseudoref --preset standard",
-    pytest.param("denoise --estimate nlm", marks=[pytest.mark.reliability, pytest.mark.neural]),
+    "denoise --preset standard",
+    pytest.param("denoise --first-pass nlm", marks=[pytest.mark.reliability, pytest.mark.neural]),
 ]
 
 

@@ -181,6 +181,6 @@ def weights(folder: Path, root: Path, name: str = "fast") -> Path:
     return Path(shutil.copy(root / "network" / "weights" / f"{name}.safetensors", folder / "w.safetensors"))
 
 
-def pseudoref(*more: object) -> Sequence[object]:
+def draft(*more: object) -> Sequence[object]:
     """The words of the cheapest run from `in` to `out`."""
-    return ["pseudoref", "in", "-o", "out", *DRAFT, *more]
+    return ["denoise", "in", "-o", "out", *DRAFT, *more]

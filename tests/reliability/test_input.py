@@ -26,9 +26,9 @@ from tests.reliability.shots import (
     Layers,
     cases,
     color,
+    draft,
     names,
     nothing,
-    pseudoref,
     same,
     shot,
     wall,
@@ -57,7 +57,7 @@ def test_time_runs_forward_under_any_name(folder, name, given):
     first = -5 if name.startswith("-") else 1  # a hyphen before the digits is a sign
     for out, form, spec in (("plain", "shot.{:04d}.exr", "plain"), ("named", name, f"named/{given}")):
         shot(folder / out, 5, step=(3, 1), name=form, first=1 if out == "plain" else first)
-        ravg("pseudoref", spec, "-o", f"{out} out", *DRAFT, folder=folder).succeeds()
+        ravg("denoise", spec, "-o", f"{out} out", *DRAFT, folder=folder).succeeds()
     for index in range(5):
         one = color(folder / "plain out" / f"shot.{1 + index:04d}.exr")
         np.testing.assert_array_equal(one, color(folder / "named out" / name.format(abs(first + index))))
@@ -81,7 +81,7 @@ def test_each_view_layer_is_denoised_and_a_composite_kept(folder, case):
             found |= {f"{group}.{n}": found[f"ViewLayer.{n}"] for n in ("Denoising Albedo", "Vector")}
 
     shot(folder / "in", 3, edit)
-    if ravg(*pseudoref(), folder=folder).ends("either").code == 0:
+    if ravg(*draft(), folder=folder).ends("either").code == 0:
         for layer in layers:
             before, after = (color(folder / x / "shot.1002.exr", layer) for x in ("in", "out"))
             assert np.array_equal(before, after) == (layer in kept)
@@ -92,7 +92,7 @@ def test_each_view_layer_is_denoised_and_a_composite_kept(folder, case):
 def test_an_aov_that_is_a_role_changes_nothing_else(folder, name):
     """Or it is refused."""
     shot(folder / "in", 3, step=(2, 0))
-    words = ["denoise", "in", "--estimate", "nlm"]
+    words = ["denoise", "in", "--first-pass", "nlm"]
     if ravg(*words, "-o", "out", "--aov", name, folder=folder).ends("either").code == 0:
         ravg(*words, "-o", "plain", folder=folder).succeeds()
         same(folder / "plain", folder / "out")
@@ -105,7 +105,7 @@ def test_layers_that_could_be_one_thing_are_refused(folder, extra):
         del layers[COLOR]
 
     shot(folder / "in", 3, edit)
-    ravg(*pseudoref(), folder=folder).is_refused()
+    ravg(*draft(), folder=folder).is_refused()
 
 
 # --- 11: weights that ask for too much
@@ -156,7 +156,7 @@ def test_hostile_weights_are_refused_in_a_line_with_next_to_no_memory(folder, ca
         change(metadata)
         save_file({name: file.get_tensor(name) for name in file.keys()}, folder / "w.safetensors", metadata)  # noqa: SIM118
     shot(folder / "in", 1)
-    words = ["denoise", "in", "-o", "out", "--estimate", "auto", "--weights", "w.safetensors"]
+    words = ["denoise", "in", "-o", "out", "--first-pass", "auto", "--weights", "w.safetensors"]
     done = ravg(*words, folder=folder, seconds=60, memory=3 * 2**30).is_refused()
     error = next(line for line in done.said.splitlines() if line.startswith("error: "))
     assert len(error) <= 600
@@ -179,7 +179,7 @@ def make_special(kind: str, path: Path) -> None:
         path.mkdir()
 
 
-@cases((["inspect", "in"], pseudoref()), "words")
+@cases((["inspect", "in"], draft()), "words")
 @cases(("pipe", "socket", "device", "loop", "folder"), "kind")
 def test_no_frame_that_is_no_file_is_waited_for(folder, kind, words):
     path = shot(folder / "in", 5) / "shot.1003.exr"
@@ -190,11 +190,11 @@ def test_no_frame_that_is_no_file_is_waited_for(folder, kind, words):
     assert "Traceback" not in done.said
 
 
-LOOPS = ["inspect", "a"], ["pseudoref", "in", "-o", "a/x"], pseudoref("--preview", "a/x.png")
+LOOPS = ["inspect", "a"], ["denoise", "in", "-o", "a/x"], draft("--preview", "a/x.png")
 SIZES = "9" * 400, "1" + "0" * 400 + "G", "9" * 400 + ".5T", "1e400"
 
 
-@cases([*LOOPS, *(pseudoref("--max-memory", size) for size in SIZES)], "words")
+@cases([*LOOPS, *(draft("--max-memory", size) for size in SIZES)], "words")
 def test_loops_of_links_and_numbers_without_end_are_refused(folder, words):
     shot(folder / "in", 3)
     (folder / "a").symlink_to(folder / "b")
@@ -205,7 +205,7 @@ def test_loops_of_links_and_numbers_without_end_are_refused(folder, words):
 @cases((50, 300), "mebibytes")
 def test_little_memory_ends_in_one_line(folder, mebibytes):
     shot(folder / "in", 3, size=(1500, 2000), noise=0)
-    ravg(*pseudoref(), folder=folder, memory=mebibytes * 2**20).is_refused()
+    ravg(*draft(), folder=folder, memory=mebibytes * 2**20).is_refused()
 
 
 @cases(("[red]x[/blue]", "[/]", "[link=http://a]b", "\x1b[2J", "[bold]"), "name")
@@ -251,9 +251,9 @@ sys.exit(main(sys.argv[1:]))
 def test_pyoidn_without_its_library(folder, estimate):
     """auto does without, and says so."""
     shot(folder / "in", 2)
-    words = ["denoise", "in", "-o", "out", "--estimate", estimate]
+    words = ["denoise", "in", "-o", "out", "--first-pass", estimate]
     done = run_python("-c", WITHOUT_LIBRARY, *words, folder=folder).ends("works" if estimate == "auto" else "refused")
-    assert estimate != "auto" or re.search(r"estimates: (nlm|bundled)\b", done.said)
+    assert estimate != "auto" or re.search(r"first pass: (nlm|bundled)\b", done.said)
 
 
 # --- 13: words of any encoding, folders of any name, usage
@@ -268,7 +268,7 @@ def test_a_string_in_a_header_is_kept_to_the_byte(folder, value):
         data = path.read_bytes()
         assert data.count(b"A" * len(value)) == 1
         path.write_bytes(data.replace(b"A" * len(value), value))
-    ravg(*pseudoref(), folder=folder).succeeds()
+    ravg(*draft(), folder=folder).succeeds()
     made = (folder / "out" / "shot.1001.exr").read_bytes()
     assert b"owner\0string\0" + len(value).to_bytes(4, "little") + value in made
 
@@ -283,11 +283,11 @@ FOLDERS = (
 def test_a_folder_may_be_called_anything(folder, name, pattern):
     noisy, out = shot(folder / name / "in", 2), folder / name / "out"
     spec, target = (noisy / "shot.####.exr", out / "made.####.exr") if pattern else (noisy, out)
-    ravg("pseudoref", spec, "-o", target, *DRAFT).succeeds()
+    ravg("denoise", spec, "-o", target, *DRAFT).succeeds()
     assert len(names(out)) == 2
 
 
-@cases((["inspect", "ä"], ["pseudoref", "ä", "-o", "ö", *DRAFT], ["denoise", "--help"]), "words")
+@cases((["inspect", "ä"], ["denoise", "ä", "-o", "ö", *DRAFT], ["denoise", "--help"]), "words")
 def test_a_terminal_may_know_ascii_alone(folder, words):
     shot(folder / "ä", 2)
     run_python("-m", "ravg", *words, folder=folder, PYTHONIOENCODING="ascii", LC_ALL="C").succeeds()
@@ -306,7 +306,7 @@ def test_bad_usage_ends_with_two_and_makes_nothing(folder, words):
     shot(folder / "in", 3)
     before = set(folder.rglob("*"))
     output = [] if "-o" in words else ["-o", "out"]
-    done = ravg("pseudoref", "in", *DRAFT, *words, *output, folder=folder)
+    done = ravg("denoise", "in", *DRAFT, *words, *output, folder=folder)
     assert done.code == 2
     assert "Traceback" not in done.said
     assert set(folder.rglob("*")) == before
@@ -320,7 +320,7 @@ def denoised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A shot of two frames, denoised, to be copied."""
     folder = tmp_path_factory.mktemp("denoised")
     shot(folder / "in", 2)
-    ravg(*pseudoref(), folder=folder).succeeds()
+    ravg(*draft(), folder=folder).succeeds()
     return folder
 
 
@@ -396,7 +396,7 @@ def test_no_record_that_is_no_file_is_waited_for(folder, make):
     (folder / "out" / "ravg").mkdir(parents=True)
     for name in ("shot.1001-1002.json", "other.1.json"):
         make(folder / "out" / "ravg" / name)
-    for words in (["status", "out"], pseudoref()):
+    for words in (["status", "out"], draft()):
         done = ravg(*words, folder=folder, seconds=60)
         assert done.code != -9
         assert "Traceback" not in done.said
@@ -491,7 +491,7 @@ def test_each_frame_is_made_once_under_its_number(folder, case):
         layers[COLOR] = grained(layers[COLOR], index)
         write(folder / "in" / (number if isinstance(number, str) else f"shot.{number:04d}.exr"), layers)
     source = [] if more and not more[0].startswith("-") else ["in"]
-    done = ravg("pseudoref", *source, *more, "-o", "out", *DRAFT, folder=folder, seconds=60, memory=2 * 2**30)
+    done = ravg("denoise", *source, *more, "-o", "out", *DRAFT, folder=folder, seconds=60, memory=2 * 2**30)
     done.ends(how)
     if done.code == 0 and "--frames" not in more:
         assert names(folder / "in") <= names(folder / "out")

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import OURS, ROOT, ravg, run_python
-from tests.reliability.shots import DRAFT, blurred, cases, contents, no_leftovers, pseudoref, shot, unchanged, weights
+from tests.reliability.shots import DRAFT, blurred, cases, contents, draft, no_leftovers, shot, unchanged, weights
 
 pytestmark = [pytest.mark.reliability, pytest.mark.posix]
 Make = Callable[[Path], object]
@@ -85,10 +85,10 @@ WEIGHTS: dict[str, Make] = {
 
 @cases(TARGETS, "target")
 def test_a_preview_is_written_over_nothing(folder, target):
-    spared(folder, lambda f: pseudoref("--estimate", "single", "--preview", target(f)))
+    spared(folder, lambda f: draft("--first-pass", "single", "--preview", target(f)))
 
 
-DENOISE = ["denoise", "in", "-o", "out", "--weights", "w.safetensors", "--estimate", "nlm"]
+DENOISE = ["denoise", "in", "-o", "out", "--weights", "w.safetensors", "--first-pass", "nlm"]
 
 
 @pytest.mark.neural
@@ -105,7 +105,7 @@ def test_a_preview_is_written_over_no_weights(folder, target):
 
 @cases(("single", "in"), "where")
 def test_an_output_is_written_over_no_input(folder, where):
-    spared(folder, lambda f: ["pseudoref", "in", "-o", where, *DRAFT, "--estimate", "single"])
+    spared(folder, lambda f: ["denoise", "in", "-o", where, *DRAFT, "--first-pass", "single"])
 
 
 @cases(("ravg.json", "ravg", "ravg/shot.1001-1003.json"), "name")
@@ -114,7 +114,7 @@ def test_a_record_is_written_over_no_file_of_that_name(folder, name):
         path = folder / "out" / name
         path.parent.mkdir(parents=True)
         path.write_text('{"mine": true}')
-        return pseudoref()
+        return draft()
 
     spared(folder, words)
 
@@ -129,7 +129,7 @@ def test_links_under_temporary_names_are_not_followed(folder):
         for number, process in product(range(1001, 1004), range(os.getpid(), os.getpid() + 3000)):
             name = f".shot.{number}.exr.{host}-{process}-{threading.get_ident()}.tmp"
             (folder / "out" / name).symlink_to(folder / "victim")
-        return pseudoref()
+        return draft()
 
     spared(folder, words)
 
@@ -189,7 +189,7 @@ def test_a_process_of_another_container_keeps_what_it_writes(folder, kind, proc_
     free = next(number for number in range(2, 10**6) if not Path(f"/proc/{number}").exists())
     words = ["unshare", "--pid", "--fork", *(["--mount-proc"] if proc_of_its_own else [])]
     child = hold(folder, kind, free, *words)
-    ravg(*pseudoref(), folder=folder).succeeds()
+    ravg(*draft(), folder=folder).succeeds()
     said, _ = child.communicate("x")
     assert child.returncode == 0
     assert "whole" in said
@@ -200,7 +200,7 @@ def test_what_a_killed_process_has_left_goes(folder, kind):
     child = hold(folder, kind, 0)
     child.kill()
     child.communicate()
-    ravg(*pseudoref(), folder=folder).succeeds()
+    ravg(*draft(), folder=folder).succeeds()
     no_leftovers(folder / "out")
 
 
@@ -253,12 +253,12 @@ def test_a_user_without_a_home_runs_an_installation_of_roots(folder, words, temp
 def test_compiled_loops_that_are_cut_short_are_compiled_again(folder, kind, share):
     shot(folder / "in", 1)
     packages = installed(folder, compiled=True)
-    run_python("-m", "ravg", *pseudoref(), packages=packages, folder=folder).succeeds()
+    run_python("-m", "ravg", *draft(), packages=packages, folder=folder).succeeds()
     files = sorted((packages / "nlm" / "__pycache__").glob(f"average*.{kind}"))
     assert files
     for path in files:
         os.truncate(path, int(share * path.stat().st_size))
-    run_python("-m", "ravg", *pseudoref(), packages=packages, folder=folder).succeeds()
+    run_python("-m", "ravg", *draft(), packages=packages, folder=folder).succeeds()
 
 
 # --- 19: outputs in odd places
@@ -303,7 +303,7 @@ ODD: dict[str, tuple[Make, Sequence[str], str]] = {
     "a preview that is an output": (nothing, ["-o", "out", "--preview", "out/shot.1002.exr"], "refused"),
     "a preview without an extension": (nothing, ["-o", "out", "--preview", "out/x"], "refused"),
     "a preview in a folder that is not there": (nothing, ["-o", "out", "--preview", "no/such/x.png"], "either"),
-    "a preview and a sheet in one file": (nothing, ["-o", "out", "--preview", "x.png", "--contact", "./x.png"], "refused"),
+    "a preview and a sheet in one file": (nothing, ["-o", "out", "--preview", "x.png", "--contact-sheet", "./x.png"], "refused"),
     "a log that is a frame": (nothing, ["-o", "out", "--log-file", "in/shot.1002.exr"], "refused"),
     "a log that is an output": (nothing, ["-o", "out", "--log-file", "out/shot.1002.exr"], "refused"),
     "a log that is the preview": (nothing, ["-o", "out", "--log-file", "x.png", "--preview", "x.png"], "refused"),
@@ -311,8 +311,8 @@ ODD: dict[str, tuple[Make, Sequence[str], str]] = {
     "a log that is a pipe": (lambda f: fifo(f / "pipe"), ["-o", "out", "--log-file", "pipe"], "refused"),
     "a log that is a folder": (nothing, ["-o", "out", "--log-file", "in"], "refused"),
     "records in a folder that is a file": (lambda f: written(f / "out/ravg"), ["-o", "out"], "refused"),
-    "estimates that are the input": (nothing, ["-o", "out", "--estimate", "in"], "either"),
-    "estimates in the output": (nothing, ["-o", "single", "--estimate", "single"], "refused"),
+    "estimates that are the input": (nothing, ["-o", "out", "--first-pass", "in"], "either"),
+    "estimates in the output": (nothing, ["-o", "single", "--first-pass", "single"], "refused"),
     "a very long name": (nothing, ["-o", "x" * 240 + ".####.exr"], "either"),
     "a name that is too long": (nothing, ["-o", "x" * 300 + ".####.exr"], "refused"),
     "a path that is too long": (nothing, ["-o", "/".join(["x" * 200] * 30)], "refused"),
@@ -330,5 +330,5 @@ def test_an_odd_place_works_or_is_refused_and_spares_what_is_there(folder, case)
     prepare(folder)
     before = contents(folder / "in", folder / "single")
     source = [] if words[0] == FRAMES else ["in"]
-    ravg("pseudoref", *DRAFT, *source, *words, folder=folder, seconds=60).ends(how)
+    ravg("denoise", *DRAFT, *source, *words, folder=folder, seconds=60).ends(how)
     unchanged(before)

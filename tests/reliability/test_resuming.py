@@ -34,11 +34,11 @@ from tests.reliability.shots import (
     color,
     contents,
     difference,
+    draft,
     exchange,
     names,
     no_leftovers,
     nothing,
-    pseudoref,
     read_layers,
     render_again,
     same,
@@ -86,7 +86,7 @@ class Project:
         blurred(self.first_pass, self.frames)
 
     def run(self, out: Path, *more: object) -> Done:
-        return ravg("pseudoref", self.frames, "-o", out, *DRAFT, "--estimate", self.first_pass, *more).succeeds()
+        return ravg("denoise", self.frames, "-o", out, *DRAFT, "--first-pass", self.first_pass, *more).succeeds()
 
     def resumes_as_fresh(self, *more: object) -> None:
         """Assert that --resume leaves what a run into an empty folder makes."""
@@ -138,10 +138,10 @@ OPTIONS: dict[str, Sequence[str]] = {
     "a layer left out": ("--layer", "normal=Denoising Albedo"),
     "a stage forced on": ("--stages", "refine"),
     "a stage forced off": ("--no-stages", "gate"),
-    "another preset": ("--preset", "final", "--estimate", "none"),
-    "no estimates": ("--estimate", "none"),
-    "our own estimates": ("--estimate", "nlm"),
-    "OIDN's estimates": ("--estimate", "oidn-fast"),
+    "another preset": ("--preset", "final", "--first-pass", "none"),
+    "no estimates": ("--first-pass", "none"),
+    "our own estimates": ("--first-pass", "nlm"),
+    "OIDN's estimates": ("--first-pass", "oidn-fast"),
 }
 
 
@@ -156,7 +156,7 @@ def test_resume_with_other_options(folder, more):
 @pytest.mark.neural
 def test_resume_with_other_weights_under_one_name_and_of_one_time(folder):
     shot(folder / "in", 3, step=(2, 1))
-    words = ["denoise", "in", "--estimate", "nlm", "--weights", "w.safetensors"]
+    words = ["denoise", "in", "--first-pass", "nlm", "--weights", "w.safetensors"]
     for name, outs in (("fast", ["out"]), ("balanced", ["out", "fresh"])):
         os.utime(weights(folder, ROOT, name), (1e9, 1e9))
         for out in outs:
@@ -194,10 +194,10 @@ def test_resume_leaves_alone_what_is_the_same(folder, elsewhere):
 def kept(folder: Path, first: Sequence[str], then: Sequence[str], change: Callable[[Path], object] = nothing) -> None:
     """Assert that estimates that were kept never show in what would be made without."""
     shot(folder / "in", 4, step=(2, 1), **RAW)
-    words = ["pseudoref", "in", *DRAFT]
-    ravg(*words, "-o", "first", *first, "--keep-estimates", "kept", folder=folder).succeeds()
+    words = ["denoise", "in", *DRAFT]
+    ravg(*words, "-o", "first", *first, "--keep-first-pass", "kept", folder=folder).succeeds()
     change(folder)
-    if ravg(*words, "-o", "out", *then, "--keep-estimates", "kept", folder=folder).ends("either").code == 0:
+    if ravg(*words, "-o", "out", *then, "--keep-first-pass", "kept", folder=folder).ends("either").code == 0:
         ravg(*words, "-o", "fresh", *then, folder=folder).succeeds()
         same(folder / "fresh", folder / "out")
 
@@ -208,7 +208,7 @@ MODES = {"oidn": "oidn-best", "oidn-best": "oidn", "oidn-fast": "oidn-clean", "o
 @pytest.mark.oidn
 @pytest.mark.parametrize(("first", "then"), MODES.items())
 def test_kept_estimates_of_another_mode(folder, first, then):
-    kept(folder, ["--estimate", first], ["--estimate", then])
+    kept(folder, ["--first-pass", first], ["--first-pass", then])
 
 
 KEPT: dict[str, Callable[[Path], object]] = {
@@ -220,7 +220,7 @@ KEPT: dict[str, Callable[[Path], object]] = {
     "somebody else's picture in its place": lambda f: shutil.copy2(f / "in/shot.1002.exr", f / "kept/shot.1002.exr"),
     "the output in its place": lambda f: shutil.copy2(f / "first/shot.1002.exr", f / "kept/shot.1002.exr"),
 }
-FAST = ["--estimate", "oidn-fast"]
+FAST = ["--first-pass", "oidn-fast"]
 
 
 @pytest.mark.oidn
@@ -254,7 +254,7 @@ def test_kept_estimates_are_written_over_nobodys_file(folder, place):
     shot(folder / "in", 4)
     where = place(folder)
     before = contents(folder)
-    ravg(*pseudoref(*FAST, "--keep-estimates", where), folder=folder).is_refused()
+    ravg(*draft(*FAST, "--keep-first-pass", where), folder=folder).is_refused()
     unchanged(before)
 
 
@@ -286,7 +286,7 @@ def as_fresh(
     before: Sequence[object],
     after: Sequence[object],
     change: Callable[[Path], object],
-    command: Sequence[object] = ("pseudoref", "in", *DRAFT),
+    command: Sequence[object] = ("denoise", "in", *DRAFT),
     edit: Edit | None = None,
 ) -> None:
     """Assert that after a change --resume leaves the frames of a run into an empty folder."""
@@ -346,7 +346,7 @@ def test_resume_with_something_else(folder, case):
 @pytest.mark.neural
 @cases(NETWORK)
 def test_resume_of_the_network_with_something_else(folder, case):
-    as_fresh(folder, *case, command=["denoise", "in", "--estimate", "nlm", "--weights", "w.safetensors"])
+    as_fresh(folder, *case, command=["denoise", "in", "--first-pass", "nlm", "--weights", "w.safetensors"])
 
 
 @pytest.mark.neural
@@ -407,7 +407,7 @@ def test_estimates_of_a_sequence_that_does_not_fit_are_refused(folder, case):
     change, more, fits = case
     blurred(folder / "single", shot(folder / "in", 8, step=(2, 1)))
     change(folder / "single")
-    done = ravg(*pseudoref("--estimate", "single", *more), folder=folder).ends("works" if fits else "refused")
+    done = ravg(*draft("--first-pass", "single", *more), folder=folder).ends("works" if fits else "refused")
     assert bool(names(folder / "out")) == (done.code == 0)
 
 
@@ -424,7 +424,7 @@ TOGETHER: dict[str, Sequence[Sequence[str]]] = {
 @cases(TOGETHER, "runs")
 def test_runs_into_one_folder_at_once_leave_the_frames_of_one_of_them(folder, runs):
     shot(folder / "in", 6, step=(2, 1))
-    command = [sys.executable, "-P", "-m", "ravg", "pseudoref", "in", "-o", "out"]
+    command = [sys.executable, "-P", "-m", "ravg", "denoise", "in", "-o", "out"]
     settings = {"cwd": folder, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "stderr": subprocess.PIPE, "text": True}
     running = [subprocess.Popen([*command, *more], **settings) for more in runs]  # type: ignore[call-overload]
     for process in running:
@@ -432,7 +432,7 @@ def test_runs_into_one_folder_at_once_leave_the_frames_of_one_of_them(folder, ru
         assert process.returncode == 0
     for index, more in enumerate(runs):
         options = [word for word in more if word != "--frames" and not word.startswith("100")]
-        ravg("pseudoref", "in", "-o", f"alone{index}", *options, folder=folder).succeeds()
+        ravg("denoise", "in", "-o", f"alone{index}", *options, folder=folder).succeeds()
     for name in names(folder / "in"):
         assert not all(difference(folder / f"alone{index}", folder / "out", {name}) for index in range(len(runs)))
     no_leftovers(folder / "out")
@@ -453,7 +453,7 @@ def test_chunks_on_a_cluster_make_again_what_is_not_what_it_was(folder, stale):
     running = [subprocess.Popen([sys.executable, "-m", *words], **quiet) for words in (scheduler, worker)]  # type: ignore[call-overload]
     try:
         time.sleep(5)
-        words = ["-m", "ravg", *pseudoref("--scheduler", address, "--chunk", "2")]
+        words = ["-m", "ravg", *draft("--scheduler", address, "--chunk", "2")]
         run_python(*words, folder=folder).succeeds()
         if stale:
             render_again(folder / "in" / "shot.1004.exr")
@@ -464,7 +464,7 @@ def test_chunks_on_a_cluster_make_again_what_is_not_what_it_was(folder, stale):
         for process in running:
             process.terminate()
             process.wait(20)
-    ravg("pseudoref", "in", "-o", "fresh", *DRAFT, folder=folder).succeeds()
+    ravg("denoise", "in", "-o", "fresh", *DRAFT, folder=folder).succeeds()
     same(folder / "fresh", folder / "out")
 
 
@@ -490,7 +490,7 @@ def two_views(folder: Path, frames: int) -> None:
 def test_views_of_a_pattern_are_made_each_by_itself(folder, case):
     change, after = case
     two_views(folder, 4)
-    words = ["pseudoref", "in/shot.%V.####.exr", *DRAFT]
+    words = ["denoise", "in/shot.%V.####.exr", *DRAFT]
     ravg(*words, "-o", "out/done.%V.####.exr", folder=folder).succeeds()
     change(folder)
     for out, more in (("out", ["--resume"]), ("fresh", [])):
@@ -502,7 +502,7 @@ def test_views_of_a_pattern_are_made_each_by_itself(folder, case):
 @cases(("out.####.exr", "in/shot.%V.####.exr", "out.exr"), "output")
 def test_two_views_in_one_place_are_refused(folder, output):
     two_views(folder, 2)
-    ravg("pseudoref", "in/shot.%V.####.exr", *DRAFT, "-o", output, folder=folder).is_refused()
+    ravg("denoise", "in/shot.%V.####.exr", *DRAFT, "-o", output, folder=folder).is_refused()
 
 
 def test_two_views_in_one_file_are_both_denoised(folder):
@@ -514,7 +514,7 @@ def test_two_views_in_one_file_are_both_denoised(folder):
 
     shot(folder / "in", 3, edit, step=(2, 1))
     for more in ([], ["--resume"]):
-        ravg(*pseudoref(*more), folder=folder).succeeds()
+        ravg(*draft(*more), folder=folder).succeeds()
     for view in ("left", "right"):
         before, after = (color(folder / x / "shot.1002.exr", f"{COLOR}.{view}") for x in ("in", "out"))
         assert not np.array_equal(before, after)
@@ -523,10 +523,10 @@ def test_two_views_in_one_file_are_both_denoised(folder):
 # --- 24: two things taken for one
 
 FOR_BOTH = [
-    ["--keep-estimates", "kept", "--estimate", "oidn-fast"],
+    ["--keep-first-pass", "kept", "--first-pass", "oidn-fast"],
     ["--preview", "x.png"],
-    ["--contact", "x.png"],
-    ["--estimate", "left/shot.####.exr"],
+    ["--contact-sheet", "x.png"],
+    ["--first-pass", "left/shot.####.exr"],
     ["--layer", "albedo=left/shot.####.exr"],
     ["-o", "out"],
 ]
@@ -537,7 +537,7 @@ def test_what_is_given_once_for_two_views_is_refused(folder, more):
     for view in ("left", "right"):
         shot(folder / view, 3)
     output = [] if "-o" in more else ["-o", "out/%V"]
-    ravg("pseudoref", "%V/shot.####.exr", *DRAFT, *more, *output, folder=folder).is_refused()
+    ravg("denoise", "%V/shot.####.exr", *DRAFT, *more, *output, folder=folder).is_refused()
 
 
 @pytest.mark.oidn
@@ -548,7 +548,7 @@ def test_estimates_of_view_layers_called_alike_are_kept_apart(folder):
             layers |= {name.replace("ViewLayer", other): layer.copy() for other in ("A B", "A_B")}
 
     shot(folder / "in", 2, edit)
-    ravg(*pseudoref(*FAST, "--keep-estimates", "kept"), folder=folder).succeeds()
+    ravg(*draft(*FAST, "--keep-first-pass", "kept"), folder=folder).succeeds()
     assert len([*(folder / "kept").rglob("*.exr")]) == 4
 
 
@@ -557,7 +557,7 @@ def test_estimates_of_neighbouring_frames_are_refused(folder, by):
     shot(folder / "in", 6, step=(3, 1))
     for index in range(6):
         write(folder / "single" / f"shot.{1001 + index}.exr", {COLOR: wall(index + by, (3, 1))[COLOR]})
-    ravg(*pseudoref("--estimate", "single"), folder=folder).ends("refused" if by else "works")
+    ravg(*draft("--first-pass", "single"), folder=folder).ends("refused" if by else "works")
 
 
 @cases(("1001-1007", "1003-1006", "1005"), "frames")
@@ -565,8 +565,8 @@ def test_every_second_frame_is_the_same_whatever_range_is_asked_for(folder, fram
     noisy = shot(folder / "in", 7, step=(1, 0))
     for number in (1002, 1004, 1006):
         (noisy / f"shot.{number}.exr").unlink()
-    ravg("pseudoref", "in", "-o", "all", *DRAFT, folder=folder).succeeds()
-    ravg("pseudoref", "in", "-o", "part", *DRAFT, "--frames", frames, "--keep-going", folder=folder)
+    ravg("denoise", "in", "-o", "all", *DRAFT, folder=folder).succeeds()
+    ravg("denoise", "in", "-o", "part", *DRAFT, "--frames", frames, "--keep-going", folder=folder)
     same(folder / "part", folder / "all")
 
 
@@ -577,8 +577,10 @@ out, options = sys.argv[1], json.loads(sys.argv[2])
 print(sum(not frame.resumed for frame in denoise_shot(open_shot("in"), out, resume=True, **options)))
 """
 
+NETWORK_OPTIONS = {"preset": "fast", "first_pass": "nlm", "weights": "w.safetensors"}
 
-@cases(({"no_stages": ["warp"]}, {"stages": ["refine"]}, {"estimate": "nlm"}, {"weights": "w.safetensors"}), "then")
+
+@cases(({"no_stages": ["warp"]}, {"stages": ["refine"]}, {"first_pass": "nlm"}, NETWORK_OPTIONS), "then")
 def test_a_program_resumes_by_its_options(folder, then):
     shot(folder / "in", 3, step=(2, 1))
     shutil.copy(ROOT / "tests" / "data" / "small.safetensors", folder / "w.safetensors")
@@ -602,5 +604,5 @@ def test_a_frame_that_is_exchanged_while_it_is_used_ends_the_run(folder):
         new.replace(old)
 
     threading.Thread(target=swap, daemon=True).start()
-    done = run_python("-m", "ravg", *pseudoref(), folder=folder).is_refused()
+    done = run_python("-m", "ravg", *draft(), folder=folder).is_refused()
     assert re.search(r"shot\.1008\.exr", done.said)
