@@ -25,11 +25,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.cpu_time import measure
 from hybrid.runtime.allocator import reuse_freed_memory
-from network.models import PRESETS, channels_last, denoise_tile, for_inference
-from network.paper.blocks import RobustAverage, outermost_first, ravg
+from network.paper.blocks import RobustAverage
 from network.paper.kernels import apply_kernels, predict_kernel, threshold_kernel
+from network.paper.models import for_inference as prepare_kernels
+from network.presets import PRESETS, build_preset
+from network.robust_average import outermost_first, ravg
+from network.robust_unet import RobustUNet, channels_last, for_inference
+from network.training.clips import Sample
 from network.training.config import TrainConfig
-from network.training.loop import batch_loss
+from network.training.loop import batch_loss, predict
 from network.training.losses import relmse
 
 
@@ -101,32 +105,31 @@ def parts(tile: int) -> Iterator[tuple[str, Callable[[], object], int]]:
 
 
 def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], object], int]]:
-    for name, build in ((name, PRESETS[name]) for name in presets):
+    for name in presets:
         for bfloat16 in (False, True):
-            model = for_inference(build(), bfloat16)
-            color = torch.rand(1, 5, 3, tile, tile)
-            window = dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), color)
-            window |= {"confidence": torch.rand(1, 5, 1, tile, tile), "modulation": color[:, 0]}
-            window |= dict.fromkeys(("exposure", "gain"), torch.ones(1))
+            model = build_preset(name)
+            model = (for_inference if isinstance(model, RobustUNet) else prepare_kernels)(model, bfloat16)
+            batch = batch_of(1, tile, model.frames)
             yield (
                 f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
-                lambda m=model, w=window: denoise_tile(m, w),
+                lambda m=model, b=batch: torch.no_grad()(predict)(m, b),
                 tile**2,
             )
         for count in (1, 2):
-            model, config = channels_last(build()), TrainConfig(steps=1)
-            color, image = torch.rand(count, 5, 3, 128, 128), torch.rand(count, 3, 128, 128)
-            batch = {
-                **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), color),
-                **dict.fromkeys(("modulation", "clean_albedo", "clean_normal", "target"), image),
-                **dict.fromkeys(("exposure", "gain", "error"), torch.ones(count)),
-                "confidence": color[:, :, :1],
-            }
+            model, config = channels_last(build_preset(name)), TrainConfig(steps=1)
+            batch = batch_of(count, 128, model.frames)
             yield (
                 f"{name}, training, batch of {count}",
                 lambda m=model, b=batch, c=config: batch_loss(m, b, c, relmse).backward(),
                 count * 128**2,
             )
+
+
+def batch_of(count: int, size: int, frames: int) -> Sample:
+    """Samples of noise."""
+    window, image = torch.rand(count, frames, 3, size, size), torch.rand(count, 3, size, size)
+    one = torch.ones(count)
+    return Sample(*[window] * 5, window[:, :, :1], *[image] * 3, one, one, image[:, :2], image, one)
 
 
 def main(argv: list[str]) -> int:

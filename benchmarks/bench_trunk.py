@@ -24,10 +24,13 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from hybrid.alignment.transfer import autoexposure
 from hybrid.files.shots import open_shot
 from hybrid.oidn import denoise_oidn
 from hybrid.runtime.allocator import reuse_freed_memory
-from network.unet import denoise_picture, load_oidn, round_trunk
+from network.bfloat16 import round_unet
+from network.oidn_weights import load_oidn
+from network.unet import denoise_color
 
 # Of OIDN's weights: its quality, and whether it is told that guides are clean.
 MODES = {
@@ -52,11 +55,11 @@ def compare(name: str, images: list[np.ndarray], threads: int, rounds: int) -> d
     quality, clean = MODES[name]
     layers = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in images]
     exact = load_oidn(name)
-    rounded = round_trunk(exact)
+    rounded = round_unet(exact)
     runs: dict[str, Callable[[], Any]] = {
         "oidn": lambda: denoise_oidn(*images, quality=quality, clean=clean, threads=threads),
-        "float32": lambda: denoise_picture(exact, *layers),
-        "bfloat16": lambda: denoise_picture(rounded, *layers),
+        "float32": lambda: denoise_color(exact, *layers, exposure=autoexposure(images[0])),
+        "bfloat16": lambda: denoise_color(rounded, *layers, exposure=autoexposure(images[0])),
     }
     wanted = torch.from_numpy(runs["oidn"]()).permute(2, 0, 1)[None]
     accuracy = {}

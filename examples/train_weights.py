@@ -19,7 +19,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from network.checkpoint import save_model
-from network.models import PRESETS as ALL
+from network.presets import build_preset
 from network.robust_unet import start_from_oidn
 
 #: Kind of shot, first seed, how many.
@@ -33,7 +33,7 @@ SCHEDULES = {
     "quality": ["--window", 7, "--steps", 1000],
 }
 TRAIN = ["--init", "oidn", "--loss", "display", "--differences", 1, "--pseudo", 0.6, "--batch", 2, "--crop", 80]
-TRAIN += ["--rate", 3e-4, "--trunk-rate", 0.1, "--warmup", 100, "--ema", 0.995, "--sets", 1]
+TRAIN += ["--rate", 3e-4, "--backbone-rate", 0.1, "--warmup", 100, "--ema", 0.995, "--sets", 1]
 
 
 def main() -> int:
@@ -45,7 +45,7 @@ def main() -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     if options.untrained:
         for preset in SCHEDULES:
-            model = start_from_oidn(ALL[preset]())
+            model = start_from_oidn(build_preset(preset))
             save_model(options.out / f"{preset}.safetensors", model, {"start": "OIDN 2.5.1, nothing trained"})
         return 0
 

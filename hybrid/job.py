@@ -51,7 +51,7 @@ LOG = logging.getLogger("ravg")
 
 # Presets of each method, the default first.
 PRESETS: dict[str, tuple[str, ...]] = {
-    "network": ("fast", "balanced", "quality", "tkpcn", "auto"),
+    "network": ("fast", "balanced", "quality", "auto"),
     "classical": ("standard", "draft", "final"),
     "pooled": ("pooled",),
 }
@@ -141,6 +141,9 @@ class DenoiseOptions:
 
     def __post_init__(self) -> None:
         preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release
+        if preset == "tkpcn":
+            weights = "network/paper/weights/tkpcn.safetensors"
+            raise ValueError(f"preset is 'tkpcn', which is no preset any more, expected its weights: --weights {weights}")
         if preset and preset not in METHOD_OF_PRESET:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(METHOD_OF_PRESET)}")
         method = self.method or METHOD_OF_PRESET.get(preset, "network")
@@ -251,7 +254,7 @@ def open_denoiser(
             return AverageDenoiser(timings)
         return ClassicalDenoiser(CLASSICAL_PRESETS[options.preset], timings)
     neural = import_neural()
-    return neural.Denoiser(  # type: ignore[no-any-return]
+    return neural.open_network(  # type: ignore[no-any-return]
         weights_of(options),
         tile=neural.SMALL_TILE if options.tile is None and options.max_memory is not None else options.tile,
         precision=options.precision,

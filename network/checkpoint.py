@@ -1,4 +1,7 @@
-"""A model in one safetensors file: weights, and in its metadata what to build and where it comes from."""
+"""A model in one safetensors file: weights, and in the metadata its description and the notes on its training.
+
+Files are untrusted: nothing in them is run, and a description is checked before anything of its size is built.
+"""
 
 from __future__ import annotations
 
@@ -10,112 +13,83 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from network.models import (
-    TKPCN,
-    KernelConfig,
-    Model,
-    MultiScale,
-    MultiScaleConfig,
-    RAResNet,
-    RAResNetConfig,
-    RAUNet,
-    RAUNetConfig,
-    TKPCNConfig,
-)
 from network.robust_unet import RobustUNet, RobustUNetConfig
+
+if TYPE_CHECKING:
+    from network.presets import Model
 
 Config = TypeVar("Config")
 
 FORMAT = "ravg-network"
-#: Raised when a change makes older weights give other kernels. Files say which one they were written for.
-VERSION = 3
-#: The greatest number in a description that is read: three times the width of any network here.
-LARGEST = 256
-
-
-#: The greatest weight that is read: a thousand times that of any network here. What is heavier makes NaN of pictures.
+#: Raised when older weights would give other images.
+VERSION = 4
+#: Beginnings of the names of a `RobustUNet`'s tensors in version 3, with those of today.
+_NAMES_OF_3 = {"trunk": "backbone", "known": "aux_conv", "average": "robust_average", "keep": "average_blend"}
+#: The greatest weight that is read: a thousand times that of any network here. Greater weights give NaN images.
 HEAVIEST = 5e3
-#: Bounds of single numbers in it, two to four times what any network here has.
+#: Bounds of numbers in a description: two to four times those of any network here. And of all others.
 BOUNDS = {"frames": 15, "size": 21, "conv_size": 15, "scales": 8, "blocks": 64, "temporal_blocks": 16}
-#: How deep they may lie: a network within scales, its configuration, that of its kernels, a list.
+LARGEST = 256
+#: Nesting of a description: a network within scales, its configuration, that of its kernels, a list.
 DEEPEST = 5
-#: How many weights a network may have: twenty times those of the largest here.
+#: Parameters of a network: twenty times those of the largest here.
 PARAMETERS = 10**8
-#: Characters of a description, or of the notes on a training of weeks; and what a message quotes of them.
+#: Characters of a description or of notes, and of what a message quotes.
 LONGEST, QUOTED = 2**24, 160
-#: Networks by name, with their configurations.
-CLASSES: dict[str, tuple[Any, Any]] = {
-    "RAUNet": (RAUNet, RAUNetConfig),
-    "RAResNet": (RAResNet, RAResNetConfig),
-    "TKPCN": (TKPCN, TKPCNConfig),
-    "RobustUNet": (RobustUNet, RobustUNetConfig),
-}
 
 
 def describe(model: Model) -> dict[str, Any]:
-    """What is needed to build the model anew.
-
-    Parameters
-    ----------
-    model : Model
-        Any.
-
-    Returns
-    -------
-    dict
-        Plain JSON values.
-    """
-    if isinstance(model, MultiScale):
-        return {"model": "MultiScale", "scales": model.config.scales, "base": describe(model.base)}
-    return {"model": type(model).__name__, "config": asdict(model.config)}
+    """Description of a model, as plain JSON values, from which `build` can build it again."""
+    name = type(model).__name__
+    if name == "MultiScale":
+        return {"model": name, "scales": model.config.scales, "base": describe(model.base)}  # type: ignore
+    return {"model": name, "config": asdict(model.config)}
 
 
 def build(description: Mapping[str, Any]) -> Model:
-    """Build the model of a description, with initial weights.
-
-    Parameters
-    ----------
-    description : mapping
-        From `describe`.
-
-    Returns
-    -------
-    Model
-        In training layout.
-
-    Raises
-    ------
-    ValueError
-        If the description is not one of `describe`.
-    """
+    """Build the model of a description, with initial weights; ValueError unless it is one of `describe`."""
     try:
-        name = description["model"]
-        if name == "MultiScale":
-            if description["base"]["model"] == "MultiScale":
-                raise ValueError("expected scales of a network that has one, got scales of scales")
-            base = cast(RAUNet | RAResNet, build(description["base"]))
-            return MultiScale(MultiScaleConfig(base.config, description["scales"]))
-        if name not in CLASSES:
-            raise ValueError(f"expected model MultiScale, {', '.join(CLASSES)}, got {name!r}")
-        network, configuration = CLASSES[name]
-        values = dict(description["config"])
-        values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        if "kernel" in values:
-            values["kernel"] = _configure(KernelConfig, values["kernel"])
-        return cast(Model, network(_configure(configuration, values)))
+        if description["model"] == "RobustUNet":
+            return RobustUNet(_configure(RobustUNetConfig, description["config"]))
+        return _build_paper(description)
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"model description: {error!r}") from error
 
 
+def _build_paper(description: Mapping[str, Any]) -> Model:
+    """Build one of the paper's networks."""
+    from network.paper import models as paper  # here, since no preset needs them
+
+    name = description["model"]
+    if name == "MultiScale":
+        if description["base"]["model"] == "MultiScale":
+            raise ValueError("expected scales of a network that has one, got scales of scales")
+        base: Any = _build_paper(description["base"])
+        return paper.MultiScale(paper.MultiScaleConfig(base.config, description["scales"]))
+    kinds: dict[str, tuple[Any, Any]] = {
+        "RAUNet": (paper.RAUNet, paper.RAUNetConfig),
+        "RAResNet": (paper.RAResNet, paper.RAResNetConfig),
+        "TKPCN": (paper.TKPCN, paper.TKPCNConfig),
+    }
+    if name not in kinds:
+        raise ValueError(f"expected model RobustUNet, MultiScale, {', '.join(kinds)}, got {name!r}")
+    network, configuration = kinds[name]
+    values = dict(description["config"])
+    if "kernel" in values:
+        values["kernel"] = _configure(paper.KernelConfig, values["kernel"])
+    model: Model = network(_configure(configuration, values))
+    return model
+
+
 def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
-    """A configuration of checked types: 5.0 frames pass every comparison, and fail when they are counted."""
-    values = dict(values)
+    """A configuration of JSON values; 5.0 frames would pass every comparison, and fail when they are counted."""
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     for item in fields(kind):  # type: ignore[arg-type]
         if type(item.default) is int and type(values.get(item.name, 0)) is not int:
             raise TypeError(f"{item.name}: expected a whole number, got {values[item.name]!r}")
@@ -132,7 +106,7 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
     model : Model
         The model, in any precision.
     notes : mapping, optional
-        Where the weights come from (training configuration, validation), as JSON values.
+        Origin of the weights (training configuration, validation), as JSON values.
 
     Raises
     ------
@@ -159,14 +133,10 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
 
 
 def new_partial(path: Path) -> Path:
-    """An empty file beside `path` to write to, to be renamed to it; what an earlier process has left there is gone.
+    """Create an empty file beside `path`, to be written and renamed to it; removes one of an earlier process.
 
-    It is made anew, so that nothing is written through a link that somebody has put there.
-
-    Raises
-    ------
-    OSError
-        If `path` is there and no file, or the folder cannot be written to.
+    The file is created exclusively, so that nothing is written through a link at its place. Raises OSError if `path`
+    exists and is no file, or the folder cannot be written to.
     """
     if path.exists() and not path.is_file():
         raise OSError(f"{path} is there and no file, expected a file or a new name")
@@ -177,7 +147,7 @@ def new_partial(path: Path) -> Path:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
-    """Write tensors in place of an empty file of `new_partial`, with its mode.
+    """Write tensors over an empty file of `new_partial`, and keep its mode.
 
     safetensors replaces the file by one that only its owner may read, whatever the umask.
 
@@ -188,7 +158,7 @@ def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Map
     tensors : mapping of str to Tensor
         By name.
     metadata : mapping of str to str
-        For the file's header.
+        For the header of the file.
     """
     mode = stat.S_IMODE(path.stat().st_mode)
     save_file(dict(tensors), path, dict(metadata))
@@ -196,25 +166,10 @@ def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Map
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:
-    """Read a model.
+    """Load a model from a file of `save_model`, in float32.
 
-    Parameters
-    ----------
-    path : path
-        File from `save_model`.
-
-    Returns
-    -------
-    Model
-        Float32, in training layout; see `network.models.for_inference`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file is cut short, no safetensors file, not ours, of another version, or its weights are not
-        those of the model it names.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is cut short, no file of ours, of another
+    version, or its weights do not fit the model that it describes.
     """
     where = f"weights {os.fspath(path)!r}"
     with _open(path) as (file, metadata):
@@ -222,17 +177,18 @@ def load_model(path: str | os.PathLike[str]) -> Model:
             description = _parse(metadata, "description")
             _refuse_huge(description)
             with torch.device("meta"):  # shapes alone, which take no memory
-                wanted = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
+                expected = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
         except (KeyError, ValueError, RecursionError) as error:
             raise ValueError(f"{where}: {_short(error)}") from error
-        found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        if wanted != found:
-            name = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
-            got = f"expected shape {wanted.get(name)}, got {found.get(name)}"
+        names = {_name_of_today(name, metadata, description): name for name in file.keys()}  # noqa: SIM118 (no mapping)
+        found = {name: tuple(file.get_slice(stored).get_shape()) for name, stored in names.items()}
+        if expected != found:
+            name = min(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
+            got = f"expected shape {expected.get(name)}, got {found.get(name)}"
             raise ValueError(f"{where}: {_short(name)}: {got}")
         if (count := sum(math.prod(shape) for shape in found.values())) > PARAMETERS:
             raise ValueError(f"{where}: expected at most {PARAMETERS:g} parameters, got {count}")
-        tensors = {name: file.get_tensor(name) for name in found}
+        tensors = {name: file.get_tensor(stored) for name, stored in names.items()}
     for name, value in tensors.items():
         if not value.is_floating_point() or not bool((value.abs() <= HEAVIEST).all()):
             raise ValueError(f"{where}: {name}: expected finite numbers up to {HEAVIEST:g}, got others")
@@ -241,8 +197,16 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     return model
 
 
+def _name_of_today(name: str, metadata: Mapping[str, str], description: Mapping[str, Any]) -> str:
+    """Name that a tensor of a file has in this version."""
+    if metadata["version"] != "3" or description["model"] != "RobustUNet":
+        return name
+    head, dot, rest = name.partition(".")
+    return _NAMES_OF_3.get(head, head) + dot + rest
+
+
 def _refuse_huge(value: Any, name: str = "", depth: int = 0) -> None:
-    """Raise ValueError for a description that would take all memory, or for ever, to build or to run."""
+    """Raise ValueError for a description that would take excessive memory or time to build or to run."""
     if isinstance(value, Mapping | list):
         if depth == DEEPEST:
             raise ValueError(f"model description: expected values within at most {DEEPEST} others, got more")
@@ -255,36 +219,20 @@ def _refuse_huge(value: Any, name: str = "", depth: int = 0) -> None:
 
 
 def _parse(metadata: Mapping[str, str], name: str) -> Any:
-    """The JSON value of an entry of a file's metadata."""
+    """JSON value of an entry of the metadata."""
     if len(text := metadata[name]) > LONGEST:
         raise ValueError(f"{name}: expected at most {LONGEST} characters, got {len(text)}")
     return json.loads(text)
 
 
 def _short(words: object) -> str:
-    """What a message quotes of a file: a line at most."""
+    """Text from a file, shortened to one line for a message."""
     text = " ".join(str(words).split())
     return text if len(text) <= QUOTED else f"{text[:QUOTED]}…"
 
 
 def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read where weights come from.
-
-    Parameters
-    ----------
-    path : path
-        File from `save_model`.
-
-    Returns
-    -------
-    dict
-        The notes given to `save_model`.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `load_model`.
-    """
+    """Load the notes given to `save_model`; raises as `load_model`."""
     with _open(path) as (_, metadata):
         try:
             notes: dict[str, Any] = _parse(metadata, "notes")
@@ -295,7 +243,7 @@ def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 @contextmanager
 def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
-    """A file and its metadata, if it is one of ours; nothing else has been read yet."""
+    """A file and its metadata, if format and version are ours."""
     where = f"weights {os.fspath(path)!r}"
     if not Path(path).is_file():
         raise FileNotFoundError(f"{where}: no such file")
@@ -304,7 +252,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise ValueError(f"{where}: expected format {FORMAT!r}, got {_short(repr(metadata.get('format')))}")
-            if metadata.get("version") != str(VERSION):
+            if metadata.get("version") not in ("3", str(VERSION)):
                 raise ValueError(f"{where}: expected version {VERSION}, got {_short(metadata.get('version'))}")
             yield file, metadata
     except SafetensorError as error:
@@ -312,26 +260,12 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
 
 
 def shipped_weights(preset: str) -> Path:
-    """Path of the weights that come with the package.
-
-    Parameters
-    ----------
-    preset : str
-        Name.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    ValueError
-        If there is no such preset; names those there are.
-    """
+    """Path of the weights of a preset that ships; ValueError, with the names of those that ship, for any other."""
     folder = Path(__file__).parent / "weights"
     path = folder / f"{preset}.safetensors"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
-        raise ValueError(f"preset is {preset!r}, expected one of: {known}")
-    return path
+    if path.is_file():
+        return path
+    if (path := folder.parent / "paper" / "weights" / f"{preset}.safetensors").is_file():
+        raise ValueError(f"preset is {preset!r}, which is no preset any more, expected its weights by name: {path}")
+    shipped = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
+    raise ValueError(f"preset is {preset!r}, expected one of: {shipped}")

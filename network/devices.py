@@ -1,53 +1,36 @@
-"""What torch computes on, by the names that OIDN has too."""
+"""Devices of torch by the names that OIDN uses, and whether they compute in bfloat16."""
 
 from __future__ import annotations
 
-import torch
+from typing import TYPE_CHECKING
 
-from network.training.config import DEVICES
+if TYPE_CHECKING:
+    import torch
+
+DEVICES = ("auto", "cpu", "cuda", "hip", "sycl", "metal")
 
 
 def find_device(name: str) -> tuple[str, torch.device]:
-    """Find a device of torch.
+    """Find a device, one of `DEVICES`, and its name.
 
-    Parameters
-    ----------
-    name : str
-        One of `network.training.config.DEVICES`; "auto": the first that is there of cuda, hip, sycl, cpu. Metal, which
-        nobody has run, is taken by its name alone.
-
-    Returns
-    -------
-    tuple of str and torch.device
-        Its name, and the device.
-
-    Raises
-    ------
-    ValueError
-        If it is not there; names those that are.
+    "auto" is the first available of cuda, hip, sycl and cpu; Metal, on which this is untested, has to be named. Raises
+    ValueError, with the available devices, if the device is not among them.
     """
-    there = {**_accelerators(), "cpu": torch.device("cpu")}
+    import torch  # here, so that `DEVICES` is available without torch
+
+    available = {**_accelerators(), "cpu": torch.device("cpu")}
     if name == "auto":
-        return next((kind, device) for kind, device in there.items() if kind != "metal")
-    if name not in there:
-        known = name in DEVICES
-        what = "one that torch can use here" if known else "one that there is"
-        raise ValueError(f"device is {name!r}, expected {what}: auto, {', '.join(there)}")
-    return name, there[name]
+        return next((kind, device) for kind, device in available.items() if kind != "metal")
+    if name not in available:
+        expected = "one that torch can use here" if name in DEVICES else "one that there is"
+        raise ValueError(f"device is {name!r}, expected {expected}: auto, {', '.join(available)}")
+    return name, available[name]
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether a device computes in bfloat16 faster than in float32.
+    """Whether a device computes in bfloat16 faster than in float32: CPUs with AVX-512 bf16 or AMX, and most GPUs."""
+    import torch
 
-    Parameters
-    ----------
-    device : torch.device
-        Of processors those with AVX-512 bf16 or AMX do.
-
-    Returns
-    -------
-    bool
-    """
     if device.type != "cpu":
         return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
@@ -55,9 +38,11 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def _accelerators() -> dict[str, torch.device]:
-    """Those that torch can use here."""
+    """Accelerators that torch can use here."""
+    import torch
+
     found = {}
-    if torch.cuda.is_available():  # torch calls AMD's so too
+    if torch.cuda.is_available():  # torch calls AMD's GPUs cuda too
         found["hip" if torch.version.hip else "cuda"] = torch.device("cuda")
     if torch.xpu.is_available():
         found["sycl"] = torch.device("xpu")

@@ -1,17 +1,16 @@
-"""The final stage: a U-Net that knows how to denoise, whose frames meet in Robust Average blocks before it does.
+"""The final stage: OIDN's U-Net over an aligned window, its frames fused by Robust Average blocks.
 
-The trunk is OIDN's (`network.unet`). Each frame of an aligned window enters as a noisy realisation of the centre; RA
-blocks, the first behind the first convolution at full resolution, let the samples of the frames meet; one decoder makes
-the picture of the centre.
+Each frame of the window enters as a noisy image of the centre; Robust Average (RA) blocks, the first behind the first
+convolution at full resolution, fuse the frames; one decoder makes the image of the centre.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import log
-from typing import cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -19,30 +18,35 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from network.bfloat16 import round_taps, round_unet
 from network.cpu.convolution import convolve
-from network.cpu.input_packing import RESIDUAL_LIMIT, can_lay_out, entering
-from network.paper.blocks import ChannelAverage
-from network.unet import (
-    DECODERS,
-    ENCODERS,
-    Convolutions,
-    Trunk,
-    TrunkConfig,
-    in_strips,
-    load_oidn,
-    pu_forward,
-    pu_inverse,
-    round_taps,
-    round_trunk,
-)
+from network.cpu.input_packing import can_pack, packer
+from network.oidn_weights import load_oidn
+from network.robust_average import ChannelAverage
+from network.strips import in_strips
+from network.transfer import pu_forward, pu_inverse
+from network.unet import DECODERS, ENCODERS, OidnUNet, OidnUNetConfig, Stage, check_size
+from network.windows import PackedInputs, UNetWindow
+from nlm.pooling import RESIDUAL_LIMIT
 
-#: Channels that a frame has beside those of OIDN's networks: the gathered average, confidence, samples gathered.
-KNOWN = 5
-#: Weight of the average in an RA block before any training.
+Module = TypeVar("Module", bound=nn.Module)
+
+#: Input channels of a frame beyond those of OIDN's networks: average of the first passes, confidence, pooled samples.
+AUX_CHANNELS = 5
+#: Initial weight of the robust average in an RA block.
 BLEND = 0.8
-#: Share of the average of estimates in the picture before any training, by the trunk's size: the better a trunk's
-#: picture, the less. Found on four shots at two noise levels (docs/experiments.md).
-KEEP = {"small": 0.5, "base": 0.4, "large": 0.25}
+#: Initial share of the average of first passes in the image, by the size of the backbone: less for better backbones.
+#: Found on four shots at two noise levels (docs/experiments.md).
+AVERAGE_BLEND = {"small": 0.5, "base": 0.4, "large": 0.25}
+#: Networks of OIDN that a model of each size starts from. The first two accept noisy guides; the third, the only large
+#: one, needs clean guides.
+OIDN_BACKBONES = {"small": "rt_hdr_alb_nrm_small", "base": "rt_hdr_alb_nrm", "large": "rt_hdr_calb_cnrm_large"}
+#: Pixels by which images are mirrored beyond their borders, which a backbone otherwise takes for darkness: 0.7 dB
+#: within 8 pixels of a border, and a flat image stays flat to 0.4 %, where its rim came out a third too dark. Crops in
+#: training are mirrored alike.
+MIRRORED = 16
+#: Pixels of mirroring beyond the borders: rows before and after, columns before and after.
+Borders = tuple[tuple[int, int], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class RobustUNetConfig:
     frames: int = 5  # T, odd; the window
     size: str = "base"  # of network.unet.ENCODERS
     ra_scales: tuple[int, ...] = (0,)  # 0: behind the first convolution; s: behind the convolutions of scale s
-    clean_guides: bool = False  # whether the trunk relies on its guides: where they have noise they are filtered first
+    clean_guides: bool = False  # whether the backbone relies on its guides: noisy guides are filtered first
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.frames % 2 == 0:
@@ -64,399 +68,356 @@ class RobustUNetConfig:
             raise ValueError(f"ra_scales: expected scales 0 to {len(scales) - 1}, got {self.ra_scales}")
 
 
-@dataclass(frozen=True)
-class Realisations:
-    """A window whose frames are noisy pictures of its centre, and what they give by hand.
+class PooledWindow(NamedTuple):
+    """A window whose frames are noisy images of its centre, and averages of it.
 
     Attributes
     ----------
     frames : Tensor
-        ``(N, T, 3, H, W)`` on OIDN's transfer curve, with noise of their own; their mean is `picture`.
-    picture : Tensor
-        ``(N, 3, H, W)``, the samples of all frames gathered (`nlm.pooling`), on the same curve.
+        ``(N, T, 3, H, W)`` on the transfer curve, each with its own noise; their mean is `pooled`.
+    pooled : Tensor
+        ``(N, 3, H, W)`` on the curve: the pooled samples of all frames.
     average : Tensor
-        ``(N, 3, H, W)``, the gated average of the estimates, on the same curve.
+        ``(N, 3, H, W)`` irradiance: average of the first passes by confidence.
+    encoded_average : Tensor
+        The same as radiance on the curve.
     confidence : Tensor
         ``(N, T, 1, H, W)``; 1 for the centre where no frame has any.
     samples : Tensor
-        ``(N, 1, H, W)`` in (0, 1]: frames' worth of samples gathered, over T.
+        ``(N, 1, H, W)`` in (0, 1]: frames' worth of pooled samples, over T.
     parts : Tensor
-        ``(N, T, 3, H, W)``: what each frame gives of the gathered irradiance, which is their sum.
-    estimate : Tensor
-        ``(N, 3, H, W)``: average of the estimates, irradiance.
-    scale : Tensor
-        ``(N, 3, H, W)``: what irradiance is multiplied by before the transfer curve.
+        ``(N, T, 3, H, W)`` irradiance: contribution of each frame to the pooled image.
     """
 
     frames: Tensor
-    picture: Tensor
+    pooled: Tensor
     average: Tensor
+    encoded_average: Tensor
     confidence: Tensor
     samples: Tensor
     parts: Tensor
-    estimate: Tensor
-    scale: Tensor
 
 
-def realise(
-    estimate: Tensor, residual: Tensor, confidence: Tensor, modulation: Tensor, exposure: Tensor, gain: Tensor
-) -> Realisations:
-    """Make of each frame of a window a noisy realisation of its centre.
-
-    Parameters
-    ----------
-    estimate, residual : Tensor
-        ``(N, T, 3, H, W)`` irradiance, as for `nlm.pooling.pool_samples`.
-    confidence : Tensor
-        ``(N, T, 1, H, W)``, at least 0.
-    modulation : Tensor
-        ``(N, 3, H, W)``; radiance is irradiance times modulation.
-    exposure : Tensor
-        ``(N,)``, positive, of the irradiance.
-    gain : Tensor
-        ``(N,)``, positive: OIDN's exposure of the whole picture (`network.unet.autoexposure`).
-
-    Returns
-    -------
-    Realisations
-        Float32.
+def pool_samples(window: UNetWindow) -> PooledWindow:
+    """Pool the samples of a window, and make a noisy image of the centre from each of its frames.
 
     Notes
     -----
-    With e the estimates, r' the residuals held to six times the light, c the confidence,
+    With e the first passes, r' the residuals limited to `nlm.pooling.RESIDUAL_LIMIT` times the light, c the confidence,
 
         G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,    x_s = P(G + c_s r'_s + (1 − c_s) r'_t),
 
-    P the transfer curve, t the centre: a frame that is not trusted shows the centre's noise. All x_s are then shifted
-    by P(b) − mean x_s. Noise on a concave curve has a mean that is too dark: without the shift, pictures of a few
-    samples lost up to 5 dB.
+    P the transfer curve, t the centre: a frame without confidence gets the noise of the centre. All x_s are then
+    shifted by P(b) − mean x_s: noise on a concave curve has a mean that is too dark, and without the shift, images of a
+    few samples lost up to 5 dB.
     """
+    first_pass, residual, confidence, modulation, exposure, gain, _, _ = window
     centre = confidence.shape[1] // 2
     total = confidence.sum(1, keepdim=True)
-    alone = torch.zeros_like(confidence)
-    alone[:, centre] = 1
-    confidence = torch.where(total > 0, confidence, alone)
+    centre_only = torch.zeros_like(confidence)
+    centre_only[:, centre] = 1
+    confidence = torch.where(total > 0, confidence, centre_only)
     share = confidence / confidence.sum(1, keepdim=True)
-    limit = RESIDUAL_LIMIT * (estimate.mean(2, keepdim=True).clamp_min(0) + exposure.view(-1, 1, 1, 1, 1))
-    held = residual * (limit / torch.maximum(residual.mean(2, keepdim=True).abs(), limit))
-    parts = share * (estimate + held)
-    average, gathered = (share * estimate).sum(1), parts.sum(1)
+    light = first_pass.mean(2, keepdim=True).clamp_min(0) + exposure.view(-1, 1, 1, 1, 1)
+    limit = float(RESIDUAL_LIMIT) * light
+    limited = residual * (limit / torch.maximum(residual.mean(2, keepdim=True).abs(), limit))
+    parts = share * (first_pass + limited)
+    average, pooled = (share * first_pass).sum(1), parts.sum(1)
     scale = modulation * gain.view(-1, 1, 1, 1)
-    own = held[:, centre, None]
-    frames = pu_forward(((average[:, None] + own + confidence * (held - own)) * scale[:, None]).clamp_min_(0))
-    picture = pu_forward((gathered * scale).clamp_min(0))
-    frames += (picture - frames.mean(1))[:, None]
+    centre_noise = limited[:, centre, None]
+    noisy = average[:, None] + centre_noise + confidence * (limited - centre_noise)
+    frames = pu_forward((noisy * scale[:, None]).clamp_min_(0))
+    encoded = pu_forward((pooled * scale).clamp_min(0))
+    frames += (encoded - frames.mean(1))[:, None]
     samples = share.square().sum(1).reciprocal() / share.shape[1]
-    average_seen = pu_forward((average * scale).clamp_min(0))
-    return Realisations(frames, picture, average_seen, confidence, samples, parts, average, scale)
+    encoded_average = pu_forward((average * scale).clamp_min(0))
+    return PooledWindow(frames, encoded, average, encoded_average, confidence, samples, parts)
+
+
+def pack_inputs(window: UNetWindow) -> PackedInputs:
+    """Inputs of the network from a window, in plain operations; `network.cpu.input_packing` is the fused form."""
+    pooled = pool_samples(window)
+    missing = torch.full_like(window.modulation, 0.5)
+    albedo = missing if window.albedo is None else window.albedo.clamp(0, 1)
+    normal = missing if window.normal is None else window.normal.clamp(-1, 1) * 0.5 + 0.5
+    frames = torch.cat([pooled.frames, pooled.confidence], 2).transpose(0, 1).flatten(0, 1)
+    shared = torch.cat([albedo, normal, pooled.encoded_average, pooled.samples], 1)
+    return PackedInputs(frames, shared, torch.cat([pooled.pooled, albedo, normal], 1), pooled.average)
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What a `RobustUNet` made of a window.
-
-    Attributes
-    ----------
-    irradiance : Tensor
-        ``(N, 3, H, W)``, at least 0.
-    window : mapping of str to Tensor
-        What it was made from, as `realise` takes it.
-    """
+class UNetOutput:
+    """Image that a `RobustUNet` made of a window: ``(N, 3, H, W)`` irradiance, at least 0."""
 
     irradiance: Tensor
-    window: Mapping[str, Tensor]
+    window: UNetWindow
 
     def parts(self) -> tuple[Tensor, Tensor]:
-        """What each frame gives of the gathered picture, ``(N, T, 3, H, W)``, and its share, ``(N, T, 1, H, W)``."""
-        found = realise(**self.window)
-        return found.parts, found.confidence / found.confidence.sum(1, keepdim=True)
+        """Contribution of each frame to the pooled image, ``(N, T, 3, H, W)``, and its share, ``(N, T, 1, H, W)``."""
+        pooled = pool_samples(self.window)
+        return pooled.parts, pooled.confidence / pooled.confidence.sum(1, keepdim=True)
 
 
 class RobustUNet(nn.Module):
-    """OIDN's U-Net over a window of frames, connected by RA blocks.
+    """OIDN's U-Net over a window of frames, fused by RA blocks.
 
     Parameters
     ----------
     config : RobustUNetConfig
-        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large"), and some thousands for what is new.
+        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large"), and some thousands beside the backbone.
 
     Notes
     -----
-    The frames share the encoder up to the last RA block; what follows it sees the centre alone. The first block stands
-    *before* the first ReLU: averages of what a convolution makes are what it makes of averages, so that before any
-    training the network does what it would with frames gathered by hand. The skip connection from the input to the
-    last scale of the decoder has the gathered picture.
+    The frames share the encoder up to the last RA block; all later layers see the centre alone. The first block stands
+    *before* the first ReLU: a convolution of an average is the average of convolutions, so that before any training
+    the network gives the same as on samples that were pooled beforehand. The skip connection from the input to the last
+    scale of the decoder has the pooled image.
 
-    Further input channels (`KNOWN`) enter the first convolution with weights of 0. Blocks start at a blend of `BLEND`,
-    learned for each channel, and the picture as a mixture of the network's and the average of estimates, whose errors
-    are different ones (`KEEP`), predicted pixel by pixel once it is trained.
+    Further input channels (`AUX_CHANNELS`) enter the first convolution with weights of 0. RA blocks start at `BLEND`,
+    learned for each channel. The image is blended with the average of first passes, whose errors are different
+    (`AVERAGE_BLEND`), by a share that training can make vary by pixel.
     """
 
     def __init__(self, config: RobustUNetConfig) -> None:
         super().__init__()
         self.config = config
         widths = [convolutions[-1] for convolutions in ENCODERS[config.size]]
-        self.trunk = Trunk(TrunkConfig(9, config.size))
-        self.known = nn.Conv2d(KNOWN, ENCODERS[config.size][0][0], 3, padding=1, bias=False)
-        self.average = nn.ModuleDict(
+        self.backbone = OidnUNet(OidnUNetConfig(9, config.size))
+        self.aux_conv = nn.Conv2d(AUX_CHANNELS, ENCODERS[config.size][0][0], 3, padding=1, bias=False)
+        self.robust_average = nn.ModuleDict(
             {str(scale): ChannelAverage(widths[scale], BLEND) for scale in sorted(config.ra_scales)}
         )
-        self.keep = nn.Conv2d(DECODERS[config.size][-1][-1], 1, 1)
-        nn.init.zeros_(self.known.weight)
-        nn.init.zeros_(self.keep.weight)
-        keep = KEEP[config.size]
-        nn.init.constant_(cast(Tensor, self.keep.bias), log(keep / (1 - keep)))
+        self.average_blend = nn.Conv2d(DECODERS[config.size][-1][-1], 1, 1)
+        nn.init.zeros_(self.aux_conv.weight)
+        nn.init.zeros_(self.average_blend.weight)
+        blend = AVERAGE_BLEND[config.size]
+        nn.init.constant_(cast(Tensor, self.average_blend.bias), log(blend / (1 - blend)))
 
     @property
     def multiple(self) -> int:
         """Height and width must be multiples of this."""
-        return self.trunk.multiple
+        return self.backbone.multiple
 
-    def forward(self, frames: Tensor, still: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Make the picture of the centre.
+    @property
+    def frames(self) -> int:
+        """Length of the windows, T."""
+        return self.config.frames
+
+    def forward(self, frames: Tensor, shared: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
+        """Make the image of the centre.
 
         Parameters
         ----------
-        frames : Tensor
-            ``(N, T, 3, H, W)`` from `realise`.
-        still : Tensor
-            ``(N, 9, H, W)``: the gathered picture, and albedo and normal of the centre in [0, 1].
-        known : Tensor
-            ``(N, T, 5, H, W)``: gathered average, confidence, samples; all but confidence are those of the window.
+        frames, shared, static : Tensor
+            Of `PackedInputs`.
 
         Returns
         -------
-        picture : Tensor
+        image : Tensor
             ``(N, 3, H, W)`` on the transfer curve.
-        keep : Tensor
-            ``(N, 1, H, W)`` in (0, 1): share of the average of estimates.
+        blend : Tensor
+            ``(N, 1, H, W)`` in (0, 1): share of the average of first passes.
 
         Raises
         ------
         ValueError
             If frames are not the model's, or height or width is no multiple of 16.
         """
-        self.expect(frames.shape[1])
-        for name, length in zip(("height", "width"), still.shape[2:], strict=True):
-            if length == 0 or length % self.multiple:
-                raise ValueError(f"frames: expected a {name} that is a multiple of {self.multiple}, got {length}")
-        return self.finish(self.meet(*self.lay_out(frames, still, known)), still)
+        self.expect_frames(len(frames) // len(shared))
+        check_size("frames", static, self.multiple)
+        return self.decode(self.encode_and_fuse(frames, shared), static)
 
-    def expect(self, frames: int) -> None:
+    def expect_frames(self, frames: int) -> None:
         """Raise ValueError unless a window of so many frames is the model's."""
-        if frames != self.config.frames:
-            raise ValueError(f"frames: expected {self.config.frames}, got {frames}")
+        if frames != self.frames:
+            raise ValueError(f"frames: expected {self.frames}, got {frames}")
 
-    def lay_out(self, frames: Tensor, still: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Lay what is known of each frame side by side, and what all have alike; as for `forward`.
+    @property
+    def _last_fused(self) -> int:
+        """Coarsest scale with an RA block, behind which only the centre is left; −1 without any."""
+        return max(self.config.ra_scales, default=-1)
 
-        Returns
-        -------
-        own : Tensor
-            ``(T·N, 4, H, W)``, time first: picture, confidence.
-        alike : Tensor
-            ``(N, 10, H, W)``: albedo, normal, gathered average, samples.
-        """
-        own = torch.cat([frames, known[:, :, 3:4]], 2).transpose(0, 1).flatten(0, 1)
-        return own, torch.cat([still[:, 3:], known[:, 0, :3], known[:, 0, 4:]], 1)
-
-    def meet(self, own: Tensor, alike: Tensor) -> Tensor:
-        """Run the finest scale of the encoder, in whose midst the frames meet. A row depends on two on each side.
+    def encode_and_fuse(self, frames: Tensor, shared: Tensor) -> Tensor:
+        """Run the finest scale of the encoder and its RA block; a row depends on two rows on each side.
 
         Parameters
         ----------
-        own, alike : Tensor
-            From `lay_out`, or `network.cpu.input_packing.entering`, of any even height.
+        frames, shared : Tensor
+            Of `PackedInputs`, of any even height.
 
         Returns
         -------
         Tensor
-            What enters the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all
-            frames have met.
+            Input of the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all frames
+            are fused.
         """
-        count, last = self.config.frames, max(self.config.ra_scales, default=-1)
-        first, known, layout = self.trunk.first, self.known.weight, torch.channels_last
-        own = own if last >= 0 else own.chunk(count)[count // 2]
-        own, alike = (part.to(first.weight.dtype, memory_format=layout) for part in (own, alike))
-        of_own = torch.cat([first.weight[:, :3], known[:, 3:4]], 1).contiguous(memory_format=layout)
-        of_alike = torch.cat([first.weight[:, 3:], known[:, :3], known[:, 4:]], 1).contiguous(memory_format=layout)
-        # Convolved once for all frames: of 14 channels that a frame has, ten are those of all.
-        once = functional.conv2d(alike, of_alike, first.bias, padding=1).permute(0, 2, 3, 1)
-        added = once.repeat(len(own) // len(alike), 1, 1, 1).permute(0, 3, 1, 2)
-        x = convolve(own, of_own, None, added, relu=False)
-        if "0" in self.average:
-            x = self.average["0"](x, count, last == 0)
-        return functional.max_pool2d(cast(Convolutions, self.trunk.encoder[0]).after_first(x), 2)
+        count, last = self.frames, self._last_fused
+        first, aux, layout = self.backbone.first, self.aux_conv.weight, torch.channels_last
+        frames = frames if last >= 0 else frames.chunk(count)[count // 2]
+        frames, shared = (part.to(first.weight.dtype, memory_format=layout) for part in (frames, shared))
+        frame_weight = torch.cat([first.weight[:, :3], aux[:, 3:4]], 1).contiguous(memory_format=layout)
+        shared_weight = torch.cat([first.weight[:, 3:], aux[:, :3], aux[:, 4:]], 1).contiguous(memory_format=layout)
+        # Ten of a frame's 14 channels are the same in all frames: they are convolved once.
+        once = functional.conv2d(shared, shared_weight, first.bias, padding=1).permute(0, 2, 3, 1)
+        repeated = once.repeat(len(frames) // len(shared), 1, 1, 1).permute(0, 3, 1, 2)
+        x = convolve(frames, frame_weight, None, repeated, relu=False)
+        if "0" in self.robust_average:
+            x = self.robust_average["0"](x, count, last == 0)
+        return functional.max_pool2d(cast(Stage, self.backbone.encoder[0]).after_first(x), 2)
 
-    def finish(self, x: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
-        """Run all that follows `meet`, as for `forward`.
+    def decode(self, x: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
+        """Run all layers behind `encode_and_fuse`.
 
         Parameters
         ----------
         x : Tensor
-            From `meet`.
-        still : Tensor
-            As for `forward`.
+            From `encode_and_fuse`.
+        static : Tensor
+            Of `PackedInputs`.
 
         Returns
         -------
-        picture, keep : Tensor
+        image, blend : Tensor
             As of `forward`.
         """
-        trunk, count, last = self.trunk, self.config.frames, max(self.config.ra_scales, default=-1)
-        skips, coarsest = [still], len(trunk.encoder) - 1
+        count, coarsest = self.frames, len(self.backbone.encoder) - 1
+        skips = [static]
         for scale in range(1, coarsest + 1):
             if scale < coarsest:
-                # What enters a scale is handed on to the decoder: the centre's, which has the others' in it.
-                skips.append(x.chunk(count)[count // 2] if scale <= last else x)
-            (x,) = in_strips(partial(self._encode, scale), 2, x)
+                # The decoder gets the centre's features, into which the other frames' are fused.
+                skips.append(x.chunk(count)[count // 2] if scale <= self._last_fused else x)
+            (x,) = in_strips(partial(self._encode_scale, scale), 2, x)
+        image, blend = self.backbone.decode(x, skips, self._head)
+        return image, blend
 
-        def finish(features: Tensor) -> tuple[Tensor, Tensor]:
-            keep = torch.sigmoid(self.keep(features.to(self.keep.weight.dtype)).float())
-            return trunk.finish(features), keep
+    def _head(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Image and share of the average from features of the finest scale."""
+        weight, bias = self.average_blend.weight, cast(Tensor, self.average_blend.bias)
+        if torch.is_grad_enabled() or bool(weight.any()):
+            logits = self.average_blend(features.to(weight.dtype)).float()
+        else:  # as in the shipped weights
+            logits = bias.float().view(1, 1, 1, 1).expand(len(features), 1, *features.shape[2:]).contiguous()
+        return self.backbone.project(features), torch.sigmoid(logits)
 
-        picture, keep = trunk.decode(x, skips, finish)
-        return picture, keep
-
-    def _encode(self, scale: int, x: Tensor) -> list[Tensor]:
-        """Run a scale of the encoder but the finest, and halve what comes out, but of the coarsest."""
-        last = max(self.config.ra_scales, default=-1)
-        x = self.trunk.encoder[scale](x)
-        if str(scale) in self.average:
-            x = self.average[str(scale)](x, self.config.frames, last == scale)
-        return [x if scale == len(self.trunk.encoder) - 1 else functional.max_pool2d(x, 2)]
-
-
-#: Pixels that a picture is mirrored by beyond its borders, to a trunk else darkness: 0.7 dB within 8 pixels of one, and
-#: a flat picture stays flat to 0.4 %, where its rim came out a third too dark. Crops in training are mirrored alike.
-MIRRORED = 16
-#: By how many pixels a picture is mirrored beyond its borders: rows before and after, columns before and after.
-Borders = tuple[tuple[int, int], tuple[int, int]]
+    def _encode_scale(self, scale: int, x: Tensor) -> list[Tensor]:
+        """Run a scale of the encoder, and halve its output except at the coarsest scale."""
+        x = self.backbone.encoder[scale](x)
+        if str(scale) in self.robust_average:
+            x = self.robust_average[str(scale)](x, self.frames, self._last_fused == scale)
+        return [x if scale == len(self.backbone.encoder) - 1 else functional.max_pool2d(x, 2)]
 
 
 def denoise_window(
     model: RobustUNet,
-    window: Mapping[str, Tensor],
-    albedo: Tensor | None,
-    normal: Tensor | None,
+    window: UNetWindow,
     run: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
     *,
     borders: Borders = ((0, 0), (0, 0)),
-) -> Picture:
+) -> UNetOutput:
     """Run a model on an aligned window.
 
     Parameters
     ----------
     model : RobustUNet
         The model.
-    window : mapping of str to Tensor
-        As `realise` takes it.
-    albedo, normal : Tensor, optional
-        ``(N, 3, H, W)``: the centre's guides, albedo in [0, 1], normals in [−1, 1]; without, the same everywhere.
+    window : UNetWindow
+        Of the model's number of frames.
     run : callable, optional
-        Stands for the model where it is wrapped.
+        Called with gradients instead of the model, where it is wrapped (distributed, compiled).
     borders : pairs of int
-        By how many pixels the window is mirrored beyond its borders before the model sees it.
+        Pixels by which the window is mirrored beyond its borders.
 
     Returns
     -------
-    Picture
-        Float32, of the size of the window.
+    UNetOutput
+        Of the size of the window.
 
     Raises
     ------
     ValueError
-        If the window has not the model's frames.
+        If the window has another number of frames.
 
     Notes
     -----
-    Without gradients all that is done at full size is done some rows at a time (`network.unet.in_strips`): no more of
-    all frames' features is ever there, and what is there fits the caches of a processor. On a processor what enters is
-    laid out in one pass (`network.cpu.input_packing`).
+    Without gradients all work at full size runs in strips (`network.strips`), so that the features of all frames are
+    never in memory at once; on a CPU the inputs are packed in one pass (`network.cpu.input_packing`).
     """
-    model.expect(window["confidence"].shape[1])
-    height, width = window["modulation"].shape[-2:]
+    model.expect_frames(window.confidence.shape[1])
+    height, width = window.modulation.shape[-2:]
     sizes = zip((height, width), borders, strict=True)
     rows, columns = (np.pad(np.arange(size), border, mode="reflect") for size, border in sizes)
 
-    def realised(rows: NDArray[np.int64]) -> tuple[Realisations, Tensor]:
-        """Of these rows the frames, and what stands still beside them, in plain operations."""
-        missing = torch.full_like(window["modulation"], 0.5)
-        guides = torch.cat(
-            [
-                missing if albedo is None else albedo.clamp(0, 1),
-                missing if normal is None else normal.clamp(-1, 1) * 0.5 + 0.5,
-            ],
-            1,
-        )
-        layers = [window[name] for name in ("estimate", "residual", "confidence", "modulation")]
-        places = [torch.from_numpy(index).to(guides.device) for index in (rows, columns)]
-        *given, guides = (layer.index_select(-2, places[0]).index_select(-1, places[1]) for layer in (*layers, guides))
-        found = realise(*given, window["exposure"], window["gain"])  # type: ignore[call-arg]
-        return found, torch.cat([found.picture, guides], 1)
-
-    def lay_out(rows: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        found, still = realised(rows)
-        return *model.lay_out(found.frames, still, _known(found)), still, found.estimate
+    def pack_rows(rows: NDArray[np.int64]) -> PackedInputs:
+        return pack_inputs(_select(window, rows, columns))
 
     if torch.is_grad_enabled():
-        found, still = realised(rows)
-        seen, keep = (model if run is None else run)(found.frames, still, _known(found))
-        average = found.estimate
+        *inputs, average = pack_rows(rows)
+        encoded, blend = (model if run is None else run)(*inputs)
     else:
-        quick = can_lay_out(*window.values(), *(guide for guide in (albedo, normal) if guide is not None))
-        lay_out_rows = entering(window, albedo, normal, columns) if quick else lay_out
+        pack = packer(window, columns) if can_pack(window) else pack_rows
 
-        def enter(rows: Tensor) -> list[Tensor]:
-            own, alike, still, average = lay_out_rows(rows[:, 0].numpy())
-            return [model.meet(own, alike), still, average]
+        def encode(rows: Tensor) -> list[Tensor]:
+            frames, shared, static, average = pack(rows[:, 0].numpy())
+            return [model.encode_and_fuse(frames, shared), static, average]
 
-        features, still, average = in_strips(enter, 2, torch.from_numpy(rows)[:, None], of_frames=True)
-        seen, keep = model.finish(features, still)
-        del features, still
+        features, static, average = in_strips(encode, 2, torch.from_numpy(rows)[:, None], all_frames=True)
+        encoded, blend = model.decode(features, static)
+        del features, static
     (top, _), (left, _) = borders
-    seen, keep, average = (layer[..., top : top + height, left : left + width] for layer in (seen, keep, average))
+    encoded, blend, average = (x[..., top : top + height, left : left + width] for x in (encoded, blend, average))
 
-    def mix(seen: Tensor, keep: Tensor, average: Tensor, modulation: Tensor) -> list[Tensor]:
-        # Light on both sides of the mixture: on the curve a mean of two pictures would be darker than they are.
-        light = pu_inverse(seen.float().clamp_min(0)) / (modulation * window["gain"].view(-1, 1, 1, 1))
-        return [light + keep * (average.clamp_min(0) - light)]
+    def mix(encoded: Tensor, blend: Tensor, average: Tensor, modulation: Tensor) -> list[Tensor]:
+        # Irradiance is blended: on the curve a mean of two images would be darker than they are.
+        light = pu_inverse(encoded.float().clamp_min(0)) / (modulation * window.gain.view(-1, 1, 1, 1))
+        return [light + blend * (average.clamp_min(0) - light)]
 
-    (irradiance,) = in_strips(mix, 0, seen, keep, average, window["modulation"])
-    return Picture(irradiance, window)
-
-
-def _known(found: Realisations) -> Tensor:
-    """What the network is told of each frame beside its picture and guides, ``(N, T, 5, H, W)``."""
-    frames = found.frames.shape[1]
-    average, samples = (layer[:, None].expand(-1, frames, -1, -1, -1) for layer in (found.average, found.samples))
-    return torch.cat([average, found.confidence, samples], 2)
+    (irradiance,) = in_strips(mix, 0, encoded, blend, average, window.modulation)
+    return UNetOutput(irradiance, window)
 
 
-#: OIDN's networks that a model of each size starts from. The first two bear guides with noise; the third, whose guides
-#: must have none, is the only large one that there is.
-OIDN_TRUNKS = {"small": "rt_hdr_alb_nrm_small", "base": "rt_hdr_alb_nrm", "large": "rt_hdr_calb_cnrm_large"}
+def _select(window: UNetWindow, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> UNetWindow:
+    """Rows and columns of a window, by number."""
+    device = window.modulation.device
+    places = [torch.from_numpy(index).to(device) for index in (rows, columns)]
+    layers = {
+        name: layer.index_select(-2, places[0]).index_select(-1, places[1])
+        for name, layer in window._asdict().items()
+        if layer is not None and layer.ndim > 1
+    }
+    return window._replace(**layers)
 
 
 def start_from_oidn(model: RobustUNet) -> RobustUNet:
-    """Give a model the weights of OIDN's network of its size (`network.unet.load_oidn`, which says what it raises).
+    """Load the weights of OIDN's network of its size into a model (`network.oidn_weights.load_oidn`); returns it."""
+    model.backbone.load_state_dict(load_oidn(OIDN_BACKBONES[model.config.size]).state_dict())
+    return model
+
+
+def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
+    """Prepare a model for running: channels last, no gradients.
 
     Parameters
     ----------
     model : RobustUNet
-        Is changed.
+        Changed in place.
+    bfloat16 : bool
+        Round weights (`network.bfloat16.round_unet`); pays only on processors that compute in bfloat16.
 
     Returns
     -------
     RobustUNet
         The same.
     """
-    model.trunk.load_state_dict(load_oidn(OIDN_TRUNKS[model.config.size]).state_dict())
-    return model
+    model.eval().requires_grad_(False)
+    if bfloat16:
+        model.backbone = round_unet(model.backbone)
+        model.aux_conv.weight.data = round_taps(model.aux_conv.weight)
+    return channels_last(model)
 
 
-def round_robust(model: RobustUNet) -> RobustUNet:
-    """Lay a model out for processors that have bfloat16 (`network.unet.round_trunk`); the model is changed."""
-    model.trunk = round_trunk(model.trunk)
-    model.known.weight.data = round_taps(model.known.weight)
+def channels_last(model: Module) -> Module:
+    """Convert the weights of all convolutions to the memory format of their activations, channels last; in place."""
+    for parameter in model.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.to(memory_format=torch.channels_last)
     return model

@@ -17,7 +17,7 @@ Floats = NDArray[np.float32]
 # What a pixel shows beyond its estimate counts up to so many times its light and the exposure. Noise of a few samples
 # seldom goes so far; a firefly goes hundreds of times as far, and no denoiser forgives it: at 15 to 30 samples a
 # picture made without this limit lost up to 10 dB. Limits of 4 to 8 differ by less than 0.1 dB.
-_LIMIT = np.float32(6)
+RESIDUAL_LIMIT = np.float32(6)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _gather(
                     excess += residuals[t, y, x, c]
                 if not np.isfinite(level + excess):
                     continue
-                limit = _LIMIT * (max(level, np.float32(0)) + C * exposure)
+                limit = RESIDUAL_LIMIT * (max(level, np.float32(0)) + C * exposure)
                 share = min(limit / max(abs(excess), limit), np.float32(1))
                 total += weight
                 squares += np.float64(weight) ** 2

@@ -116,7 +116,7 @@ def denoise(
         | None,
         typer.Option(
             metavar="NAME",
-            help="network: fast (default), balanced, quality, tkpcn, or auto, with --budget; classical: draft, "
+            help="network: fast (default), balanced, quality, or auto, with --budget; classical: draft, "
             "standard (default), final; pooled",
             rich_help_panel=WHAT,
         ),
@@ -139,7 +139,7 @@ def denoise(
             min=0,
             max=0.99,
             metavar="SHARE",
-            help="kernel threshold (tkpcn alone); higher drops more taps (default: as trained)",
+            help="threshold of weights that predict kernels; higher drops more taps (default: as trained)",
             rich_help_panel=WHAT,
         ),
     ] = None,
@@ -181,7 +181,7 @@ def denoise(
         typer.Option(
             min=16,
             metavar="N",
-            help="side in pixels of the tiles of the network (default: 2048, tkpcn 640, with --max-memory 384)",
+            help="side in pixels of the tiles of the network (default: 2048, of kernels 640, with --max-memory 384)",
             rich_help_panel=RESOURCES,
         ),
     ] = None,

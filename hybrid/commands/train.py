@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import glob
+import inspect
 import re
+from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -24,7 +27,6 @@ from hybrid.commands.options import (
     ProfileOption,
     StrictOption,
     check_first_pass,
-    choose,
     usage,
 )
 from hybrid.commands.shots import import_neural, judge_alike, parse_input, parse_layers, say_cuts
@@ -35,7 +37,19 @@ if TYPE_CHECKING:
     from hybrid.files.shots import Shot
 
 TRAINING = "Training"
-DEFAULTS = TrainConfig(steps=1)  # one limit there must be
+
+
+class Levels(NamedTuple):
+    """Noise levels of a shot."""
+
+    name: str  # of the shot
+    shots: dict[str, Shot]
+    samples: list[float]  # per pixel
+
+    @property
+    def first(self) -> Shot:
+        """The first level."""
+        return next(iter(self.shots.values()))
 
 
 def open_levels(
@@ -46,36 +60,13 @@ def open_levels(
     layers: dict[str, str] | None = None,
     profile: Profile | None = None,
     motion: str | None = None,
-) -> tuple[str, dict[str, Shot], list[float]]:
+) -> Levels:
     """Find the noise levels of a shot.
 
-    Parameters
-    ----------
-    spec : str
-        A folder of one shot, with ``LEVEL.####.exr`` for each independent render of it (``reference`` and what begins
-        so is left out), or one sequence.
-    samples : dict of str to float, optional
-        Levels to take, and their samples per pixel. Without: all there are, and what Cycles wrote in their headers.
-    frames : str, optional
-        As for `hybrid.files.shots.open_shot`.
-    layers, profile, motion : optional
-        The same.
-
-    Returns
-    -------
-    str
-        Name of the shot: of its folder.
-    dict of str to Shot
-        The levels by name.
-    list of float
-        Their samples per pixel.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such folder or sequence, or a level is not in it.
-    ValueError
-        If there are several levels and no samples of one of them.
+    `spec` is a folder of one shot, with ``LEVEL.####.exr`` for each independent render of it (names that begin with
+    ``reference`` are left out), or one sequence; `samples` are the levels to open and their samples per pixel, by
+    default all levels, as the headers of Cycles have them. Raises FileNotFoundError if there is no such folder,
+    sequence or level, and ValueError if there are several levels and no samples of one of them.
     """
     from hybrid.comparison.samples import samples_of
     from hybrid.files.shots import open_shot
@@ -101,7 +92,7 @@ def open_levels(
         if count is None and len(levels) > 1:
             raise ValueError(f"levels: no samples in the header of {name}; expected --levels {name}=SAMPLES,…")
         counts.append(float(count or 1))
-    return path.resolve().name, levels, counts
+    return Levels(path.resolve().name, levels, counts)
 
 
 def make_clips(
@@ -117,7 +108,8 @@ def make_clips(
     levels: Annotated[
         str | None,
         typer.Option(
-            help="a=24,b=24,c=8: levels and their samples; else all, as Cycles' headers say", rich_help_panel=INPUT
+            help="a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     tile: Annotated[
@@ -126,9 +118,7 @@ def make_clips(
     ] = 128,
     tiles: Annotated[
         int,
-        typer.Option(
-            min=1, help="clips of each frame, placed where noise, detail and motion are", rich_help_panel=WHAT
-        ),
+        typer.Option(min=1, help="clips of each frame, placed by noise, detail and motion", rich_help_panel=WHAT),
     ] = 4,
     window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT)] = 5,
     first_pass: Annotated[
@@ -144,7 +134,7 @@ def make_clips(
         bool,
         typer.Option(
             "--reference",
-            help="only the frames that SHOT/reference.####.exr has, trained towards it",
+            help="target SHOT/reference.####.exr, and only frames that it has",
             rich_help_panel=INPUT,
         ),
     ] = False,
@@ -152,11 +142,11 @@ def make_clips(
         str | None,
         typer.Option(
             metavar="LEVEL",
-            help="the level whose pseudo-references the others are trained towards; itself it is none",
+            help="level whose pseudo-references are the targets of the others; itself it is no input",
             rich_help_panel=INPUT,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="of the places", rich_help_panel=WHAT)] = 0,
+    seed: Annotated[int, typer.Option(help="seed of the places", rich_help_panel=WHAT)] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -169,7 +159,7 @@ def make_clips(
     Clips are aligned windows with first passes and pseudo-references.
 
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
-    Shots that have clips already are left alone, so that the same command goes on where it was.
+    Shots that have clips already are skipped, so that the same command continues an interrupted run.
     """
     from hybrid.files.shots import open_shot
     from hybrid.plan import Context
@@ -180,70 +170,66 @@ def make_clips(
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
     if reference and target is not None:
         raise typer.BadParameter("--target: expected none with --reference, which is the target")
-    import_neural()
-    from hybrid.neural import write_clips
-
+    neural = import_neural()
     with usage():
         samples = None if levels is None else parse_samples(levels)
     roles, chosen = parse_layers(layer), parse_input(profile, motion)
-    found = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
-    names = [name for name, _, _ in found]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
-    for name, there, _ in found:
-        if target is not None and (target not in there or len(there) == 1):
-            levels_there = ", ".join(there)
-            raise ValueError(
-                f"target: expected a level of {name} that is not the only one, {levels_there}, got {target!r}"
-            )
+    opened = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
+    _check_levels(opened, target)
     if scheduler is not None:
-        frames_of = {name: len(next(iter(shot.values()))) for name, shot, _ in found}
-        words = dict(zip(names, shots, strict=True))
         chunks = {
-            name: Chunk(arguments_of(context, {"shots": [words[name]]}), count) for name, count in frames_of.items()
+            each.name: Chunk(arguments_of(context, {"shots": [spec]}), len(each.first))
+            for each, spec in zip(opened, shots, strict=True)
         }
         run_on_cluster(scheduler, "make-clips", chunks)
         return
     output.mkdir(parents=True, exist_ok=True)
     reuse_freed_memory()
-    bar = Progress("make-clips", sum(len(next(iter(shot.values()))) for _, shot, _ in found))
-    for name, shot, counts in found:
-        first = next(iter(shot.values()))
-        if any(output.glob(f"{glob.escape(name)}.[0-9][0-9][0-9][0-9].safetensors")):
-            bar.advance(len(first), f"{name} has clips already")
+    bar = Progress("make-clips", sum(len(each.first) for each in opened))
+    for each in opened:
+        if any(output.glob(f"{glob.escape(each.name)}.[0-9][0-9][0-9][0-9].safetensors")):
+            bar.advance(len(each.first), f"{each.name} has clips already")
             continue
-        levels_of, _ = judge_alike(shot, strict=strict)
-        towards = None if target is None else levels_of.pop(target)
-        inputs = [count for level, count in zip(shot, counts, strict=True) if level != target]
-        plan = plan_shot(next(iter(levels_of.values())), context=Context(True, window // 2))
-        say_cuts(plan, (), strict=strict, name=name if len(found) > 1 else "")
-        write_clips(
-            levels_of,
+        inputs, _ = judge_alike(each.shots, strict=strict)
+        render = None if target is None else inputs.pop(target)
+        plan = plan_shot(next(iter(inputs.values())), context=Context(True, window // 2))
+        say_cuts(plan, (), strict=strict, name=each.name if len(opened) > 1 else "")
+        clean = each.first.path(each.first.numbers[0]).with_name("reference.####.exr")
+        source = neural.ClipSource(
+            each.name,
             inputs,
+            [count for level, count in zip(each.shots, each.samples, strict=True) if level != target],
+            reference=open_shot(clean, keep=1) if reference else None,
+            target=render,
+        )
+        neural.write_clips(
+            source,
             output,
-            name,
             radius=window // 2,
             tile=tile,
             tiles=tiles,
             estimate=first_pass,
-            reference=open_shot(first.path(first.numbers[0]).with_name("reference.####.exr"), keep=1)
-            if reference
-            else None,
-            target=towards,
             seed=seed,
-            advance=partial(bar.advance, message=name),
+            advance=partial(bar.advance, message=each.name),
         )
-    LOG.info(f"clips of {len(found)} shots are in {output}")
+    LOG.info(f"clips of {len(opened)} shots are in {output}")
+
+
+def _check_levels(opened: list[Levels], target: str | None) -> None:
+    """Raise ValueError for shots of one name, or without the target."""
+    names = [each.name for each in opened]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"shots: expected folders of different names, got {twice[0]!r} twice")
+    for each in opened:
+        if target is not None and (target not in each.shots or len(each.shots) == 1):
+            levels = ", ".join(each.shots)
+            raise ValueError(
+                f"target: expected a level of {each.name} that is not the only one, {levels}, got {target!r}"
+            )
 
 
 def parse_samples(text: str) -> dict[str, float]:
-    """Read ``a=24,b=24,c=8``: levels, and their samples per pixel.
-
-    Raises
-    ------
-    ValueError
-        If it is not of that form.
-    """
+    """Read ``a=24,b=24,c=8``: levels, and their samples per pixel; ValueError if it is not of that form."""
     samples = {}
     for item in text.split(","):
         name, _, count = item.partition("=")
@@ -253,6 +239,25 @@ def parse_samples(text: str) -> dict[str, float]:
     return samples
 
 
+def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each setting of `TrainConfig`; it gets their values as keyword arguments."""
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    for config in (TrainConfig, SamplerConfig):
+        hints = get_type_hints(config, include_extras=True)
+        for item in fields(config):
+            setting, *_ = getattr(hints[item.name], "__metadata__", (None,))
+            if setting is not None:
+                names = setting.names or (f"--{item.name.replace('_', '-')}",)
+                option = typer.Option(*names, help=setting.help, rich_help_panel=TRAINING)
+                annotation = Annotated[hints[item.name].__origin__, option]  # type: ignore[valid-type]
+                kind = inspect.Parameter.KEYWORD_ONLY
+                parameters.append(inspect.Parameter(item.name, kind, default=item.default, annotation=annotation))
+    command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return command
+
+
+@_with_settings
 def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
     output: Annotated[
@@ -264,137 +269,48 @@ def train(
     init: Annotated[
         str | None,
         typer.Option(
-            help="start from these weights: a file, a preset that ships, or oidn: OIDN's own, with a new final stage",
+            help="initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone",
             rich_help_panel=INPUT,
         ),
     ] = None,
     window: Annotated[
         int | None,
-        typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT),  # the middle ones of the clips'
+        typer.Option(help="frames of a window: 1, 3, 5 or 7, the middle ones of the clips'", rich_help_panel=WHAT),
     ] = None,
     validation: Annotated[
         list[str] | None,
         typer.Option(help="shots kept out of training; again or with commas for more", rich_help_panel=INPUT),
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="stop after so many steps", rich_help_panel=TRAINING)] = None,
-    minutes: Annotated[float | None, typer.Option(help="stop after so many minutes", rich_help_panel=TRAINING)] = None,
-    batch: Annotated[
-        int, typer.Option(help="samples of a step, of all processes together", rich_help_panel=TRAINING)
-    ] = DEFAULTS.batch,
-    rate: Annotated[float, typer.Option(help="peak learning rate", rich_help_panel=TRAINING)] = DEFAULTS.rate,
-    trunk_rate: Annotated[
-        float,
-        typer.Option(help="share of it for a trunk that knows how to denoise; 0: left alone", rich_help_panel=TRAINING),
-    ] = DEFAULTS.trunk_rate,
-    warmup: Annotated[
-        int, typer.Option(help="steps in which the rate rises", rich_help_panel=TRAINING)
-    ] = DEFAULTS.warmup,
-    clip_norm: Annotated[
-        float, typer.Option("--clip", help="largest norm of a gradient", rich_help_panel=TRAINING)
-    ] = DEFAULTS.clip_norm,
-    ema: Annotated[
-        float, typer.Option(help="how slowly the weights that are kept follow", rich_help_panel=TRAINING)
-    ] = DEFAULTS.ema,
-    loss: Annotated[
-        str,
-        typer.Option(
-            help="relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)", rich_help_panel=TRAINING
-        ),
-    ] = DEFAULTS.loss,
-    vgg: Annotated[
-        str | None,
-        typer.Option(help="torchvision's VGG19 weights: a file, or hub to fetch them", rich_help_panel=TRAINING),
-    ] = None,
-    terms: Annotated[
-        str, typer.Option(help="temporal, power (every subset of the window), or spatial", rich_help_panel=TRAINING)
-    ] = DEFAULTS.terms,
-    whole: Annotated[
-        float, typer.Option(help="weight of the whole window's term beside the temporal ones", rich_help_panel=TRAINING)
-    ] = DEFAULTS.whole,
-    differences: Annotated[
-        float,
-        typer.Option(
-            help="weight of the error of what changes from frame to frame; wants clips of whole frames",
-            rich_help_panel=TRAINING,
-        ),
-    ] = DEFAULTS.differences,
-    pseudo: Annotated[
-        float,
-        typer.Option(help="chance of a pseudo-reference as target, beside renders", rich_help_panel=TRAINING),
-    ] = DEFAULTS.sampler.pseudo,
-    slope: Annotated[
-        float, typer.Option(help="more than 1: asymmetric, rather noise than lost detail", rich_help_panel=TRAINING)
-    ] = DEFAULTS.slope,
-    drop_frames: Annotated[
-        float, typer.Option(help="chance that frames of a sample are taken away", rich_help_panel=TRAINING)
-    ] = DEFAULTS.sampler.drop_frames,
-    crop: Annotated[
-        int, typer.Option(help="pixels on a side of a sample", rich_help_panel=TRAINING)
-    ] = DEFAULTS.sampler.crop,
-    sets: Annotated[
-        int, typer.Option(help="disjoint sets of clips, one an epoch", rich_help_panel=TRAINING)
-    ] = DEFAULTS.sampler.sets,
-    seed: Annotated[int, typer.Option(help="of initial weights and samples", rich_help_panel=TRAINING)] = DEFAULTS.seed,
     device: DeviceOption = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="of torch and numba", rich_help_panel=RESOURCES)] = None,
-    workers: Annotated[
-        int, typer.Option(min=0, help="processes that read clips", rich_help_panel=RESOURCES)
-    ] = DEFAULTS.workers,
-    float32: Annotated[bool, typer.Option("--float32", help="no bfloat16", rich_help_panel=RESOURCES)] = False,
-    compile: Annotated[
-        bool, typer.Option("--compile", help="compile the network; pays on a GPU", rich_help_panel=RESOURCES)
-    ] = False,
-    validate_minutes: Annotated[
-        float, typer.Option(help="between validations, and between checkpoints", rich_help_panel=TRAINING)
-    ] = DEFAULTS.validate_minutes,
     tensorboard: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="write TensorBoard's logs there", rich_help_panel=OUTPUT)
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="go on from W.safetensors.state, with the same options", rich_help_panel=OUTPUT),
+        typer.Option("--resume", help="continue from W.safetensors.state, same options", rich_help_panel=OUTPUT),
     ] = False,
+    **settings: Any,
 ) -> None:
     """Train a network on clips.
 
     ``torchrun -m hybrid.cli train …`` trains in several processes.
 
-    Fine-tune on your own footage, without any reference: ravg prepare it, then --init fast --rate 1e-4.
+    Fine-tune on your own footage, without any reference: ravg make-clips of it, then --init fast --rate 1e-4.
     """
-    import_neural()
+    neural = import_neural()
     from hybrid.files.replace import check_outputs
-    from hybrid.neural import train_network
-    from network.models import PRESETS
 
-    if init in (None, "oidn"):
-        choose(PRESETS, preset, "preset")
+    if init in (None, "oidn") and preset not in neural.TRAINING_PRESETS:
+        known = ", ".join(neural.TRAINING_PRESETS)
+        raise typer.BadParameter(f"--preset is {preset!r}, expected one of {known}")
     with usage():
-        config = TrainConfig(
-            steps=steps,
-            minutes=minutes,
-            batch=batch,
-            rate=rate,
-            trunk_rate=trunk_rate,
-            warmup=warmup,
-            clip_norm=clip_norm,
-            ema=ema,
-            loss=loss,
-            vgg=vgg,
-            terms=terms,
-            whole=whole,
-            differences=differences,
-            slope=slope,
-            bfloat16=not float32,
-            compile=compile,
-            device=device,
-            workers=workers,
-            seed=seed,
-            checkpoint_minutes=validate_minutes,
-            validate_minutes=validate_minutes,
-            sampler=SamplerConfig(crop=crop, sets=sets, drop_frames=drop_frames, pseudo=pseudo),
-        )
+        of_sampler = {item.name: settings.pop(item.name) for item in fields(SamplerConfig) if item.name in settings}
+        config = TrainConfig(**settings, device=device, sampler=SamplerConfig(**of_sampler))
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
-    read += [(what, Path(path)) for what, path in (("init", init), ("vgg", vgg)) if path and Path(path).is_file()]
+    read += [
+        (what, Path(path)) for what, path in (("init", init), ("vgg", config.vgg)) if path and Path(path).is_file()
+    ]
     check_outputs([("output", output), ("state", Path(f"{output}.state"))], read)
     writer = None
     if tensorboard is not None:
@@ -419,18 +335,9 @@ def train(
             figures = "  ".join(f"{name.partition('/')[2]} {value:.3f}" for name, value in values.items())
             LOG.info(f"step {step}: {figures}")
 
-    train_network(
-        clips,
-        output,
-        config,
-        preset=preset,
-        init=init,
-        window=window,
-        validation=[name for item in validation or () for name in item.split(",")],
-        threads=threads,
-        resume=resume,
-        log=log,
-    )
+    shots = tuple(name for item in validation or () for name in item.split(","))
+    inputs = neural.TrainInputs(clips, preset, init, window, shots)
+    neural.train_network(inputs, output, config, threads=threads, resume=resume, log=log)
     if writer is not None:
         writer.close()
     LOG.info(f"wrote {output}")

@@ -27,7 +27,7 @@ from hybrid.stream import FrameStream
 from nlm.average import average, replace_nonfinite, robust_average
 
 if TYPE_CHECKING:
-    from hybrid.neural import Denoiser
+    from hybrid.neural.network_denoiser import NetworkDenoiser
 
 Array = NDArray[np.float32]
 Run = Callable[[Frames], Iterator[tuple[int, Array]]]
@@ -186,11 +186,12 @@ class Network:
 
 
 @lru_cache(maxsize=1)
-def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> Denoiser:
+def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> NetworkDenoiser:
     """A network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
-    return neural.Denoiser(neural.shipped_weights(preset), tile=tile, precision=precision, threshold=threshold)
+    weights = neural.TKPCN_WEIGHTS if preset == "tkpcn" else neural.shipped_weights(preset)
+    return neural.open_network(weights, tile=tile, precision=precision, threshold=threshold)
 
 
 def aligned_average(aligned: AlignedWindow) -> Array:

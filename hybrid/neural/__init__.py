@@ -1,16 +1,22 @@
-"""The boundary to torch: what runs a network, makes its clips, and trains it. Importing it needs torch."""
+"""The boundary to torch: running networks, making clips, training. Importing it needs torch."""
 
-from hybrid.neural.clips import write_clips
-from hybrid.neural.denoiser import SMALL_TILE, Denoiser
-from hybrid.neural.train import train_network
-from hybrid.neural.unet import bundled_preset, denoise_bundled
+from hybrid.neural.clips import ClipSource, write_clips
+from hybrid.neural.oidn_networks import bundled_preset, denoise_bundled
+from hybrid.neural.opening import SMALL_TILE, open_network
+from hybrid.neural.train import TrainInputs, train_network
 from network.checkpoint import shipped_weights
+from network.paper import TKPCN_WEIGHTS
+from network.presets import PRESETS as TRAINING_PRESETS
 
 __all__ = [
     "SMALL_TILE",
-    "Denoiser",
+    "TKPCN_WEIGHTS",
+    "TRAINING_PRESETS",
+    "ClipSource",
+    "TrainInputs",
     "bundled_preset",
     "denoise_bundled",
+    "open_network",
     "shipped_weights",
     "train_network",
     "write_clips",

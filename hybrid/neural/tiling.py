@@ -1,4 +1,4 @@
-"""From pictures to tensors and back, and a picture as tiles."""
+"""From arrays to tensors and back, and an image as tiles."""
 
 from __future__ import annotations
 
@@ -13,31 +13,30 @@ Block = tuple[slice, slice]
 
 
 def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
-    """From layers to a tensor.
+    """Convert layers (T, H, W, C) to a tensor ``(1, T, C, H, W)``.
 
     Parameters
     ----------
     window : (T, H, W, C) array
         Layers.
     copied : bool
-        Whether they are laid out plane by plane; else the tensor looks at the array, and whoever reads it copies it.
+        Whether planes become contiguous; otherwise the tensor is a view of the array.
 
     Returns
     -------
     Tensor
-        ``(1, T, C, H, W)``.
     """
     planes = window.transpose(0, 3, 1, 2)
     return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
 
 
 def image_of(tensor: torch.Tensor) -> Array:
-    """(1, C, H, W) to (H, W, C)."""
+    """Convert ``(1, C, H, W)`` to (H, W, C)."""
     return tensor[0].permute(1, 2, 0).float().cpu().numpy()
 
 
 def pad(window: Array, multiple: int) -> Array:
-    """Repeat the edges of a window up to the size that a network needs.
+    """Repeat the bottom and right edges of layers up to multiples of a size.
 
     Parameters
     ----------
@@ -49,7 +48,6 @@ def pad(window: Array, multiple: int) -> Array:
     Returns
     -------
     (T, H', W', C) array
-        No smaller.
     """
     bottom, right = (-size % multiple for size in window.shape[1:3])
     return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
@@ -63,22 +61,22 @@ def tiles(
     Parameters
     ----------
     rows : slice
-        To be covered.
+        Rows to cover.
     height, width : int
         Of the image.
     tile : int
-        Pixels on a side of a tile, rounded up to `multiple`.
+        Side of a tile, pixels, rounded up to `multiple`.
     halo : int
         Pixels around a tile that its result depends on, rounded up to `multiple`.
     multiple : int
-        Where tiles may start, so that each samples its coarse scales where the whole image would.
+        Tiles and halos start at multiples of this, so that every tile samples its coarse scales where the whole image
+        would.
 
     Yields
     ------
     tuple of three pairs of slices
-        Where a tile's result goes, what it is computed from, and where in that the result is.
+        The tile's part of the image, its input with the halo, and the part within the input.
     """
-    # The halo starts on a multiple, so that every tile samples its coarse scales where the whole image would.
     halo = -(-halo // multiple) * multiple
     tile = -(-tile // multiple) * multiple
     for top in range(rows.start, rows.stop, tile):

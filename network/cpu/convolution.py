@@ -1,7 +1,7 @@
-"""A 3×3 convolution, what is added to it, and its ReLU: one operation where oneDNN has it. For running, on processors.
+"""A 3×3 convolution with an addition and a ReLU as one operation of oneDNN, for inference on CPUs.
 
-On CPUs torch's compiler makes one operation of them; called without it, it gives the same picture in four fifths of the
-time, in bfloat16 to the bit in two thirds: the ReLU alone reads and writes all features once more.
+torch's compiler fuses the three on CPUs. Called without it, the fused operation gives the same result in four fifths of
+the time, in bfloat16 to the bit in two thirds: the ReLU alone reads and writes all features once more.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# Of what type they are one operation: where oneDNN is built in, of what it takes on this processor. Elsewhere they run
-# one after the other.
+# Types for which oneDNN has the fused operation on this processor; none where torch was built without oneDNN.
 _FUSED: frozenset[torch.dtype] = frozenset()
 if torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
     _FUSED |= {torch.float32}
@@ -22,7 +21,7 @@ if torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolut
 
 
 def can_fuse(x: Tensor) -> bool:
-    """Whether they are one operation on these features: on a processor, without gradients."""
+    """Whether `convolve` is one operation on these features: on a CPU, without gradients."""
     return x.dtype in _FUSED and not torch.is_grad_enabled() and x.device.type == "cpu"
 
 
@@ -36,11 +35,11 @@ def convolve(
     x : Tensor
         ``(N, C, H, W)``.
     weight, bias : Tensor
-        Of the convolution: ``(O, C, 3, 3)``, and ``(O,)``.
+        ``(O, C, 3, 3)`` and ``(O,)``.
     added : Tensor, optional
-        ``(N, O, H, W)``, channels last: what is added to it, and where the result is written.
+        ``(N, O, H, W)``, channels last; the result overwrites it.
     relu : bool
-        Whether there is a ReLU.
+        Whether to apply the ReLU.
 
     Returns
     -------
@@ -48,12 +47,12 @@ def convolve(
         ``(N, O, H, W)``.
     """
     if not can_fuse(x):
-        found = functional.conv2d(x, weight, bias, padding=1)
-        found = found if added is None else added.add_(found)
-        return torch.relu_(found) if relu else found
+        result = functional.conv2d(x, weight, bias, padding=1)
+        result = result if added is None else added.add_(result)
+        return torch.relu_(result) if relu else result
     one, name, rest = [1, 1], "relu" if relu else None, (list[float](), "")
     operation = weight, bias, one, one, one, 1  # padding, stride and dilation; groups
     if added is None:
         return cast(Tensor, torch.ops.mkldnn._convolution_pointwise(x, *operation, name or "none", *rest))
-    x = x.contiguous(memory_format=torch.channels_last)  # as what is added lies
+    x = x.contiguous(memory_format=torch.channels_last)  # the memory format of `added`
     return cast(Tensor, torch.ops.mkldnn._convolution_pointwise_.binary(added, x, *operation, "add", 1.0, name, *rest))

@@ -1,7 +1,7 @@
-"""A 3×3 convolution of features at twice their size, and what stands beside them there. For running, on processors.
+"""A 3×3 convolution of upsampled features and a skip connection without upsampling them, for inference on CPUs.
 
-Of features that are enlarged by repeating them, the nine taps of a pixel fall on four: those that fall on the same one
-are added up before. That leaves four ninths of the work, and nothing is enlarged or put side by side.
+Of features enlarged by repetition, the nine taps of a pixel read only four different values: taps that read the same
+value are added beforehand. That leaves four ninths of the work, and nothing is enlarged or concatenated.
 """
 
 from __future__ import annotations
@@ -15,60 +15,51 @@ from torch.nn import functional
 from network.cpu.convolution import convolve
 
 
-class Taps(NamedTuple):
-    """The weights of a convolution as they fall on features of half the size, and beside them.
+class UpsampleTaps(NamedTuple):
+    """Weights of a convolution over upsampled features and a skip connection.
 
     Attributes
     ----------
     coarse : Tensor
-        ``(4·O, C, 2, 2)``: of each of the four places in a pixel of half the size.
-    beside : Tensor
-        ``(O, D, 3, 3)``.
+        ``(4·O, C, 2, 2)``: merged taps on the features, for each of the four pixels that a feature covers.
+    skip : Tensor
+        ``(O, D, 3, 3)``: taps on the skip connection.
     """
 
     coarse: Tensor
-    beside: Tensor
+    skip: Tensor
 
 
-def add_taps(weight: Tensor, width: int) -> Taps:
-    """Add up the taps that fall on the same pixel of half the size.
+def merge_taps(weight: Tensor, channels: int) -> UpsampleTaps:
+    """Add the taps that read the same feature.
 
     Parameters
     ----------
     weight : Tensor
         ``(O, C + D, 3, 3)``.
-    width : int
-        C, how many channels are enlarged.
+    channels : int
+        C, number of upsampled channels.
 
     Returns
     -------
-    Taps
-        Of an even row 2i the three taps fall on rows i − 1, i and i of the features, of an odd one, 2i + 1, on i, i and
-        i + 1; so of columns.
+    UpsampleTaps
+        The three taps of an even row 2i read rows i − 1, i and i of the features, those of an odd row 2i + 1 rows i, i
+        and i + 1; columns likewise.
     """
-    kernels = [half for rows in _halves(weight[:, :width], 2) for half in _halves(rows, 3)]
-    last = torch.channels_last
-    return Taps(torch.cat(kernels).contiguous(memory_format=last), weight[:, width:].contiguous(memory_format=last))
+    kernels = [half for rows in _halves(weight[:, :channels], 2) for half in _halves(rows, 3)]
+    layout = torch.channels_last
+    coarse = torch.cat(kernels).contiguous(memory_format=layout)
+    return UpsampleTaps(coarse, weight[:, channels:].contiguous(memory_format=layout))
 
 
-def can_enlarge(*layers: Tensor) -> bool:
-    """Whether `convolve_enlarged` takes these layers.
-
-    Parameters
-    ----------
-    *layers : Tensor
-        All that it is given.
-
-    Returns
-    -------
-    bool
-    """
+def can_upsample(*layers: Tensor) -> bool:
+    """Whether `convolve_upsampled` takes these layers and weights: on a CPU, all float32 or all bfloat16."""
     (dtype, *others) = {layer.dtype for layer in layers}
     return not others and dtype in (torch.float32, torch.bfloat16) and all(x.device.type == "cpu" for x in layers)
 
 
-def convolve_enlarged(x: Tensor, skip: Tensor, taps: Taps, bias: Tensor) -> Tensor:
-    """Enlarge features, put others beside them, convolve, and apply a ReLU.
+def convolve_upsampled(x: Tensor, skip: Tensor, taps: UpsampleTaps, bias: Tensor) -> Tensor:
+    """Upsample features, concatenate the skip connection, convolve, and apply a ReLU.
 
     Parameters
     ----------
@@ -76,8 +67,8 @@ def convolve_enlarged(x: Tensor, skip: Tensor, taps: Taps, bias: Tensor) -> Tens
         ``(N, C, H, W)``.
     skip : Tensor
         ``(N, D, 2·H, 2·W)``.
-    taps : Taps
-        From `add_taps`.
+    taps : UpsampleTaps
+        From `merge_taps`.
     bias : Tensor
         ``(O,)``.
 
@@ -89,15 +80,15 @@ def convolve_enlarged(x: Tensor, skip: Tensor, taps: Taps, bias: Tensor) -> Tens
     count, channels, (height, width) = len(x), len(bias), x.shape[2:]
     parts = functional.conv2d(x, taps.coarse, padding=1).unflatten(1, (2, 2, channels))
     size = count, channels, 2 * height, 2 * width
-    whole = torch.empty(size, dtype=x.dtype, memory_format=torch.channels_last)
+    upsampled = torch.empty(size, dtype=x.dtype, memory_format=torch.channels_last)
     for row in range(2):
         for column in range(2):
             part = parts[:, row, column, :, row : row + height, column : column + width]
-            whole[:, :, row::2, column::2] = part
-    return convolve(skip, taps.beside, bias, whole)
+            upsampled[:, :, row::2, column::2] = part
+    return convolve(skip, taps.skip, bias, upsampled)
 
 
 def _halves(weight: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """The taps along an axis as they fall on two: of even places, and of odd ones."""
-    before, own, after = weight.unbind(axis)
-    return torch.stack([before, own + after], axis), torch.stack([before + own, after], axis)
+    """Three taps along an axis merged to two: for even pixels, and for odd pixels."""
+    before, centre, after = weight.unbind(axis)
+    return torch.stack([before, centre + after], axis), torch.stack([before + centre, after], axis)

@@ -1,6 +1,8 @@
-"""What the network sees: the one place where a window becomes feature channels, for training and for running."""
+"""Feature channels of the kernel-predicting networks, for training and for running."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,42 +11,40 @@ from torch import Tensor
 CHANNELS = 10
 
 
-def network_inputs(
-    color: Tensor,
-    albedo: Tensor | None,
-    normal: Tensor | None,
-    confidence: Tensor,
-    exposure: Tensor,
-) -> Tensor:
-    """Feature channels of each frame of an aligned window.
+class KernelWindow(NamedTuple):
+    """An aligned window of T frames, float32, finite.
 
-    Parameters
+    Attributes
     ----------
     color : Tensor
-        ``(N, T, 3, H, W)`` aligned irradiance.
-    albedo, normal : Tensor, optional
-        ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space. Zeros where missing.
+        ``(N, T, 3, H, W)`` irradiance, side frames mixed with the centre where they are not trusted.
     confidence : Tensor
         ``(N, T, 1, H, W)`` in [0, 1].
     exposure : Tensor
-        ``(N,)``, positive: the brightness of each window as a whole, proportional to its radiance. Of whole frames and
+        ``(N,)``, positive: brightness of each window as a whole, proportional to its radiance. Of whole frames and
         never of tiles: tiles of different exposure would show their seams.
+    albedo, normal : Tensor or None
+        ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space.
+    """
 
-    Returns
-    -------
-    Tensor
-        ``(N, T, 10, H, W)``: ``log1p(color / exposure)``, ``log1p(albedo)``, normal, confidence.
+    color: Tensor
+    confidence: Tensor
+    exposure: Tensor
+    albedo: Tensor | None = None
+    normal: Tensor | None = None
 
-    Raises
-    ------
-    ValueError
-        If a shape does not fit color's.
+
+def network_inputs(window: KernelWindow) -> Tensor:
+    """``(N, T, 10, H, W)``: ``log1p(color / exposure)``, ``log1p(albedo)``, normal, confidence; 0 for missing guides.
+
+    Raises ValueError if shapes do not fit each other.
 
     Notes
     -----
     The logarithm keeps a firefly of 1e6 at 14; negative radiance (bicubic warping makes some) counts as zero
-    here, though not in what the kernels are applied to.
+    here, though not in the frames that kernels are applied to.
     """
+    color, confidence, exposure, albedo, normal = window
     n, t, _, h, w = color.shape
     for name, value, depth in (("albedo", albedo, 3), ("normal", normal, 3), ("confidence", confidence, 1)):
         if value is not None and value.shape != (n, t, depth, h, w):
@@ -53,7 +53,7 @@ def network_inputs(
         raise ValueError(f"exposure: expected shape {(n,)}, got {tuple(exposure.shape)}")
     scale = exposure.reciprocal().view(n, 1, 1, 1, 1)
     missing = color.new_zeros(()).expand(n, t, 3, h, w)
-    # In place, as these are passes over memory and nothing else.
+    # In place: these are passes over memory.
     channels = [
         (color * scale).clamp_min_(0).log1p_(),
         missing if albedo is None else albedo.clamp_min(0).log1p_(),

@@ -3,7 +3,7 @@
 A kernel has one weight per tap: the K×K neighbours of a pixel in each frame of the aligned window (time, then
 row, then column). All taps of a pixel are normalised together. Applying them keeps the frames apart: numerators
 ``S_t = Σ k_i x_i`` and denominators ``N_t = Σ k_i`` over the taps of frame t. The filtered image is ``Σ S_t / Σ N_t``;
-any subset of the frames, and the share of each frame, are sums of the same.
+images of any subset of the frames, and the share of each frame, are sums of the same.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *
     threshold : float or Tensor, optional
         t, on the scale of the weights; a tensor broadcasts against ``(N, 1, H, W)``. Default ``1 / (2K)``.
     centre : int
-        The tap that gets all the weight where no weight exceeds the threshold: the kernel is then the identity.
+        The tap with all the weight where no weight exceeds the threshold: the kernel is then the identity.
 
     Returns
     -------
@@ -74,23 +74,16 @@ def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, 
     Returns
     -------
     Tensor
-        ``(N, K, H, W)`` float32 (float64 stays), not negative, sums to 1 over the taps.
-
-    Raises
-    ------
-    ValueError
-        As for `threshold_kernel`.
+        As of `threshold_kernel`; float32 (float64 stays).
 
     Notes
     -----
     ``η_t(η_0(w))``. Without the first normalisation t would be compared with numbers whose scale the network
     chooses, and the same t would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first
     normalisation needs only its sum. Kept in float32: in half precision a weight near 1/K has lost the digits
-    that tell it from t.
+    that distinguish it from t.
     """
-    if weights.dtype != torch.float64:
-        weights = weights.float()
-    return _activate(weights, threshold, centre, relative=True)
+    return _activate(_at_least_float32(weights), threshold, centre, relative=True)
 
 
 def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: int) -> Tensor:
@@ -101,20 +94,14 @@ def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: 
     weights : Tensor
         ``(N, K, H, W)`` raw weights; only their differences count.
     threshold : float or Tensor
-        t on the scale of the softmax, below 1/K. 0, the default, is the plain softmax, which gives every tap some
-        weight.
+        t on the scale of the softmax, below 1/K. 0, the default, is the plain softmax: every tap has some weight.
     centre : int
         As for `threshold_kernel`.
 
     Returns
     -------
     Tensor
-        ``(N, K, H, W)`` float32 (float64 stays), not negative, sums to 1 over the taps.
-
-    Raises
-    ------
-    ValueError
-        As for `threshold_kernel`.
+        As of `threshold_kernel`; float32 (float64 stays).
 
     Notes
     -----
@@ -125,9 +112,11 @@ def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: 
     ----------
     Kalojanov and Thurston 2023, section 4, equation 2 and the last paragraph on thresholds.
     """
-    if weights.dtype != torch.float64:
-        weights = weights.float()
-    return threshold_kernel(weights.softmax(1), threshold, centre=centre)
+    return threshold_kernel(_at_least_float32(weights).softmax(1), threshold, centre=centre)
+
+
+def _at_least_float32(weights: Tensor) -> Tensor:
+    return weights if weights.dtype == torch.float64 else weights.float()
 
 
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,8 +143,8 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
 
     Notes
     -----
-    Taps outside the image count in neither sum, so that dividing renormalises what is left of a kernel at the
-    border. Both directions accumulate in place, in float32 or float64: unfolding would write each frame K·K times.
+    Taps outside the image count in neither sum, so that dividing renormalises the rest of a kernel at the border. Both
+    directions accumulate in place, in float32 or float64: unfolding would write each frame K·K times.
     """
     if frames.ndim != 5 or kernels.ndim != 4 or kernels.shape[0] != frames.shape[0]:
         raise ValueError(
@@ -171,7 +160,7 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
         )
     dtype = torch.promote_types(kernels.dtype, frames.dtype)
     working = dtype if dtype == torch.float64 else torch.float32
-    # A further channel of ones, which has the denominators for numerators; the margin around the image is zero.
+    # The numerators of a further channel of ones are the denominators; the margin around the image is zero.
     (n, t, c, h, w), margin = frames.shape, size // 2
     padded = frames.new_zeros((n, t, c + 1, h + 2 * margin, w + 2 * margin), dtype=working)
     padded[:, :, :c, margin : margin + h, margin : margin + w] = frames
@@ -189,7 +178,7 @@ def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon:
     numerators, denominators : Tensor
         ``(N, T', C, H, W)`` and ``(N, T', 1, H, W)``: all frames, or a subset of them along the second axis.
     fallback : Tensor
-        ``(N, C, H, W)``: what the image is where the kernels have no weight on these frames.
+        ``(N, C, H, W)``: x, the image where the kernels have no weight on these frames.
     epsilon : float
         Weight of the fallback, on the scale of a kernel, whose weights sum to 1.
 
@@ -209,8 +198,8 @@ class Pyramid(NamedTuple):
     kernels : tuple of Tensor
         ``(N, taps, H / 2^s, W / 2^s)``, finest first.
     blends : tuple of Tensor
-        One fewer, α_s in [0, 1] of ``(N, 1, H / 2^s, W / 2^s)``: how much of the low frequencies of scale s comes from
-        the next coarser one.
+        One fewer, α_s in [0, 1] of ``(N, 1, H / 2^s, W / 2^s)``: share of the low frequencies of scale s that comes
+        from the next coarser scale.
     """
 
     kernels: tuple[Tensor, ...]
@@ -219,14 +208,16 @@ class Pyramid(NamedTuple):
 
 @dataclass(frozen=True)
 class Filtered:
-    """What kernels made of a window, frame by frame: the images of any of its frames are sums of these.
+    """A window after its kernels, frame by frame: the images of any of its frames are sums of these.
 
     Attributes
     ----------
     numerators, denominators : Tensor
         ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `apply_kernels`.
     kernels : Tensor or Pyramid
-        What made them.
+        The kernels.
+    centre : Tensor
+        ``(N, C, H, W)``: the centre frame before filtering.
     coarse : Filtered, optional
         The same at half the resolution.
     blend : Tensor, optional
@@ -245,57 +236,40 @@ class Filtered:
     numerators: Tensor
     denominators: Tensor
     kernels: Tensor | Pyramid
+    centre: Tensor
     coarse: Filtered | None = None
     blend: Tensor | None = None
 
     @classmethod
     def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Filtered:
-        """Apply kernels of one or more resolutions to a window.
-
-        Parameters
-        ----------
-        kernels : Tensor or Pyramid
-            From a model.
-        color : Tensor
-            ``(N, T, C, H, W)``, any linear quantity.
-
-        Returns
-        -------
-        Filtered
-            The sums of each frame.
-        """
+        """Apply kernels of one or more resolutions to ``(N, T, C, H, W)``, any linear quantity."""
+        centre = color[:, color.shape[1] // 2]
         if isinstance(kernels, Tensor):
-            return cls(*apply_kernels(kernels, color), kernels)
+            return cls(*apply_kernels(kernels, color), kernels, centre)
         sums = apply_kernels(kernels.kernels[0], color)
         if not kernels.blends:
-            return cls(*sums, kernels)
+            return cls(*sums, kernels, centre)
         rest = Pyramid(kernels.kernels[1:], kernels.blends[1:])
-        return cls(*sums, kernels, cls.of(rest, halve(color)), kernels.blends[0])
+        return cls(*sums, kernels, centre, cls.of(rest, halve(color)), kernels.blends[0])
 
     def apply(self, layers: Tensor) -> Tensor:
-        """Filter other layers of the window with the same kernels.
+        """Filter other layers of the window, ``(N, T, C, H, W)``, with the same kernels to ``(N, C, H, W)``."""
+        return Filtered.of(self.kernels, layers).irradiance
 
-        Parameters
-        ----------
-        layers : Tensor
-            ``(N, T, C, H, W)``.
-
-        Returns
-        -------
-        Tensor
-            ``(N, C, H, W)``.
-        """
-        return Filtered.of(self.kernels, layers).image(layers[:, layers.shape[1] // 2])
+    @property
+    def irradiance(self) -> Tensor:
+        """Image of all frames, ``(N, C, H, W)``; the centre where the kernels have no weight."""
+        return self.image(self.centre)
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
-        """Image that some frames give together.
+        """Image of some frames together.
 
         Parameters
         ----------
         fallback : Tensor
             ``(N, C, H, W)``, as for `mean_of`.
         frames : sequence of int, optional
-            Which; all without.
+            Indices of the frames; default: all.
         epsilon : float
             As for `mean_of`.
 
@@ -314,12 +288,12 @@ class Filtered:
         return fine + self.blend * double(low - halve(fine))
 
     def parts(self) -> tuple[Tensor, Tensor]:
-        """What each frame contributes to the image of all, ``(N, T, C, H, W)``, and its weight, ``(N, T, 1, H, W)``.
+        """Contribution of each frame to the image of all, ``(N, T, C, H, W)``, and its weight, ``(N, T, 1, H, W)``.
 
-        They sum to the image and to 1. With coarser resolutions a weight may leave [0, 1] a little, since what those
-        replace is taken away first.
+        They sum to the image and to 1. With coarser resolutions a weight may leave [0, 1] a little, since low
+        frequencies are subtracted before the coarser image replaces them.
         """
-        # 1e-6: as in `mean_of`; nothing of a kernel is left only where no tap is inside the image, which cannot be.
+        # 1e-6: as in `mean_of`; a kernel has no weight left only where no tap is inside the image, which cannot be.
         total = self.denominators.sum(1, keepdim=True).clamp_min(1e-6)
         parts, shares = self.numerators / total, self.denominators / total
         if self.coarse is None or self.blend is None:
@@ -333,65 +307,27 @@ class Filtered:
 
 
 def check_threshold(relative: float) -> float:
-    """Check a threshold of kernels.
-
-    Parameters
-    ----------
-    relative : float
-        t·K, in units of the mean weight of K taps.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If it is outside [0, 1).
-    """
+    """Return a threshold t·K, in units of the mean weight of K taps; ValueError if it is outside [0, 1)."""
     if not 0 <= relative < 1:
         raise ValueError(f"threshold: expected 0 <= t·K < 1, so that t < 1/K, got t·K = {relative}")
     return relative
 
 
 def halve(image: Tensor) -> Tensor:
-    """Mean of 2×2 pixels.
-
-    Parameters
-    ----------
-    image : Tensor
-        ``(..., H, W)``, H and W even.
-
-    Returns
-    -------
-    Tensor
-        ``(..., H / 2, W / 2)``.
-    """
+    """Means over 2×2 pixels of ``(..., H, W)``, H and W even."""
     halved: Tensor = functional.avg_pool2d(image.flatten(0, -4), 2).unflatten(0, image.shape[:-3])
     return halved
 
 
 def double(image: Tensor) -> Tensor:
-    """Linear interpolation to twice the size.
-
-    Parameters
-    ----------
-    image : Tensor
-        ``(..., H, W)``.
-
-    Returns
-    -------
-    Tensor
-        ``(..., 2 H, 2 W)``.
-    """
+    """Linear interpolation of ``(..., H, W)`` to twice the size."""
     flat = functional.interpolate(image.flatten(0, -4), scale_factor=2.0, mode="bilinear", align_corners=False)
     doubled: Tensor = flat.unflatten(0, image.shape[:-3])
     return doubled
 
 
 def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:
-    """Check the arguments shared by the two activations, and run one."""
+    """Check the arguments of the activations, and run them."""
     taps = weights.shape[1]
     if not 0 <= centre < taps:
         raise ValueError(f"centre: expected a tap from 0 to {taps - 1}, got {centre}")
@@ -415,7 +351,7 @@ class _Threshold(torch.autograd.Function):
         # Also a denormal, whose reciprocal is infinite.
         nothing = total < 1e-30
         kernel.div_(total.masked_fill_(nothing, torch.inf))
-        kernel[:, centre : centre + 1] += nothing  # no gradient: that is divided by the total, infinity
+        kernel[:, centre : centre + 1] += nothing  # no gradient: it is divided by the total, infinity
         ctx.save_for_backward(weights, kernel, total)
         ctx.threshold, ctx.relative = threshold, relative
         return kernel
@@ -515,7 +451,7 @@ def _to_taps(
             gradient = to_kernels[frame, tap, y]
             gradient[:] = 0
             for channel in range(channels):
-                # Rows as arrays of their own, or no loop over x becomes vector instructions.
+                # Rows are separate arrays, or the compiler vectorises no loop over x.
                 given = to_sums[frame, channel, y]
                 read = padded[frame, channel, y + row, column : column + width]
                 for x in range(width):
@@ -526,7 +462,7 @@ def _to_taps(
 def _to_frames(
     to_sums: NDArray[Any], kernels: NDArray[Any], to_padded: NDArray[Any], size: int
 ) -> None:  # pragma: no cover - compiled
-    """Gradient of the frames, added up where the taps have read: a frame at a time, as rows overlap."""
+    """Gradient of the frames, scattered to where the taps have read; frame by frame, as rows overlap."""
     count, channels, height, width = to_sums.shape
     for frame in prange(count):
         for y in range(height):

@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 import torch
@@ -22,63 +23,123 @@ from network.checkpoint import new_partial, write_tensors
 from network.paper.kernels import mean_of
 from network.training import losses
 from network.training.config import SamplerConfig
-from network.training.losses import ImageLoss
 
 FORMAT = "ravg-clips"
 VERSION = "4"
-#: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this; what is brighter
-#: (fireflies only) becomes this.
+#: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this, to which brighter values
+#: (fireflies only) are clipped.
 HALF_MAX = 65504.0
-#: The fields of a clip that are one number for each level.
-FIGURES = ("exposure", "gain")
 #: Kinds of targets that are renders, whose noise is independent of the input's.
 RENDERS = ("noisy", "rendered")
 #: Bytes after which a shard is full: small enough to copy about, large enough that files are few.
 SHARD_BYTES = 1 << 28
 
 
+class Layout(NamedTuple):
+    """Axes of a field of a clip behind its levels, and how it is stored and varied.
+
+    Kinds: "radiance" and "irradiance" (stored over the exposure; colors), "color" (without unit), "normal", "motion",
+    "share" (unchanged), "exposure" and "gain" (numbers, float32), "flag" (a number).
+    """
+
+    kind: str
+    channels: int = 3  # 0: one number
+    window: bool = False  # whether there is one for each frame of the window
+
+    @property
+    def is_radiance(self) -> bool:
+        """Whether values scale with the light."""
+        return self.kind in ("radiance", "irradiance")
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is one number per level, of a whole frame."""
+        return self.channels == 0
+
+    def shape(self, levels: int, frames: int, height: int, width: int) -> tuple[int, ...]:
+        """Shape of the field."""
+        if self.is_number:
+            return (levels,)
+        return (levels, *((frames,) if self.window else ()), self.channels, height, width)
+
+
 @dataclass(frozen=True)
 class Clip:
-    """A frame of a shot, or a tile of it, at L noise levels, each with its aligned window.
+    """A frame of a shot, or a tile of it, at L noise levels, each with its aligned window of T frames.
 
-    Parameters
-    ----------
-    color : Tensor
-        ``(L, T, 3, H, W)`` aligned irradiance, side frames mixed with the centre where not trusted.
-    albedo, normal : Tensor
-        ``(L, T, 3, H, W)`` aligned likewise; zeros where the renderer gave none.
-    estimate : Tensor
-        ``(L, T, 3, H, W)`` aligned estimates of the frames, irradiance, made from the same noisy frames alone.
-    residual : Tensor
-        ``(L, T, 3, H, W)`` what the noisy frames show beyond them, aligned to the nearest pixel (`nlm.pooling`).
-    confidence : Tensor
-        ``(L, T, 1, H, W)`` in [0, 1].
-    modulation : Tensor
-        ``(L, 3, H, W)``; radiance is irradiance times modulation.
-    clean_albedo, clean_normal : Tensor
-        ``(L, 3, H, W)`` of the centre, without noise: for networks that rely on their guides.
-    noisy : Tensor
-        ``(L, 3, H, W)`` radiance of the centre, as rendered.
-    exposure : Tensor
-        ``(L,)``, of the windows of whole frames: what the network is told when it runs.
-    gain : Tensor
-        ``(L,)``, OIDN's exposure of the whole picture (`network.unet.autoexposure`).
-    to_next : Tensor
-        ``(L, 2, H, W)``, pixels: from each pixel of the centre to where it is in the next frame; 0 where unknown.
-    linked : Tensor
-        ``(L,)``: 1 where the next clip is the same place of the next frame, else 0.
-    pseudo_reference : Tensor, optional
-        ``(L, 3, H, W)`` radiance of the centre, as estimated from the level's own window. There where no reference is.
-    reference : Tensor, optional
-        ``(L, 3, H, W)`` radiance of the centre, clean: the target wherever there is one.
-    rendered : Tensor, optional
-        ``(L, 3, H, W)`` radiance of the centre in an independent render of more samples: a second target beside
-        a reference that was estimated from that render's window.
+    Windows are ``(L, T, C, H, W)``, images of the centre ``(L, C, H, W)``, numbers ``(L,)``. A clip without an
+    independent reference has a pseudo-reference. Raises ValueError if shapes do not fit together, a value is not
+    finite, or there is no target.
+    """
 
-    Raises
-    ------
-    ValueError
-        If shapes do not fit together, a value is not finite, or there is neither pseudo-reference nor reference.
+    color: Annotated[
+        Tensor, Layout("irradiance", window=True)
+    ]  # aligned, side frames mixed with the centre where not trusted
+    albedo: Annotated[Tensor, Layout("color", window=True)]  # aligned likewise; zeros where the renderer gave none
+    normal: Annotated[Tensor, Layout("normal", window=True)]
+    estimate: Annotated[
+        Tensor, Layout("irradiance", window=True)
+    ]  # first passes of the frames, made from these noisy frames
+    residual: Annotated[
+        Tensor, Layout("irradiance", window=True)
+    ]  # noisy frames minus their first passes (`nlm.pooling`)
+    confidence: Annotated[Tensor, Layout("share", 1, window=True)]  # in [0, 1]
+    modulation: Annotated[Tensor, Layout("color")]  # radiance is irradiance times modulation
+    clean_albedo: Annotated[Tensor, Layout("color")]  # without noise: for networks that rely on their guides
+    clean_normal: Annotated[Tensor, Layout("normal")]
+    noisy: Annotated[Tensor, Layout("radiance")]  # as rendered
+    exposure: Annotated[
+        Tensor, Layout("exposure", 0)
+    ]  # of the windows of whole frames, as given to the network when it runs
+    gain: Annotated[
+        Tensor, Layout("gain", 0)
+    ]  # OIDN's exposure of the whole image (`hybrid.alignment.transfer.measure_gain`)
+    to_next: Annotated[
+        Tensor, Layout("motion", 2)
+    ]  # pixels, from each pixel to its place in the next frame; 0 where unknown
+    linked: Annotated[Tensor, Layout("flag", 0)]  # 1 where the next clip is the same place of the next frame, else 0
+    pseudo_reference: Annotated[Tensor | None, Layout("radiance")] = None  # estimated from the level's own window
+    reference: Annotated[Tensor | None, Layout("radiance")] = None  # clean: the target wherever there is one
+    # An independent render of more samples: a second target beside a reference estimated from that render's window.
+    rendered: Annotated[Tensor | None, Layout("radiance")] = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.color.shape)
+        if len(shape) != 5 or shape[1] % 2 == 0 or shape[2] != 3:
+            raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
+        if self.pseudo_reference is None and self.reference is None:
+            raise ValueError("reference: expected one where there is no pseudo-reference, got none")
+        levels, frames, _, height, width = shape
+        for name, value in self.values().items():
+            expected = FIELDS[name].shape(levels, frames, height, width)
+            if tuple(value.shape) != expected:
+                raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name}: expected finite values, got NaN or infinity")
+
+    def values(self) -> dict[str, Tensor]:
+        """The fields that are there, by name."""
+        values = {name: getattr(self, name) for name in FIELDS}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def crop(self, y: int, x: int, size: int) -> Clip:
+        """Cut out a square tile by its corner; linked to no other clip, as the next frame's tiles lie elsewhere."""
+        part = np.s_[..., y : y + size, x : x + size]
+        tile = {n: v if FIELDS[n].is_number else v[part] for n, v in self.values().items()}
+        return replace(Clip(**tile), linked=torch.zeros_like(self.linked))
+
+
+#: Layout of each field of a `Clip`.
+FIELDS: dict[str, Layout] = {
+    name: hint.__metadata__[0] for name, hint in get_type_hints(Clip, include_extras=True).items()
+}
+
+
+class Sample(NamedTuple):
+    """One level of a clip with a target, float32: fields of `Clip` without L, or batches of them with N in front.
+
+    The target is ``(3, H, W)`` radiance. The error, ``()``, is the loss of the best input of the whole clip
+    (`input_error`); 1 in validation.
     """
 
     color: Tensor
@@ -90,77 +151,23 @@ class Clip:
     modulation: Tensor
     clean_albedo: Tensor
     clean_normal: Tensor
-    noisy: Tensor
     exposure: Tensor
     gain: Tensor
     to_next: Tensor
-    linked: Tensor
-    pseudo_reference: Tensor | None = None
-    reference: Tensor | None = None
-    rendered: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        shape = tuple(self.color.shape)
-        if len(shape) != 5 or shape[1] % 2 == 0 or shape[2] != 3:
-            raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
-        image = (shape[0], *shape[2:])
-        if self.pseudo_reference is None and self.reference is None:
-            raise ValueError("reference: expected one where there is no pseudo-reference, got none")
-        expected = {
-            **dict.fromkeys(("color", "albedo", "normal", "estimate", "residual"), shape),
-            **dict.fromkeys(("modulation", "clean_albedo", "clean_normal", "noisy", "pseudo_reference"), image),
-            "confidence": (*shape[:2], 1, *shape[3:]),
-            **dict.fromkeys((*FIGURES, "linked"), shape[:1]),
-            **dict.fromkeys(("reference", "rendered"), image),
-            "to_next": (shape[0], 2, *shape[3:]),
-        }
-        for name, value in _values(self).items():
-            wanted = expected[name]
-            if tuple(value.shape) != wanted:
-                raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"{name}: expected finite values, got NaN or infinity")
-
-    def crop(self, y: int, x: int, size: int) -> Clip:
-        """Cut a square tile out of the clip.
-
-        Parameters
-        ----------
-        y, x : int
-            Row and column of its corner.
-        size : int
-            Of its sides, pixels.
-
-        Returns
-        -------
-        Clip
-            With the exposures of the whole frame. It is linked to no other, as the next frame's tiles lie elsewhere.
-        """
-        here = np.s_[..., y : y + size, x : x + size]
-        whole = (*FIGURES, "linked")
-        cut = Clip(**{n: v if n in whole else v[here] for n, v in _values(self).items()})
-        return replace(cut, linked=torch.zeros_like(self.linked))
+    target: Tensor
+    error: Tensor
 
 
-def _values(clip: Clip) -> dict[str, Tensor]:
-    values = {item.name: getattr(clip, item.name) for item in fields(clip)}
-    return {name: value for name, value in values.items() if value is not None}
+#: Fields of a clip that samples have.
+INPUTS = Sample._fields[:-2]
 
 
 def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
-    """For each noise level what it may be trained towards: other levels of no more noise, never the other way.
+    """For each noise level its possible targets: other levels of no more noise, never the other way.
 
-    Parameters
-    ----------
-    samples : sequence of float
-        Samples per pixel of each level. The levels must be independent renders.
-
-    Returns
-    -------
-    list of list of (int, str)
-        For each level the levels and kinds of targets, "noisy" and "pseudo_reference", cleanest first. A level
-        without an independent one of no more noise gets its own pseudo-reference: the network can then learn no more
-        than the estimate knows.
+    The levels, given by their samples per pixel, must be independent renders. Returns, for each level, levels and kinds
+    of targets, "noisy" and "pseudo_reference", cleanest first. A level without an independent one of no more noise gets
+    its own pseudo-reference: the network can then learn no more than the pseudo-reference contains.
 
     References
     ----------
@@ -168,15 +175,15 @@ def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
     """
     order = sorted(range(len(samples)), key=lambda level: -samples[level])
     pairs = []
-    for level, own in enumerate(samples):
-        others = [other for other in order if other != level and samples[other] >= own]
+    for level, count in enumerate(samples):
+        others = [other for other in order if other != level and samples[other] >= count]
         both = [(other, kind) for other in others for kind in ("noisy", "pseudo_reference")]
         pairs.append(both or [(level, "pseudo_reference")])
     return pairs
 
 
 def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
-    """How much a network can learn at each pixel: noise, detail, and motion that could not be followed.
+    """Importance of each pixel for training: noise, detail, and motion that could not be followed.
 
     Parameters
     ----------
@@ -191,25 +198,25 @@ def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tens
     -------
     Tensor
         ``(H, W)``, 0 where a flat sky is. Differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇ albedo|; and a
-        tenth of the mistrust of the frames, which would otherwise outweigh all else where an object passes.
+        tenth of the frames' lack of confidence, which would otherwise outweigh all else where an object passes.
     """
     noisy, estimate = (image.clamp_min(0) / (1 + image.clamp_min(0)) for image in (noisy.float(), estimate.float()))
-    found = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))
+    result = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))
     for guide in (estimate, albedo.float()):
-        found[1:] += guide.diff(dim=1).abs().mean(0)
-        found[:, 1:] += guide.diff(dim=2).abs().mean(0)
-    return found
+        result[1:] += guide.diff(dim=1).abs().mean(0)
+        result[:, 1:] += guide.diff(dim=2).abs().mean(0)
+    return result
 
 
 def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]], np.ndarray]:
-    """Chances of the possible tiles of a picture, half even, half by importance.
+    """Chances of the possible tiles of an image, half uniform, half by importance.
 
     Parameters
     ----------
     importance : Tensor
         ``(H, W)``, at least 0, from `importance`.
     size : int
-        Of the sides of a tile, pixels; at most H and W.
+        Side of a tile, pixels; at most H and W.
 
     Returns
     -------
@@ -239,16 +246,16 @@ def important_places(importance: Tensor, size: int, count: int, rng: np.random.G
     importance : Tensor
         ``(H, W)``, at least 0, from `importance`.
     size : int
-        Of the sides of a tile, pixels.
+        Side of a tile, pixels.
     count : int
-        How many at most.
+        Number of tiles; fewer where no more fit.
     rng : numpy.random.Generator
-        What they are drawn with.
+        Source of randomness.
 
     Returns
     -------
     list of (int, int)
-        Row and column of the corners, fewer than `count` where no more fit.
+        Row and column of the corners.
     """
     corners, chances = place_chances(importance, size)
     places: list[tuple[int, int]] = []
@@ -268,7 +275,7 @@ def write_shards(
     Parameters
     ----------
     folder : path
-        Where to.
+        Output folder.
     shot : str
         Name; training and validation are split by it.
     samples : sequence of float
@@ -279,12 +286,12 @@ def write_shards(
     Returns
     -------
     list of Path
-        The shards. They appear together when the last is done.
+        The shards. They appear together when the last is finished.
 
     Raises
     ------
     ValueError
-        If there are no clips, or they are not alike.
+        If there are no clips, or they differ in shape.
     """
     folder = Path(folder)
     partial: list[Path] = []
@@ -301,8 +308,8 @@ def write_shards(
         for clip in clips:
             packed = _pack(clip)
             if waiting and packed["color"].shape != waiting[0]["color"].shape:
-                found, wanted = (tuple(values["color"].shape) for values in (packed, waiting[0]))
-                raise ValueError(f"clips: expected color of shape {wanted} as in those before, got {found}")
+                found, expected = (tuple(values["color"].shape) for values in (packed, waiting[0]))
+                raise ValueError(f"clips: expected color of shape {expected} as in those before, got {found}")
             waiting.append(packed)
             if len(waiting) * sum(value.nbytes for value in packed.values()) > SHARD_BYTES:
                 flush()
@@ -310,10 +317,10 @@ def write_shards(
             flush()
         if not partial:
             raise ValueError(f"clips: expected at least one of shot {shot!r}, got none")
-        done = [path.with_suffix("") for path in partial]
-        for path, final in zip(partial, done, strict=True):
+        finished = [path.with_suffix("") for path in partial]
+        for path, final in zip(partial, finished, strict=True):
             os.replace(path, final)
-        return done
+        return finished
     finally:
         for path in partial:
             path.unlink(missing_ok=True)
@@ -322,18 +329,19 @@ def write_shards(
 def _pack(clip: Clip) -> dict[str, Tensor]:
     """Values as they are stored: radiance and irradiance over the exposure of the last level, float16."""
     scale = clip.exposure[-1]
-    packed = {"exposure": (clip.exposure / scale).float(), "gain": (clip.gain * scale).float()}
-    for name, value in _values(clip).items():
-        if name in ("color", "estimate", "residual", "noisy", "pseudo_reference", "reference", "rendered"):
+    packed = {}
+    for name, value in clip.values().items():
+        layout = FIELDS[name]
+        if layout.is_radiance:
             value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
-        if name not in FIGURES:
-            packed[name] = value.to(torch.float16).contiguous()
+        numbers = {"exposure": value / scale, "gain": value * scale}
+        packed[name] = numbers[name].float() if name in numbers else value.to(torch.float16).contiguous()
     return packed
 
 
 @dataclass(frozen=True)
 class _Shard:
-    """What is known of a shard without reading its clips."""
+    """Metadata of a shard."""
 
     path: Path
     shot: str
@@ -351,7 +359,7 @@ class Clips:
     shards : sequence
         From `open_clips`.
     frames : int, optional
-        Length of the windows, odd: the middle frames of those that are stored. All without.
+        Length of the windows, odd: the middle frames of the stored windows. Default: all.
 
     Raises
     ------
@@ -382,34 +390,14 @@ class Clips:
         return min(min(shard.shape[4:]) for shard in self._shards)
 
     def of(self, shots: Sequence[str]) -> Clips:
-        """Those of some shots.
-
-        Parameters
-        ----------
-        shots : sequence of str
-            Names.
-
-        Returns
-        -------
-        Clips
-            In the order they have here.
-        """
+        """The clips of some shots."""
         found = [shard for shard in self._shards if shard.shot in shots]
         return Clips(found, self.frames if found else None)
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
-        """What each noise level of a clip may be trained towards.
+        """Possible targets, (level, kind), of each noise level of a clip.
 
-        Parameters
-        ----------
-        index : int
-            Of the clip.
-
-        Returns
-        -------
-        list of list of (int, str)
-            For each level its targets: the reference where there is one, and a render beside it, else its
-            `noise_pairs`.
+        The reference where there is one, and a render beside it, else its `noise_pairs`.
         """
         shard = self._find(index)[0]
         if shard.targets:
@@ -417,18 +405,7 @@ class Clips:
         return noise_pairs(shard.samples)
 
     def neighbours(self, index: int) -> tuple[int, int] | None:
-        """Two clips of successive frames at the same place, the one given among them.
-
-        Parameters
-        ----------
-        index : int
-            Of the clip.
-
-        Returns
-        -------
-        (int, int) or None
-            The earlier first; None where there is no such other.
-        """
+        """Two clips of successive frames at the same place, the given one among them, the earlier first, if any."""
         for first in (index, index - 1):
             if first >= 0:
                 shard, number = self._find(first)
@@ -436,42 +413,27 @@ class Clips:
                     return first, first + 1
         return None
 
-    def read(self, index: int, level: int, target: tuple[int, str]) -> dict[str, Tensor]:
-        """Read one level of a clip with a target.
+    def read(self, index: int, level: int, target: tuple[int, str]) -> Sample:
+        """Read one level of a clip with a target, one of `pairs`.
 
-        Parameters
-        ----------
-        index : int
-            Of the clip.
-        level : int
-            Of the noise.
-        target : (int, str)
-            Level and kind, one of `pairs`.
-
-        Returns
-        -------
-        dict of Tensor
-            The fields of `Clip` that are inputs, without L, and ``target``, float16; the exposure float32. Radiance and
-            irradiance are over the exposure of the clip's last level.
-
-        Raises
-        ------
-        ValueError
-            If the file is cut short.
+        Values are as stored: float16, radiance and irradiance over the exposure of the clip's last level; exposure and
+        gain float32; error 1. Raises ValueError if the file is cut short.
         """
         shard, number = self._find(index)
-        windows = ("color", "albedo", "normal", "estimate", "residual", "confidence")
-        names = ("modulation", "clean_albedo", "clean_normal", "to_next", *FIGURES)
         outer = (shard.shape[2] - self.frames) // 2
         middle = slice(outer, outer + self.frames)
         try:
             with safe_open(shard.path, framework="pt") as file:
-                values = {name: file.get_slice(name)[number, level, middle] for name in windows}
-                values |= {name: file.get_slice(name)[number, level] for name in names}
-                values["target"] = file.get_slice(target[1])[number, target[0]]
+                values = {
+                    name: file.get_slice(name)[number, level, middle]
+                    if FIELDS[name].window
+                    else file.get_slice(name)[number, level]
+                    for name in INPUTS
+                }
+                stored_target = file.get_slice(target[1])[number, target[0]]
         except (SafetensorError, OSError) as error:
             raise ValueError(f"clips {os.fspath(shard.path)!r}: cut short ({error})") from error
-        return values
+        return Sample(**values, target=stored_target, error=torch.ones(()))
 
     def _find(self, index: int) -> tuple[_Shard, int]:
         shard = int(np.searchsorted(self._starts, index, side="right")) - 1
@@ -479,19 +441,18 @@ class Clips:
 
 
 def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Clips:
-    """Open all shards of a folder and of those in it.
+    """Open all shards of a folder and its subfolders, in the order of their paths.
 
     Parameters
     ----------
     folder : path
-        Where `write_shards` has written.
+        Output of `write_shards`.
     frames : int, optional
         Length of the windows, as for `Clips`.
 
     Returns
     -------
     Clips
-        In the order of the shards' paths.
 
     Raises
     ------
@@ -502,7 +463,7 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
     """
     paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:
-        raise FileNotFoundError(f"clips: no *.safetensors in {os.fspath(folder)!r}; expected what ravg prepare writes")
+        raise FileNotFoundError(f"clips: no *.safetensors in {os.fspath(folder)!r}; expected what ravg make-clips writes")
     shards = []
     for path in paths:
         where = f"clips {os.fspath(path)!r}"
@@ -514,9 +475,9 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
                 linked = tuple((file.get_tensor("linked")[:, 0] > 0).tolist()) if "linked" in names else ()
         except SafetensorError as error:
             raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
-        for key, wanted in (("format", FORMAT), ("version", VERSION)):
-            if metadata.get(key) != wanted:
-                raise ValueError(f"{where}: expected {key} {wanted!r}, got {metadata.get(key)!r}")
+        for key, expected in (("format", FORMAT), ("version", VERSION)):
+            if metadata.get(key) != expected:
+                raise ValueError(f"{where}: expected {key} {expected!r}, got {metadata.get(key)!r}")
         targets = tuple(name for name in ("reference", "rendered") if name in names)
         shards.append(_Shard(path, metadata["shot"], tuple(json.loads(metadata["samples"])), shape, targets, linked))
         if shards[-1].shape[2] != shards[0].shape[2]:
@@ -525,7 +486,7 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
 
 
 def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
-    """Training and validation clips; no shot is in both.
+    """Split clips into those for training and those for validation; no shot is in both.
 
     Parameters
     ----------
@@ -537,7 +498,6 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
     Returns
     -------
     training, validation : Clips
-        The rest, and those named.
 
     Raises
     ------
@@ -553,11 +513,51 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
     return clips.of(training), clips.of(validation)
 
 
-class Samples(Dataset[dict[str, Tensor]]):
+@dataclass(frozen=True)
+class _Variation:
+    """How a sample is varied: flips, transposition (with flips: quarter turns), and permutations of channels.
+
+    Normals may be in any fixed space, so none is turned with the image; their axes get a signed permutation.
+    """
+
+    flips: tuple[int, ...]
+    transpose: bool
+    channels: Tensor
+    axes: Tensor
+    signs: Tensor
+    stops: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, exposure_stops: float) -> _Variation:
+        """Draw a variation."""
+        across, down, transpose = rng.random(3) < 0.5
+        channels = torch.from_numpy(rng.permutation(3))
+        axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
+        flips = tuple(axis for axis, flipped in ((-1, across), (-2, down)) if flipped)
+        return cls(flips, bool(transpose), channels, axes, signs, rng.uniform(-exposure_stops, exposure_stops))
+
+    def apply(self, value: Tensor, kind: str) -> Tensor:
+        """Vary a layer of a kind, ``(..., C, H, W)``, or a number."""
+        if kind in ("exposure", "gain"):
+            return value * 2 ** (self.stops if kind == "exposure" else -self.stops)
+        value = value.flip(self.flips)
+        value = value.transpose(-2, -1) if self.transpose else value
+        if kind == "normal":
+            value = value[..., self.axes, :, :] * self.signs
+        elif kind == "motion":
+            signs = [-1.0 if axis in self.flips else 1.0 for axis in (-1, -2)]
+            value = value * torch.tensor(signs)[:, None, None]
+            value = value.flip(0) if self.transpose else value
+        elif kind != "share":
+            value = value[..., self.channels, :, :]
+        return value.contiguous()
+
+
+class Samples(Dataset[Sample]):
     """The samples of a training, by number: each is a function of the seed and its number alone.
 
     So the state of the sampling is one number, any process may make any sample, and a training that is resumed or
-    spread over processes sees the same ones.
+    spread over processes gets the same samples.
 
     Parameters
     ----------
@@ -566,12 +566,12 @@ class Samples(Dataset[dict[str, Tensor]]):
     config : SamplerConfig
         Crops and variations.
     seed : int
-        Of everything random.
+        Seed of everything random.
     loss : ImageLoss
-        What ``error`` is measured with.
+        Loss of ``error``.
     neighbours : bool
-        Whether each sample is two: of successive frames, at the same place and varied alike. Of clips that have none,
-        as beyond a cut, no samples are made.
+        Whether each sample is two, with a 2 in front of each shape: of successive frames, at the same place and varied
+        alike. Clips without a neighbour, as at a cut, are left out.
 
     Raises
     ------
@@ -582,10 +582,6 @@ class Samples(Dataset[dict[str, Tensor]]):
     -----
     The clips are split at random into disjoint sets, one per epoch. An epoch takes each clip of its set once, in random
     order, at a noise level and towards a target drawn from `noise_pairs`; after the last set the first comes again.
-
-    Variations: flips, transposition (with flips: quarter turns), permutations of the color channels, signed
-    permutations of the normal's axes (normals may be in any fixed space, so none is turned with the image), and those
-    of `SamplerConfig`.
     """
 
     def __init__(
@@ -593,7 +589,7 @@ class Samples(Dataset[dict[str, Tensor]]):
         clips: Clips,
         config: SamplerConfig,
         seed: int,
-        loss: ImageLoss = losses.relmse,
+        loss: losses.ImageLoss = losses.relmse,
         *,
         neighbours: bool = False,
     ) -> None:
@@ -606,146 +602,103 @@ class Samples(Dataset[dict[str, Tensor]]):
         usable = [index for index in range(len(clips)) if not neighbours or clips.neighbours(index) is not None]
         if not usable:
             raise ValueError(
-                "clips: expected neighbouring frames, as whole frames have (ravg prepare --tile 0), got none"
+                "clips: expected neighbouring frames, as whole frames have (ravg make-clips --tile 0), got none"
             )
         order = np.random.default_rng((seed, 0)).permutation(usable)
         self._sets = [order[first :: config.sets] for first in range(config.sets)]
         self._cycle: tuple[int, np.ndarray] | None = None
 
     def clip_of(self, number: int) -> int:
-        """The clip that a sample is made of.
-
-        Parameters
-        ----------
-        number : int
-            Of the sample.
-
-        Returns
-        -------
-        int
-            Index of the clip.
-        """
+        """Index of the clip that a sample is drawn from."""
         cycle, place = divmod(number, sum(map(len, self._sets)))
         if self._cycle is None or self._cycle[0] != cycle:
             rng = np.random.default_rng((self.seed, 1, cycle))
             self._cycle = cycle, np.concatenate([rng.permutation(part) for part in self._sets])
         return int(self._cycle[1][place])
 
-    def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """Make a sample.
-
-        Returns
-        -------
-        dict of Tensor
-            float32: ``color``, ``albedo``, ``normal``, ``estimate``, ``residual`` ``(T, 3, H, W)``, ``confidence``
-            ``(T, 1, H, W)``, ``modulation``, ``clean_albedo``, ``clean_normal``, ``target`` ``(3, H, W)``, ``to_next``
-            ``(2, H, W)``, ``exposure``, ``gain`` and ``error`` ``()`` (the loss of the clip's best input). With
-            neighbours there is a 2 in front of each shape. A `torch.utils.data.DataLoader` stacks them.
-        """
+    def __getitem__(self, number: int) -> Sample:
+        """Make a sample."""
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
         level = int(rng.integers(len(pairs)))
         target = self._target(pairs[level], rng)
         members = self.clips.neighbours(index) if self.neighbours else (index,)
-        assert members is not None  # as was looked at in the beginning
+        assert members is not None  # clips without neighbours are left out
         clips = [self.clips.read(member, level, target) for member in members]
-        frames = len(clips[0]["color"])
         y, x = self._place(clips[0], rng)
-        across, down, transpose = rng.random(3) < 0.5
-        channels = torch.from_numpy(rng.permutation(3))
-        axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
-        stops = rng.uniform(-config.exposure_stops, config.exposure_stops)
-
-        def vary(values: dict[str, Tensor]) -> dict[str, Tensor]:
-            """Crop and turn what was read, the same way for both clips."""
-            whole = {name: value[None].float() for name, value in values.items()}
-            sample = {"error": input_error(whole, self.loss)[0]}
-            for name, value in values.items():
-                if name in FIGURES:
-                    sample[name] = value.float() * 2 ** (stops if name == "exposure" else -stops)
-                    continue
-                value = value[..., y : y + config.crop, x : x + config.crop].float()
-                value = value.flip([axis for axis, flipped in ((-1, across), (-2, down)) if flipped])
-                value = value.transpose(-2, -1) if transpose else value
-                if name in ("normal", "clean_normal"):
-                    value = value[..., axes, :, :] * signs
-                elif name == "to_next":
-                    value = value * torch.tensor([-1.0 if across else 1.0, -1.0 if down else 1.0])[:, None, None]
-                    value = value.flip(0) if transpose else value
-                elif name != "confidence":
-                    value = value[..., channels, :, :]
-                sample[name] = value.contiguous()
-            return sample
-
-        samples = [vary(values) for values in clips]
+        variation = _Variation.draw(rng, config.exposure_stops)
+        samples = [self._varied(clip, y, x, variation) for clip in clips]
+        frames = len(clips[0].color)
         if frames > 1 and rng.random() < config.drop_frames:
             dropped = torch.from_numpy(rng.random(frames) < 0.5)
             dropped[frames // 2] = False
             for sample in samples:
-                for name in ("color", "albedo", "normal", "estimate", "residual"):
-                    sample[name][dropped] = sample[name][frames // 2].clone()
-                sample["confidence"][dropped] = 0
+                for layer in (sample.color, sample.albedo, sample.normal, sample.estimate, sample.residual):
+                    layer[dropped] = layer[frames // 2].clone()
+                sample.confidence[dropped] = 0
         if rng.random() < config.fireflies:
             count = rng.integers(1, 9)
             rows, columns = rng.integers(config.crop, size=(2, count))
             # Not black where it was black: a firefly comes from a path, not from the pixel it lands in.
-            burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * clips[0]["exposure"].float()
+            burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * clips[0].exposure.float()
             frame = rng.integers(frames)
-            for name in ("color", "residual"):
-                samples[0][name][frame, :, rows, columns] += burst
-        return {n: torch.stack([s[n] for s in samples]) for n in samples[0]} if self.neighbours else samples[0]
+            for layer in (samples[0].color, samples[0].residual):
+                layer[frame, :, rows, columns] += burst
+        return Sample(*map(torch.stack, zip(*samples, strict=True))) if self.neighbours else samples[0]
+
+    def _varied(self, clip: Sample, y: int, x: int, variation: _Variation) -> Sample:
+        """Crop and vary a clip, with the error of the whole clip."""
+        part = np.s_[..., y : y + self.config.crop, x : x + self.config.crop]
+        values = {}
+        for name in (*INPUTS, "target"):
+            value, layout = getattr(clip, name), FIELDS.get(name, Layout("radiance"))
+            values[name] = variation.apply((value if layout.is_number else value[part]).float(), layout.kind)
+        whole = Sample(*(value[None].float() for value in clip))
+        return Sample(**values, error=input_error(whole, self.loss)[0])
 
     def _target(self, targets: list[tuple[int, str]], rng: np.random.Generator) -> tuple[int, str]:
-        """One of the targets of a level: a render or a pseudo-reference first, then whose."""
+        """One of the targets of a level: a render or a pseudo-reference first, then the level."""
         renders = [target for target in targets if target[1] in RENDERS]
         estimated = [target for target in targets if target[1] not in RENDERS]
         kind = estimated if not renders or (estimated and rng.random() < self.config.pseudo) else renders
         return kind[rng.integers(len(kind))]
 
-    def _place(self, values: dict[str, Tensor], rng: np.random.Generator) -> tuple[int, int]:
+    def _place(self, clip: Sample, rng: np.random.Generator) -> tuple[int, int]:
         """Corner of the crop: the clip's own if that is as large, else drawn by importance."""
-        if values["target"].shape[-2:] == (self.config.crop, self.config.crop):
+        if clip.target.shape[-2:] == (self.config.crop, self.config.crop):
             return 0, 0
-        centre = len(values["color"]) // 2
-        modulation = values["modulation"]
-        corners, chances = place_chances(
-            importance(
-                values["color"][centre] * modulation,
-                values["estimate"][centre] * modulation,
-                values["albedo"][centre],
-                values["confidence"],
-            ),
-            self.config.crop,
-        )
+        centre = len(clip.color) // 2
+        color, estimate = (layer[centre] * clip.modulation for layer in (clip.color, clip.estimate))
+        weights = importance(color, estimate, clip.albedo[centre], clip.confidence)
+        corners, chances = place_chances(weights, self.config.crop)
         return corners[rng.choice(len(corners), p=chances)]
 
 
-def input_error(batch: dict[str, Tensor], loss: ImageLoss) -> Tensor:
-    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's estimate.
+def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
+    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's first pass.
 
     Parameters
     ----------
-    batch : dict of Tensor
-        As from `Samples`, with N in front: ``color``, ``estimate``, ``confidence``, ``modulation``, ``exposure`` and
-        ``target``.
+    batch : Sample
+        With N in front.
     loss : ImageLoss
-        What it is measured with.
+        The loss.
 
     Returns
     -------
     Tensor
         ``(N,)``, at least 1e-6.
     """
-    color, confidence, modulation = batch["color"], batch["confidence"], batch["modulation"]
-    centre = color.shape[1] // 2
-    mean = mean_of(color * confidence, confidence, color[:, centre])
-    scale = batch["exposure"] * modulation.mean((1, 2, 3)).clamp_min(1e-3)
-    errors = [loss(image * modulation, batch["target"], scale) for image in (mean, batch["estimate"][:, centre])]
+    centre = batch.color.shape[1] // 2
+    mean = mean_of(batch.color * batch.confidence, batch.confidence, batch.color[:, centre])
+    scale = losses.scale_of_radiance(batch.exposure, batch.modulation)
+    images = mean, batch.estimate[:, centre]
+    errors = [loss(image * batch.modulation, batch.target, scale) for image in images]
     # The floor matters only where the input equals the target, as in a synthetic or an empty clip.
     return torch.minimum(*errors).clamp_min(1e-6)
 
 
-def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tensor]]:
+def whole_frames(clips: Clips, index: int, multiple: int) -> list[Sample]:
     """A clip at each of its levels, towards the cleanest target, as batches of one, unvaried.
 
     Parameters
@@ -753,20 +706,18 @@ def whole_frames(clips: Clips, index: int, multiple: int) -> list[dict[str, Tens
     clips : Clips
         The clips.
     index : int
-        Which.
+        Of the clip.
     multiple : int
-        Of height and width; the model's. The rest is left off at the right and the bottom.
+        Height and width are cropped, at the bottom and the right, to multiples of this.
 
     Returns
     -------
-    list of dict of Tensor
-        As from `Samples`, with N = 1 in front.
+    list of Sample
+        With N = 1 in front.
     """
     batches = []
     for level, targets in enumerate(clips.pairs(index)):
-        values = clips.read(index, level, targets[0])
-        height, width = (length // multiple * multiple for length in values["target"].shape[-2:])
-        batch = {n: v[None].float() for n, v in values.items() if n in FIGURES}
-        batch |= {n: v[None, ..., :height, :width].float() for n, v in values.items() if n not in FIGURES}
-        batches.append(batch)
+        sample = clips.read(index, level, targets[0])
+        height, width = (length // multiple * multiple for length in sample.target.shape[-2:])
+        batches.append(Sample(*(v[None, ..., :height, :width].float() if v.ndim else v[None].float() for v in sample)))
     return batches

@@ -1,24 +1,37 @@
-"""What determines a training. Nothing here needs torch, so that a command can tell the defaults without it."""
+"""Settings of a training, with defaults and help texts for `ravg train`; importing this needs no torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple
+
+from network.devices import DEVICES
 
 LOSSES = ("l1", "smape", "relmse", "display", "perceptual")
 TERMS = ("temporal", "power", "spatial")
-DEVICES = ("auto", "cpu", "cuda", "hip", "sycl", "metal")
+# The second is the former name of the option.
+BACKBONE = ("--backbone-rate", "--trunk-rate")
+
+
+class Setting(NamedTuple):
+    """Help text of a setting that is an option of `ravg train`, and names of the option, if not that of the field."""
+
+    help: str
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
     """How samples are drawn and varied. Probabilities are per sample."""
 
-    crop: int = 128  # height and width; of larger clips a place is drawn by importance
-    sets: int = 10  # disjoint sets of clips, one for each epoch; the paper's ten
-    drop_frames: float = 0.1  # a side frame loses its confidence and becomes the centre, as at a shot's ends
+    crop: Annotated[int, Setting("pixels on a side of a sample; drawn by importance from larger clips")] = 128
+    sets: Annotated[int, Setting("disjoint sets of clips, one for each epoch; the paper's ten")] = 10
+    drop_frames: Annotated[
+        float, Setting("chance that side frames of a sample are dropped, as at the ends of a shot")
+    ] = 0.1
+    pseudo: Annotated[float, Setting("chance of a pseudo-reference as target where there are renders too")] = 0.5
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
-    pseudo: float = 0.5  # a target is a pseudo-reference, where there are renders of as many samples too
-    exposure_stops: float = 1.0  # the exposure the network is told is off by up to this, either way
+    exposure_stops: float = 1.0  # the exposure given to the network is off by up to this, either way
 
     def __post_init__(self) -> None:
         for name in ("crop", "sets"):
@@ -33,28 +46,43 @@ class SamplerConfig:
 class TrainConfig:
     """One training; with the clips and the model it determines the weights."""
 
-    steps: int | None = None  # stop after so many steps; reproducible from the seed
-    minutes: float | None = None  # or after so long, whichever comes first
-    batch: int = 2  # of all processes together
-    rate: float = 1e-3  # peak learning rate
-    trunk_rate: float = 0.1  # share of it that the trunk of a RobustUNet is trained with; 0 leaves it as it is
-    warmup: int = 200  # steps of linear rise; the kernels start at a sane mean, and must not be thrown off it
+    steps: Annotated[int | None, Setting("stop after so many steps; reproducible from the seed")] = None
+    minutes: Annotated[float | None, Setting("stop after so many minutes")] = None
+    batch: Annotated[int, Setting("samples of a step, of all processes together")] = 2
+    rate: Annotated[float, Setting("peak learning rate")] = 1e-3
+    backbone_rate: Annotated[float, Setting("factor of the rate for a pretrained backbone; 0: frozen", BACKBONE)] = 0.1
+    # The kernels start at a reasonable mean, which a full rate at once would destroy.
+    warmup: Annotated[int, Setting("steps in which the rate rises to its peak")] = 200
     weight_decay: float = 1e-4
-    clip_norm: float = 1.0  # largest norm of the gradient; one firefly is one sample
-    ema: float = 0.999  # of the weights that are validated and kept
-    loss: str = "relmse"  # which leaves the mean alone: one of LOSSES
-    vgg: str | None = None  # weights of VGG19 in torchvision's format, or hub; for perceptual
-    terms: str = "temporal"  # parts of the window that must give the target: one of TERMS
-    whole: float = 1.0  # weight of the whole window's term beside the temporal ones
-    differences: float = 0.0  # weight of what the errors of two neighbouring pictures differ by, along the motion
-    slope: float = 1.0  # λ of Vogels' asymmetric loss; for clean targets
-    bfloat16: bool = True  # for the convolutions, where the device has it; kernels and losses are float32
-    compile: bool = False  # torch.compile the network: a minute at the start, pays on a GPU
-    device: str = "auto"  # the GPU if there is one
-    workers: int = 0  # processes that read clips; 0: the training itself
-    seed: int = 0
-    checkpoint_minutes: float = 5.0
-    validate_minutes: float = 5.0
+    clip_norm: Annotated[
+        float, Setting("largest norm of a gradient, as one sample may hold a firefly", ("--clip",))
+    ] = 1.0
+    ema: Annotated[float, Setting("decay of the moving average of the weights, which is validated and saved")] = 0.999
+    # relmse leaves the mean alone.
+    loss: Annotated[str, Setting("relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)")] = (
+        "relmse"
+    )
+    vgg: Annotated[str | None, Setting("torchvision's VGG19 weights: a file, or hub to download them")] = None
+    terms: Annotated[
+        str | None,
+        Setting("of networks that predict kernels: temporal, power (every subset of the window), or spatial"),
+    ] = None
+    whole: Annotated[float, Setting("weight of the term of the whole window beside the temporal terms")] = 1.0
+    differences: Annotated[
+        float,
+        Setting(
+            "weight of the error of differences between frames, along the motion (clips of whole frames: --tile 0)"
+        ),
+    ] = 0.0
+    slope: Annotated[
+        float, Setting("λ of the asymmetric loss, for clean targets: more than 1 leaves noise before detail")
+    ] = 1.0
+    seed: Annotated[int, Setting("seed of initial weights and samples")] = 0
+    workers: Annotated[int, Setting("processes that read clips; 0: the training itself")] = 0
+    float32: Annotated[bool, Setting("compute convolutions in float32 where the device has bfloat16 too")] = False
+    compile: Annotated[bool, Setting("compile the network: a minute at the start, pays on a GPU")] = False
+    validate_minutes: Annotated[float, Setting("minutes between validations, and between checkpoints")] = 5.0
+    device: str = "auto"
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
     def __post_init__(self) -> None:
@@ -64,15 +92,16 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
-        if not 0 <= self.trunk_rate <= 1:
-            raise ValueError(f"trunk_rate: expected 0 to 1, got {self.trunk_rate}")
+        if not 0 <= self.backbone_rate <= 1:
+            raise ValueError(f"backbone_rate: expected 0 to 1, got {self.backbone_rate}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
         for name, choices in (("loss", LOSSES), ("terms", TERMS), ("device", DEVICES)):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
+            value = getattr(self, name)
+            if value not in choices and not (name == "terms" and value is None):
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
         if (self.loss == "perceptual") != (self.vgg is not None):
             raise ValueError("vgg: expected weights with the perceptual loss, and only with it")
-        for name, least in (("whole", 0), ("differences", 0), ("slope", 1)):
+        for name, least in (("whole", 0), ("differences", 0), ("slope", 1), ("workers", 0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")

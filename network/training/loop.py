@@ -1,7 +1,7 @@
 """Training of a network on clips: a plain loop, in one process or several.
 
 Several processes are those of ``torchrun``: each makes its share of every batch, gradients are averaged, and the first
-process validates and writes. Plain torch does it in a few lines, so no framework is asked for.
+process validates and writes. Plain torch does it in a few lines, so no framework is needed.
 
 Set ``OMP_WAIT_POLICY=PASSIVE`` in the environment (it is read when torch is imported): OpenMP's threads
 otherwise spin while they wait, and a step takes ten times as long on a machine that has other work.
@@ -27,49 +27,69 @@ from torch.utils.data import DataLoader
 
 from network.checkpoint import describe, new_partial, save_model
 from network.devices import find_device, has_bfloat16
-from network.models import Model, centre_of, channels_last, filter_window
+from network.paper.inputs import KernelWindow
 from network.paper.kernels import Filtered, mean_of
-from network.robust_unet import MIRRORED, Picture, RobustUNet
+from network.paper.models import filter_window
+from network.presets import Model
+from network.robust_unet import MIRRORED, RobustUNet, UNetOutput, channels_last, denoise_window
 from network.training import losses
-from network.training.clips import Clips, Samples, whole_frames
+from network.training.clips import Clips, Sample, Samples, whole_frames
 from network.training.config import TrainConfig
 from network.training.perceptual import Perceptual, load_vgg19
+from network.windows import UNetWindow
 
 
 def predict(
-    model: Model, batch: dict[str, Tensor], bfloat16: bool = False, run: Callable[..., Any] | None = None
-) -> Filtered | Picture:
-    """Filter a batch.
+    model: Model, batch: Sample, bfloat16: bool = False, run: Callable[..., Any] | None = None
+) -> Filtered | UNetOutput:
+    """Run a model on a batch.
 
     Parameters
     ----------
     model : Model
         Any.
-    batch : dict of Tensor
-        As from `network.training.clips.Samples`, with N in front.
+    batch : Sample
+        With N in front.
     bfloat16 : bool
         Whether the convolutions run in bfloat16.
     run : callable, optional
-        Stands for the model where it is wrapped.
+        Called instead of the model, where it is wrapped (distributed, compiled).
 
     Returns
     -------
-    Filtered or Picture
-        The sums of each frame, or the picture.
+    Filtered or UNetOutput
+        Both have ``irradiance`` and ``parts()``.
     """
-    if isinstance(model, RobustUNet) and model.config.clean_guides:
-        batch = batch | {name: batch[f"clean_{name}"][:, None] for name in ("albedo", "normal")}
-    with torch.autocast(batch["color"].device.type, torch.bfloat16, enabled=bfloat16):
-        return filter_window(model, batch, run=run, borders=((MIRRORED, MIRRORED),) * 2)
+    with torch.autocast(batch.color.device.type, torch.bfloat16, enabled=bfloat16):
+        if not isinstance(model, RobustUNet):
+            window = KernelWindow(batch.color, batch.confidence, batch.exposure, batch.albedo, batch.normal)
+            return filter_window(model, window, run=run)
+        clean = model.config.clean_guides
+        inputs = UNetWindow(
+            batch.estimate,
+            batch.residual,
+            batch.confidence,
+            batch.modulation,
+            batch.exposure,
+            batch.gain,
+            batch.clean_albedo if clean else centre_of(batch.albedo),
+            batch.clean_normal if clean else centre_of(batch.normal),
+        )
+        return denoise_window(model, inputs, run, borders=((MIRRORED, MIRRORED),) * 2)
+
+
+def centre_of(layers: Tensor) -> Tensor:
+    """Centre frame of ``(N, T, C, H, W)``."""
+    return layers[:, layers.shape[1] // 2]
 
 
 def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
-    """Terms of the loss.
+    """Terms of the loss of a network that predicts kernels.
 
     Parameters
     ----------
     config : TrainConfig
-        Its `terms` says which.
+        Its terms, "temporal" by default, and the weight of the whole window.
     frames : int
         Length of the window.
 
@@ -77,13 +97,13 @@ def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
     -------
     list of Term
     """
-    if config.terms == "temporal":
+    if config.terms in (None, "temporal"):
         return losses.temporal_terms(frames, config.whole)
     return losses.power_terms(frames) if config.terms == "power" else losses.spatial_terms(frames)
 
 
 def image_loss(config: TrainConfig) -> losses.ImageLoss:
-    """Find the image loss by name; read VGG19 for the perceptual one."""
+    """The image loss of a training; reads VGG19 for the perceptual one."""
     if config.vgg is not None:
         return Perceptual(load_vgg19(config.vgg))
     return {"l1": losses.l1, "smape": losses.smape, "relmse": losses.relmse, "display": losses.display}[config.loss]
@@ -91,7 +111,7 @@ def image_loss(config: TrainConfig) -> losses.ImageLoss:
 
 def batch_loss(
     model: Model,
-    batch: dict[str, Tensor],
+    batch: Sample,
     config: TrainConfig,
     loss: losses.ImageLoss,
     run: Callable[..., Any] | None = None,
@@ -102,14 +122,14 @@ def batch_loss(
     ----------
     model : Model
         Any.
-    batch : dict of Tensor
-        As from `network.training.clips.Samples`, with N in front; of neighbours where their differences count.
+    batch : Sample
+        With N in front; of neighbours where their differences count.
     config : TrainConfig
         Terms, slope, differences and precision.
     loss : ImageLoss
         Of images.
     run : callable, optional
-        Stands for the model where it is wrapped.
+        As for `predict`.
 
     Returns
     -------
@@ -118,31 +138,30 @@ def batch_loss(
 
     Notes
     -----
-    What can still be gained differs by orders of magnitude between shots, and the targets' noise adds a floor. Each
-    crop's loss is divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the
-    centre's estimate), so that every clip counts about the same. Where clips are whole frames and a crop was divided by
-    its own input's loss, flat crops, in which averaging can do no harm, outweighed the edges, and the network averaged
-    where it should not. The logarithm is for the few crops that are twenty times worse than their clip: one of them
-    would undo what a hundred others have taught.
+    Possible gains differ by orders of magnitude between shots, and the targets' noise adds a floor. Each crop's loss is
+    divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the centre's first
+    pass), so that every clip counts about the same. Where clips are whole frames and a crop was divided by its own
+    input's loss, flat crops, in which averaging can do no harm, outweighed the edges, and the network averaged where it
+    should not. The logarithm is for the few crops that are twenty times worse than their clip: one of them would undo
+    the gradients of a hundred others.
     """
     if neighbours := config.differences > 0:
-        batch = {name: pair.flatten(0, 1) for name, pair in batch.items()}
-    filtered = predict(model, batch, config.bfloat16, run)
-    color, facts = batch["color"], (batch["target"], batch["modulation"], batch["exposure"])
-    if isinstance(filtered, Picture):
-        value = losses.picture_loss(loss, filtered.irradiance, centre_of(color), *facts, config.slope)
+        batch = Sample(*(pair.flatten(0, 1) for pair in batch))
+    output = predict(model, batch, not config.float32, run)
+    color, facts = batch.color, (batch.target, batch.modulation, batch.exposure)
+    if isinstance(output, UNetOutput):
+        value = losses.image_loss(loss, output.irradiance, centre_of(color), *facts, config.slope)
     else:
         terms = loss_terms(config, color.shape[1])
-        value = losses.temporal_loss(loss, filtered, color, *facts, terms, config.slope)
-    value = value / batch["error"]
+        value = losses.temporal_loss(loss, output, color, *facts, terms, config.slope)
+    value = value / batch.error
     if neighbours:
-        image = filtered.irradiance if isinstance(filtered, Picture) else filtered.image(centre_of(color))
         image, target, modulation, exposure, error = (
-            pair.unflatten(0, (-1, 2)) for pair in (image, *facts, batch["error"])
+            pair.unflatten(0, (-1, 2)) for pair in (output.irradiance, *facts, batch.error)
         )
         after = color.shape[1] // 2 + 1
-        trust = batch["confidence"][::2, min(after, color.shape[1] - 1)]
-        flicker = losses.difference_loss(loss, image, target, modulation, exposure, batch["to_next"][::2], trust)
+        trust = batch.confidence[::2, min(after, color.shape[1] - 1)]
+        flicker = losses.difference_loss(loss, image, target, modulation, exposure, batch.to_next[::2], trust)
         value = value.unflatten(0, (-1, 2)).mean(1) + config.differences * flicker / error.mean(1)
     return torch.log1p(value).mean()
 
@@ -161,28 +180,25 @@ def validate(model: Model, clips: Clips) -> dict[str, float]:
     Returns
     -------
     dict
-        PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's),
-        ``gated`` (their average) and ``denoised``. ``mean``: radiance of denoised over that of the targets. ``side``:
-        weight of the side frames.
+        PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's first
+        pass), ``gated`` (average of the first passes) and ``denoised``. ``mean``: radiance of denoised over that of the
+        targets. ``side``: weight of the side frames.
     """
     sums: dict[str, float] = {}
     device = next(model.parameters()).device
     batches = [batch for index in range(len(clips)) for batch in whole_frames(clips, index, model.multiple)]
     for batch in batches:
-        batch = {name: value.to(device) for name, value in batch.items()}
-        modulation, target = batch["modulation"], batch["target"]
-        estimate, confidence = batch["estimate"], batch["confidence"]
-        noisy = centre_of(batch["color"])
+        batch = Sample(*(value.to(device) for value in batch))
+        output, first_pass = predict(model, batch), centre_of(batch.estimate)
         images = {
-            "noisy": noisy,
-            "estimate": centre_of(estimate),
-            "gated": mean_of(estimate * confidence, confidence, centre_of(estimate)),
+            "noisy": centre_of(batch.color),
+            "estimate": first_pass,
+            "gated": mean_of(batch.estimate * batch.confidence, batch.confidence, first_pass),
+            "denoised": output.irradiance,
         }
-        filtered = predict(model, batch)
-        images["denoised"] = filtered.irradiance if isinstance(filtered, Picture) else filtered.image(noisy)
-        values = {name: float(losses.tone_mapped_psnr(image * modulation, target)) for name, image in images.items()}
-        values["mean"] = float((images["denoised"] * modulation).sum() / target.sum().clamp_min(1e-6))
-        values["side"] = 1 - float(centre_of(filtered.parts()[1]).mean())
+        values = {n: float(losses.tone_mapped_psnr(x * batch.modulation, batch.target)) for n, x in images.items()}
+        values["mean"] = float((output.irradiance * batch.modulation).sum() / batch.target.sum().clamp_min(1e-6))
+        values["side"] = 1 - float(centre_of(output.parts()[1]).mean())
         for name, value in values.items():
             sums[name] = sums.get(name, 0.0) + value / len(batches)
     return sums
@@ -198,7 +214,7 @@ def train(
     resume: bool = False,
     log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
 ) -> list[float]:
-    """Train a model and write its averaged weights.
+    """Train a model and write the moving average of its weights.
 
     Parameters
     ----------
@@ -207,16 +223,16 @@ def train(
     model : Model
         Trained in place from the weights it has.
     config : TrainConfig
-        How.
+        Settings.
     out : path
-        Safetensors file, written at each checkpoint and at the end; ``OUT.state`` beside it holds what resuming
-        needs and is removed at the end.
+        Safetensors file, written at each checkpoint and at the end; ``OUT.state`` beside it holds the state for
+        resuming and is removed at the end.
     resume : bool
-        Go on from ``OUT.state``, as if the training had not been interrupted.
+        Continue from ``OUT.state``, as if the training had not been interrupted.
     log : callable
-        Is given the steps done and, after every step, ``train/loss``, ``train/rate``, ``train/norm`` (of the gradient),
-        ``done`` (0 to 1) and ``seconds`` (since the start); after a validation its values, as ``validation/psnr`` and
-        so on. Only in the first process.
+        Called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
+        ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with
+        its values, as ``validation/psnr`` and so on.
 
     Returns
     -------
@@ -226,8 +242,8 @@ def train(
     Raises
     ------
     ValueError
-        If the state to resume is cut short or of another training, the batch cannot be shared evenly, or the crops do
-        not fit the model.
+        If the state to resume is cut short or of another training, the batch cannot be shared evenly, or crops or terms
+        do not fit the model.
     FileNotFoundError
         If there is no state to resume.
 
@@ -243,15 +259,17 @@ def train(
         raise ValueError(
             f"crop: expected a multiple of {model.multiple}, as this model needs, got {config.sampler.crop}"
         )
+    if config.terms is not None and isinstance(model, RobustUNet):
+        raise ValueError(f"terms: expected none, as this model predicts no kernels, got {config.terms!r}")
     device = _device(config.device)
     state_path = Path(f"{os.fspath(out)}.state")
     channels_last(model.to(device).train())
     average = copy.deepcopy(model).requires_grad_(False)
-    groups = _groups(model, config.trunk_rate)
+    groups = _groups(model, config.backbone_rate)
     optimizer = torch.optim.AdamW(groups, lr=config.rate, weight_decay=config.weight_decay)
     identity = json.dumps({"model": describe(model), "training": _identity(config)}, sort_keys=True)
     # Where a processor has no bfloat16, torch computes it in loops that take ten times as long as float32.
-    config = replace(config, bfloat16=config.bfloat16 and has_bfloat16(device))
+    config = replace(config, float32=config.float32 or not has_bfloat16(device))
     step, before = 0, 0.0
     history: list[dict[str, float]] = []
     if resume:
@@ -270,14 +288,21 @@ def train(
     samples = Samples(training, config.sampler, config.seed, loss_of_image, neighbours=config.differences > 0)
     batches = _batches(samples, config, step, rank, world)
 
+    def validate_average() -> None:
+        history.append({"step": step, **validate(average, validation)})
+        log(step, {f"validation/{name}": value for name, value in history[-1].items() if name != "step"})
+
+    def write_weights() -> None:
+        save_model(out, average, {"training": asdict(config), "validation": history})
+
     start = time.monotonic() - before
-    checkpointed = validated = before
+    checkpointed = before
     values: list[float] = []
     while (done := _done(config, step, _agreed(time.monotonic() - start, device))) < 1:
         rate = config.rate * _rate(config, step, done)
         for group, part in zip(optimizer.param_groups, groups, strict=True):
             group["lr"] = rate * part["share"]
-        batch = {name: value.to(device, non_blocking=True) for name, value in next(batches).items()}
+        batch = Sample(*(value.to(device, non_blocking=True) for value in next(batches)))
         loss = batch_loss(model, batch, config, loss_of_image, run)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -292,33 +317,30 @@ def train(
         now = time.monotonic() - start
         done = _done(config, step, now)
         log(step, {"train/loss": values[-1], "train/rate": rate, "train/norm": norm, "done": done, "seconds": now})
-        if len(validation) and now - validated > 60 * config.validate_minutes:
-            history.append({"step": step, **validate(average, validation)})
-            log(step, {f"validation/{name}": value for name, value in history[-1].items() if name != "step"})
-            validated = time.monotonic() - start
-        if now - checkpointed > 60 * config.checkpoint_minutes:
-            _write(out, average, config, history)
+        if now - checkpointed > 60 * config.validate_minutes:
+            if len(validation):
+                validate_average()
+            write_weights()
             progress = {"step": step, "seconds": now, "history": history}
             _write_state(state_path, identity, model, average, optimizer, progress)
-            checkpointed = now
+            checkpointed = time.monotonic() - start
     if rank == 0:
         if len(validation):
-            history.append({"step": step, **validate(average, validation)})
-            log(step, {f"validation/{name}": value for name, value in history[-1].items() if name != "step"})
-        _write(out, average, config, history)
+            validate_average()
+        write_weights()
         state_path.unlink(missing_ok=True)
     return values
 
 
-def _groups(model: Model, trunk_rate: float) -> list[dict[str, Any]]:
-    """Parameters with their share of the rate: a trunk that knows how to denoise is to forget nothing of it."""
+def _groups(model: Model, backbone_rate: float) -> list[dict[str, Any]]:
+    """Parameters with their share of the rate: a pretrained backbone should forget nothing."""
     if not isinstance(model, RobustUNet):
         return [{"params": list(model.parameters()), "share": 1.0}]
-    new = [value for name, value in model.named_parameters() if not name.startswith("trunk.")]
-    # What stands still is not followed by a gradient.
-    model.trunk.requires_grad_(trunk_rate > 0)
-    old = {"params": list(model.trunk.parameters()), "share": trunk_rate}
-    return [{"params": new, "share": 1.0}, *([old] if trunk_rate else [])]
+    new = [value for name, value in model.named_parameters() if not name.startswith("backbone.")]
+    # Frozen parameters need no gradient.
+    model.backbone.requires_grad_(backbone_rate > 0)
+    pretrained = {"params": list(model.backbone.parameters()), "share": backbone_rate}
+    return [{"params": new, "share": 1.0}, *([pretrained] if backbone_rate else [])]
 
 
 def _in_group() -> bool:
@@ -327,16 +349,16 @@ def _in_group() -> bool:
 
 
 def _device(name: str) -> torch.device:
-    """Where to train; in a group each process has a GPU of its own."""
+    """Device to train on; in a group each process has a GPU of its own."""
     _, device = find_device(name)
     return device if device.type == "cpu" else torch.device(device.type, int(os.environ.get("LOCAL_RANK", 0)))
 
 
-def _batches(samples: Samples, config: TrainConfig, first: int, rank: int, world: int) -> Iterator[dict[str, Tensor]]:
-    """Batches from step `first` on, without end: of each the share of this process."""
+def _batches(samples: Samples, config: TrainConfig, first: int, rank: int, world: int) -> Iterator[Sample]:
+    """Endless batches from step `first` on: of each the share of this process."""
     share = config.batch // world
     numbers = ([step * config.batch + rank * share + k for k in range(share)] for step in itertools.count(first))
-    loader: DataLoader[dict[str, Tensor]] = DataLoader(
+    loader: DataLoader[Sample] = DataLoader(
         samples, batch_sampler=cast(Any, numbers), num_workers=config.workers, pin_memory=torch.cuda.is_available()
     )
     return iter(loader)
@@ -352,7 +374,7 @@ def _agreed(seconds: float, device: torch.device) -> float:
 
 
 def _done(config: TrainConfig, step: int, seconds: float) -> float:
-    """Part of the training that is done, by the limit that is nearer."""
+    """Finished share of the training, by the nearer limit."""
     by_step = step / config.steps if config.steps else 0.0
     by_time = seconds / (60 * config.minutes) if config.minutes else 0.0
     return max(by_step, by_time)
@@ -370,16 +392,11 @@ def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 
 def _identity(config: TrainConfig) -> dict[str, Any]:
-    """The configuration less what may change between an interruption and its resumption."""
+    """The configuration without settings that may change between an interruption and its resumption."""
     values = asdict(config)
-    for name in ("checkpoint_minutes", "validate_minutes", "workers"):
+    for name in ("validate_minutes", "workers"):
         del values[name]
     return values
-
-
-def _write(out: str | os.PathLike[str], average: Model, config: TrainConfig, history: list[Any]) -> None:
-    """The weights to keep, with where they come from."""
-    save_model(out, average, {"training": asdict(config), "validation": history})
 
 
 def _write_state(
@@ -410,7 +427,7 @@ def _read_state(path: Path, identity: str) -> dict[str, Any]:
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         found = state["identity"]
-    except Exception as error:  # torch has no one class for what may be wrong with a file
+    except Exception as error:  # torch raises errors of many classes for bad files
         raise ValueError(f"resume {os.fspath(path)!r}: no training state, or cut short ({error})") from error
     if found != identity:
         raise ValueError(f"resume {os.fspath(path)!r}: expected the same model and configuration, got another")

@@ -1,15 +1,11 @@
 """Image losses, and their conversion from space to time.
 
-An image loss takes prediction and target, ``(N, C, H, W)`` radiance, the scale of the radiance, ``(N,)``, and optional
-weights of the errors, and returns one value per sample, ``(N,)``. All are scale invariant:
-``loss(a·x, a·y, a·s) = loss(x, y, s)``. The perceptual one is in `network.training.perceptual`.
-
-What they do to the mean when the targets are noisy (Lehtinen et al. 2018): a squared error is least at the mean
-of the targets, so `relmse`, whose weights depend on the prediction alone and carry no gradient, is unbiased.
-`l1` is least at the median, and Monte Carlo noise is skewed, with its median below its mean: it darkens.
-`smape` is an L1 error with a weight that depends on the target too and darkens as well, where the noise is
-strong. `relmse` with a limit on outliers stays between the two: it only darkens by what is beyond the limit.
-``docs/experiments.md`` has measurements on renders.
+Image losses are scale invariant: ``loss(a·x, a·y, a·s) = loss(x, y, s)``. With noisy targets (Lehtinen et al. 2018)
+they differ in the mean: a squared error is least at the mean of the targets, so `relmse`, whose weights depend on the
+prediction alone and carry no gradient, is unbiased. `l1` is least at the median, and Monte Carlo noise is skewed, with
+its median below its mean: it darkens. `smape` is an L1 error with a weight that depends on the target too and darkens
+as well, where the noise is strong. `relmse` with a limit on outliers stays between the two: it only darkens by the
+light beyond the limit.
 """
 
 from __future__ import annotations
@@ -23,19 +19,19 @@ from torch.nn import functional
 
 from network.paper.kernels import Filtered
 
-#: Frames of a window, and the weight of the loss of the image they give together.
+#: Frames of a window, and the weight of the loss of their image.
 Term = tuple[tuple[int, ...], float]
 
 #: Weight of the fallback in the image of a subset of frames. The kernels sum to 1 over all frames; a subset to
 #: which they give less than this is mostly its own unfiltered pixels, and dividing by its share stays harmless.
 SUBSET_EPSILON = 1e-3
 
-#: Floor of the denominator of `relmse`, in squared scales: what is darker than a third of the scale counts as that.
+#: Floor of the denominator of `relmse`, in squared scales: pixels darker than a third of the scale count as that.
 RELMSE_FLOOR = 0.1
 
 
 class ImageLoss(Protocol):
-    """An image loss: ``(N, C, H, W)`` prediction and target, ``(N,)`` scale, weights of the errors, to ``(N,)``."""
+    """An image loss, ``(N,)``, of ``(N, C, H, W)`` radiance, ``(N,)`` scale of the radiance, and weights of errors."""
 
     def __call__(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor: ...
 
@@ -45,41 +41,19 @@ def l1(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None 
 
     Parameters
     ----------
-    prediction, target : Tensor
-        ``(N, C, H, W)`` radiance.
-    scale : Tensor
-        ``(N,)`` of the radiance.
-    weight : Tensor, optional
-        ``(N, C, H, W)`` factors of the errors.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
+    prediction, target, scale, weight : Tensor
+        As for `ImageLoss`.
     """
     return _mean((prediction - target).abs(), weight) / scale
 
 
 def smape(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2.
+    """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2, where "dark" starts.
 
     Parameters
     ----------
-    prediction, target : Tensor
-        ``(N, C, H, W)`` radiance.
-    scale : Tensor
-        ``(N,)`` of the radiance.
-    weight : Tensor, optional
-        ``(N, C, H, W)`` factors of the errors.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
-
-    Notes
-    -----
-    Darkens with noisy targets, see the module. ε is where "dark" starts, relative to the scale of the image.
+    prediction, target, scale, weight : Tensor
+        As for `ImageLoss`.
 
     References
     ----------
@@ -91,36 +65,23 @@ def smape(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | No
 
 
 def relmse(
-    prediction: Tensor,
-    target: Tensor,
-    scale: Tensor,
-    weight: Tensor | None = None,
-    limit: float = 4.0,
+    prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None, limit: float = 4.0
 ) -> Tensor:
     """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``, ε = 0.1.
 
     Parameters
     ----------
-    prediction, target : Tensor
-        ``(N, C, H, W)`` radiance.
-    scale : Tensor
-        ``(N,)`` of the radiance.
-    weight : Tensor, optional
-        ``(N, C, H, W)`` factors of the errors.
+    prediction, target, scale, weight : Tensor
+        As for `ImageLoss`.
     limit : float
-        Relative error beyond which the square goes on as a straight line (Huber), so that one firefly in a
+        Relative error beyond which the square continues as a straight line (Huber), so that one firefly in a
         target is not the whole gradient. ``inf`` for the pure, unbiased square.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
 
     Notes
     -----
     ``d̄`` is the mean of the prediction over the channels, without gradient: dividing by each channel would let
-    dark channels of saturated colors rule. Pixels darker than ``sqrt(ε) s``, a third of the scale, count by absolute
-    error.
+    dark channels of saturated colors dominate. Pixels darker than ``sqrt(ε) s``, a third of the scale, count by
+    absolute error.
 
     References
     ----------
@@ -132,37 +93,23 @@ def relmse(
 
 
 def display(
-    prediction: Tensor,
-    target: Tensor,
-    scale: Tensor,
-    weight: Tensor | None = None,
-    limit: float = 0.5,
+    prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None, limit: float = 0.5
 ) -> Tensor:
-    """Squared error of what is seen, ``T(x) = x / (x + s)``, to first order: ``mean (T'(d) (d − r))²``.
+    """Squared error on the display curve ``T(x) = x / (x + s)``, to first order: ``mean (T'(d) (d − r))²``.
 
     Parameters
     ----------
-    prediction, target : Tensor
-        ``(N, C, H, W)`` radiance.
-    scale : Tensor
-        ``(N,)`` of the radiance.
-    weight : Tensor, optional
-        ``(N, C, H, W)`` factors of the errors.
+    prediction, target, scale, weight : Tensor
+        As for `ImageLoss`.
     limit : float
-        Error, of the range of T, beyond which the square goes on as a straight line, as of `relmse`.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
+        Error, of the range of T, beyond which the square continues as a straight line, as of `relmse`.
 
     Notes
     -----
-    About the square of `tone_mapped_psnr` at the exposure of the picture. Its weights, ``T'(d) = s / (d + s)²``, are of
-    the prediction and carry no gradient, so that the noise of targets, which would darken a difference of T, leaves
-    the mean alone but for what is beyond the limit. Towards references it is better than `relmse`, which counts dark
-    pixels by what they are relative to themselves: a network trained so averaged more over time than the eye, or PSNR,
-    would have it.
+    About the square of `tone_mapped_psnr` at the exposure of the image. Its weights, ``T'(d) = s / (d + s)²``, depend
+    on the prediction and carry no gradient, so that the noise of targets, which would darken a difference of T, leaves
+    the mean alone but for light beyond the limit. Towards references it is better than `relmse`, which weighs dark
+    pixels relative to themselves: a network trained so averaged more over time than the eye, or PSNR, would have it.
     """
     level = scale.view(-1, 1, 1, 1)
     slope = level / (functional.relu(prediction.detach()) + level).square()
@@ -170,40 +117,18 @@ def display(
 
 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
-    """Pairs of one frame before the centre and one after: first + fourth and second + fifth of five.
-
-    Parameters
-    ----------
-    frames : int
-        Length of the window, odd: 2k + 1.
-
-    Returns
-    -------
-    list of (int, int)
-        ``(i, i + k + 1)``, i < k: each side frame occurs once.
-    """
+    """Pairs of a frame before the centre and one after, ``(i, i + k + 1)`` of 2k + 1: 1st + 4th, 2nd + 5th of five."""
     half = frames // 2
     return [(i, i + half + 1) for i in range(half)]
 
 
 def spatial_terms(frames: int) -> list[Term]:
-    """One term, the whole window: how Vogels et al. 2018 train, and what a spatial loss says to a temporal network.
-
-    Parameters
-    ----------
-    frames : int
-        Length of the window.
-
-    Returns
-    -------
-    list of Term
-        One.
-    """
+    """One term, the whole window, as Vogels et al. 2018 train: the spatial loss of a temporal network."""
     return [(tuple(range(frames)), 1.0)]
 
 
 def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
-    """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with a weight of its own.
+    """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with its own weight.
 
     Parameters
     ----------
@@ -230,18 +155,7 @@ def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
 
 
 def power_terms(frames: int) -> list[Term]:
-    """The paper's equation in full: every subset of the window but the empty one; 7 for three frames, 31 for five.
-
-    Parameters
-    ----------
-    frames : int
-        Length of the window.
-
-    Returns
-    -------
-    list of Term
-        Of equal weight.
-    """
+    """The paper's equation in full: every subset of the window but the empty one, of equal weight; 31 for five."""
     sizes = range(1, frames + 1)
     return [(subset, 1.0) for size in sizes for subset in combinations(range(frames), size)]
 
@@ -254,8 +168,8 @@ def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -
     prediction, target, noisy : Tensor
         d, r and c, ``(N, C, H, W)`` radiance; c is the noisy centre.
     slope : float
-        λ ≥ 1. With more of it the network would rather leave noise than lose detail. Meant for clean targets: where
-        the target's noise is independent of the input's, it decides on which side the prediction is.
+        λ ≥ 1. The greater, the more the network prefers noise to lost detail. For clean targets: where the target's
+        noise is independent of the input's, that noise decides on which side the prediction is.
 
     Returns
     -------
@@ -289,7 +203,7 @@ def temporal_loss(
     filtered : Filtered
         The window after its kernels.
     color : Tensor
-        ``(N, T, C, H, W)`` aligned irradiance: what a subset to which the kernels give no weight falls back to.
+        ``(N, T, C, H, W)`` aligned irradiance: the fallback of a subset to which the kernels give no weight.
     target : Tensor
         ``(N, C, H, W)`` radiance of the centre.
     modulation : Tensor
@@ -308,25 +222,22 @@ def temporal_loss(
 
     Notes
     -----
-    A subset's image is the mean of its taps: the kernels of the other frames are zeroed and the rest renormalised. An
-    estimate of a frame belongs to every term with that frame.
+    A subset's image is the mean of its taps: the kernels of the other frames are zeroed and the rest renormalised.
 
     References
     ----------
     Kalojanov and Thurston 2023, section 5, equation 5.
     """
     centre = color.shape[1] // 2
-    radiance = _scale_of_radiance(scale, modulation)
     total = torch.zeros_like(scale)
     for subset, weight in terms:
         fallback = color[:, centre] if centre in subset else color[:, list(subset)].mean(1)
-        image = filtered.image(fallback, subset, SUBSET_EPSILON) * modulation
-        sides = None if slope == 1 else asymmetry(image, target, color[:, centre] * modulation, slope)
-        total = total + weight * loss(image, target, radiance, sides)
+        image = filtered.image(fallback, subset, SUBSET_EPSILON)
+        total = total + weight * image_loss(loss, image, color[:, centre], target, modulation, scale, slope)
     return total / sum(weight for _, weight in terms)
 
 
-def picture_loss(
+def image_loss(
     loss: ImageLoss,
     image: Tensor,
     noisy: Tensor,
@@ -335,16 +246,16 @@ def picture_loss(
     scale: Tensor,
     slope: float = 1.0,
 ) -> Tensor:
-    """Loss of one picture of the whole window, for a network whose pictures are no sums of its frames.
+    """Loss of the radiance of one image; all there is for a network whose images are no sums of its frames.
 
-    Parts of the window are for such a network other windows: those whose frames `SamplerConfig.drop_frames` takes away.
+    Instead of parts of the window such a network gets windows of which `SamplerConfig.drop_frames` drops frames.
 
     Parameters
     ----------
     loss : ImageLoss
         Image loss.
     image, noisy : Tensor
-        ``(N, C, H, W)`` irradiance.
+        ``(N, C, H, W)`` irradiance, of the prediction and of the noisy centre.
     target, modulation, scale, slope : Tensor and float
         As for `temporal_loss`.
 
@@ -353,8 +264,9 @@ def picture_loss(
     Tensor
         ``(N,)``.
     """
-    sides = None if slope == 1 else asymmetry(image * modulation, target, noisy * modulation, slope)
-    return loss(image * modulation, target, _scale_of_radiance(scale, modulation), sides)
+    radiance = image * modulation
+    weights = None if slope == 1 else asymmetry(radiance, target, noisy * modulation, slope)
+    return loss(radiance, target, scale_of_radiance(scale, modulation), weights)
 
 
 def difference_loss(
@@ -366,7 +278,7 @@ def difference_loss(
     to_next: Tensor,
     trust: Tensor,
 ) -> Tensor:
-    """Loss of what changes between two successive pictures and does not between their targets: of what flickers.
+    """Loss of flicker: of changes between two successive images that their targets do not have.
 
     Parameters
     ----------
@@ -379,9 +291,9 @@ def difference_loss(
     scale : Tensor
         ``(N, 2)`` exposure of the irradiance.
     to_next : Tensor
-        ``(N, 2, H, W)``, pixels: from each pixel of the first to where it is in the second.
+        ``(N, 2, H, W)``, pixels: from each pixel of the first to its place in the second.
     trust : Tensor
-        ``(N, 1, H, W)`` in [0, 1]: how far that is the same light.
+        ``(N, 1, H, W)`` in [0, 1]: confidence that both are the same light.
 
     Returns
     -------
@@ -391,20 +303,20 @@ def difference_loss(
     Notes
     -----
     With ``e_i = d_i − r_i`` and W the warp along the motion it is ``loss(d_1, r_1 + W e_2)``, weighted by trust, and by
-    0 where the motion leaves the crop: the error of the motion-compensated difference of the pictures, which is what
+    0 where the motion leaves the crop: the error of the motion-compensated difference of the images, which is what
     temporal PSNR measures. Independent noise in the targets adds to it and does not move where it is least.
     """
     error = (images[:, 1] * modulation[:, 1]) - targets[:, 1]
     height, width = to_next.shape[-2:]
     rows, columns = (torch.arange(size, device=to_next.device, dtype=to_next.dtype) for size in (height, width))
     at_x, at_y = to_next[:, 0] + columns, to_next[:, 1] + rows[:, None]
-    # grid_sample wants −1 and 1 at the outer edges of the outer pixels.
+    # grid_sample has −1 and 1 at the outer edges of the outer pixels.
     grid = torch.stack([(2 * at_x + 1) / width - 1, (2 * at_y + 1) / height - 1], -1)
-    moved = functional.grid_sample(error, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    warped = functional.grid_sample(error, grid, mode="bilinear", padding_mode="border", align_corners=False)
     inside = (at_x >= 0) & (at_x <= width - 1) & (at_y >= 0) & (at_y <= height - 1)
-    seen = (trust * inside[:, None]).expand_as(error)
-    radiance = _scale_of_radiance(scale[:, 0], modulation[:, 0])
-    return loss(images[:, 0] * modulation[:, 0], targets[:, 0] + moved, radiance, seen)
+    weight = (trust * inside[:, None]).expand_as(error)
+    radiance = scale_of_radiance(scale[:, 0], modulation[:, 0])
+    return loss(images[:, 0] * modulation[:, 0], targets[:, 0] + warped, radiance, weight)
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
@@ -425,6 +337,19 @@ def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
     return -10 * torch.log10(error.square().mean((1, 2, 3)).clamp_min(1e-12))
 
 
+def scale_of_radiance(scale: Tensor, modulation: Tensor) -> Tensor:
+    """Scale of the radiance of windows; a black modulation (no albedo anywhere) would make it 0.
+
+    Parameters
+    ----------
+    scale : Tensor
+        ``(N,)`` of the irradiance.
+    modulation : Tensor
+        ``(N, C, H, W)``.
+    """
+    return scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
+
+
 def _bent_square(errors: Tensor, limit: float) -> Tensor:
     """Quadratic inside the limit, tangent outside (Huber)."""
     # The minimum keeps an infinite limit from making inf − inf.
@@ -436,8 +361,3 @@ def _bent_square(errors: Tensor, limit: float) -> Tensor:
 def _mean(errors: Tensor, weight: Tensor | None) -> Tensor:
     """Mean per sample of errors, weighted where there are weights."""
     return (errors if weight is None else errors * weight).mean((1, 2, 3))
-
-
-def _scale_of_radiance(scale: Tensor, modulation: Tensor) -> Tensor:
-    """From that of the irradiance; a black modulation (no albedo anywhere) would make it 0."""
-    return scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)

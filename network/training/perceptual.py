@@ -12,17 +12,17 @@ from torch import Tensor, nn
 
 from network.training.losses import smape
 
-#: Convolutions of VGG19 by block (configuration E of the paper below), each followed by a ReLU, each block but the
-#: last used by a maximum over 2×2. Up to the last convolution; what follows is for classification.
+#: Convolutions of VGG19 by block (configuration E of Simonyan and Zisserman), each followed by a ReLU, each block but
+#: the last by a maximum over 2×2. Up to the last convolution; the layers for classification are left out.
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512, 512, 512, 512), (512, 512, 512, 512))
 #: Where torch hub keeps the weights that torchvision publishes, trained on ImageNet.
 HUB_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
-#: Mean and standard deviation of the ImageNet pictures those weights have seen, in [0, 1].
+#: Mean and standard deviation of the ImageNet images of that training, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGG19(nn.Module):
-    """Trunk of VGG19: pictures to the features of two layers. Parameters are named as torchvision names them.
+    """Convolutions of VGG19: images to the features of two layers. Parameters have torchvision's names.
 
     References
     ----------
@@ -35,72 +35,45 @@ class VGG19(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        before, after_block = 3, []
+        before, block_ends = 3, []
         for block in BLOCKS:
             if layers:
                 layers.append(nn.MaxPool2d(2))
             for width in block:
                 layers += [nn.Conv2d(before, width, 3, padding=1), nn.ReLU()]
                 before = width
-            after_block.append(len(layers))
+            block_ends.append(len(layers))
         self.features = nn.Sequential(*layers)
-        self.after_third = after_block[2]
+        self.third_block_end = block_ends[2]
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of pictures.
-
-        Parameters
-        ----------
-        picture : Tensor
-            ``(N, 3, H, W)`` in [0, 1], 16 pixels or more.
-
-        Returns
-        -------
-        tuple of Tensor
-            Layer 4 of block 3 and of block 5, both after the ReLU.
-        """
-        x = self.features[: self.after_third]((picture - self.mean) / self.std)
-        return x, self.features[self.after_third :](x)
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Layer 4 of block 3 and of block 5, both after the ReLU, of ``(N, 3, H, W)`` in [0, 1], 16 pixels or more."""
+        x = self.features[: self.third_block_end]((image - self.mean) / self.std)
+        return x, self.features[self.third_block_end :](x)
 
 
 def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
-    """Read the weights of VGG19 in torchvision's format.
+    """Load the weights of VGG19 in torchvision's format, without gradients.
 
-    Parameters
-    ----------
-    source : path or "hub"
-        A state dict (.pth, read without unpickling anything but tensors, or .safetensors); "hub" downloads
-        torchvision's, 550 MB, once, and keeps it where torch hub keeps such files.
-
-    Returns
-    -------
-    VGG19
-        Without gradients.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no state dict, or not one of VGG19.
+    The source is a state dict (.pth, read without unpickling anything but tensors, or .safetensors), or "hub", which
+    downloads torchvision's, 550 MB, once, to where torch hub keeps such files. Raises FileNotFoundError if there is no
+    such file, and ValueError if it is no state dict of VGG19.
     """
     where = f"vgg {os.fspath(source)!r}"
+    if source != "hub" and not Path(source).is_file():
+        raise FileNotFoundError(f"{where}: no such file")
     try:
         if source == "hub":
             state = torch.hub.load_state_dict_from_url(HUB_URL, map_location="cpu", weights_only=True)
-        elif not Path(source).is_file():
-            raise FileNotFoundError(f"{where}: no such file")
         elif Path(source).suffix == ".safetensors":
             state = load_file(source)
         else:
             state = torch.load(source, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise
     except SafetensorError as error:
         raise ValueError(f"{where}: no safetensors file, or cut short ({error})") from error
-    except Exception as error:  # torch has no one class for what may be wrong with a file
+    except Exception as error:  # torch raises errors of many classes for bad files
         raise ValueError(f"{where}: no state dict, or cut short ({error})") from error
     model = VGG19()
     for name, value in model.state_dict().items():
@@ -115,18 +88,13 @@ def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
 
 
 class Perceptual(nn.Module):
-    """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; an `network.training.losses.ImageLoss`.
-
-    Parameters
-    ----------
-    vgg : VGG19
-        From `load_vgg19`.
+    """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; a `network.training.losses.ImageLoss`.
 
     Notes
     -----
-    VGG19 knows pictures in [0, 1]; radiance is shown to it on ``y = x / (1 + x)`` of the radiance over its scale, not
+    VGG19 takes images in [0, 1]: radiance is mapped by ``y = x / (1 + x)`` of the radiance over its scale, not
     negative. The sum and the product keep the magnitudes of the terms apart, as in the paper. Weights act on SMAPE, the
-    one factor that is made of pixels.
+    one factor that is computed from pixels.
 
     References
     ----------
@@ -138,22 +106,7 @@ class Perceptual(nn.Module):
         self.vgg = vgg
 
     def forward(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-        """The loss; see the class.
-
-        Parameters
-        ----------
-        prediction, target : Tensor
-            ``(N, C, H, W)`` radiance.
-        scale : Tensor
-            ``(N,)`` of the radiance.
-        weight : Tensor, optional
-            ``(N, C, H, W)`` factors of the errors.
-
-        Returns
-        -------
-        Tensor
-            ``(N,)``.
-        """
+        """``(N,)`` losses; see `network.training.losses.ImageLoss`."""
         images = torch.cat([prediction, target]).relu() / torch.cat([scale, scale]).view(-1, 1, 1, 1)
         distance = torch.zeros_like(scale)
         for features in self.vgg(images / (1 + images)):

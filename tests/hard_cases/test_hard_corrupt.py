@@ -69,10 +69,10 @@ def test_the_picture_is_finite_and_in_range(layer, value, record_property):
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
 def test_the_network_is_finite(value, precision, record_property):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    denoiser = Denoiser(shipped_weights("fast"), precision=precision)
+    denoiser = open_network(shipped_weights("fast"), precision=precision)
     frames = with_variance()
     for place in PLACES.values():
         for which in WHICH.values():

@@ -396,11 +396,11 @@ def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
 @pytest.mark.parametrize("rows", [64, 192])
 def test_the_network_in_parts_is_the_network(tall, rows):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
     shot, number = open_shot(tall), TALL.first + 2
-    denoiser = Denoiser(shipped_weights("fast"), precision="float32")
+    denoiser = open_network(shipped_weights("fast"), precision="float32")
     stages = {"demodulate", "outliers", "warp"}
     whole = denoiser(
         FrameStream(shot, only(stages), first_pass=Classical(CLASSICAL_PRESETS["draft"])).align(number)

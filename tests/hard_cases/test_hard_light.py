@@ -28,10 +28,10 @@ SCALES = [1e-6, 1e-3, 1e3, 1e6]
 @pytest.fixture(scope="module")
 def network():
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    return {p: Denoiser(shipped_weights("fast"), precision=p) for p in ("float32", "bfloat16")}
+    return {p: open_network(shipped_weights("fast"), precision=p) for p in ("float32", "bfloat16")}
 
 
 @pytest.mark.parametrize("preset", CLASSICAL_PRESETS)

@@ -5,8 +5,8 @@ import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
 from hybrid.first_pass import PerFrame
+from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
-from hybrid.stream import plan_shot
 from tests.flow.scenes import plain
 from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 
@@ -40,10 +40,10 @@ def test_any_size_works(size, record_property):
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_the_network_takes_any_size(size):
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy(size), first_pass=PerFrame(itself))).color
+    image = open_network(shipped_weights("fast"))(align(noisy(size), first_pass=PerFrame(itself))).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
 
@@ -67,10 +67,11 @@ def test_more_than_32767_pixels_on_a_side(size):
 @pytest.mark.neural
 def test_more_than_32767_pixels_through_the_network():
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    image = Denoiser(shipped_weights("fast"))(align(noisy((3, 33_000), 3), number=1, first_pass=PerFrame(itself))).color
+    window = align(noisy((3, 33_000), 3), number=1, first_pass=PerFrame(itself))
+    image = open_network(shipped_weights("fast"))(window).color
     assert image.shape == (3, 33_000, 3)
     assert np.isfinite(image).all()
 
@@ -89,14 +90,14 @@ def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
     The picture is wider than a tile with its halo, so that tiles lack what is beyond.
     """
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
     height, width = 40, 448
     window = align(noisy((height, width)), first_pass=PerFrame(itself))
 
     def denoiser(tile):
-        return Denoiser(shipped_weights("fast"), tile=tile, precision=precision)
+        return open_network(shipped_weights("fast"), tile=tile, precision=precision)
 
     whole = denoiser(width)(window).color
     for tile in (32, 64, 100):

@@ -24,7 +24,7 @@ from network.checkpoint import (  # noqa: E402
     save_model,
     shipped_weights,
 )
-from network.models import fast, paper, unet  # noqa: E402
+from network.presets import build_preset  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -32,13 +32,13 @@ pytestmark = pytest.mark.neural
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "good.safetensors"
-    save_model(path, fast())
+    save_model(path, build_preset("fast"))
     return path.read_bytes()
 
 
 def write(path, model=None, **metadata):
     """A file with the tensors of a model and any metadata; None leaves an entry out."""
-    model = model or fast()
+    model = model or build_preset("fast")
     entries = {
         "format": "ravg-network",
         "version": str(VERSION),
@@ -109,7 +109,7 @@ def test_pickles_are_not_opened(tmp_path):
         ({"description": "null"}, "description"),
         ({"description": "[" * 100_000}, "recursion|Expecting|nest"),
         ({"description": json.dumps({"model": "os.system", "config": {}})}, "description"),
-        ({"description": json.dumps(describe(paper()))}, "expected shape"),
+        ({"description": json.dumps(describe(build_preset("paper")))}, "expected shape"),
     ],
     ids=str,
 )
@@ -138,7 +138,7 @@ def test_wrong_metadata_is_named(tmp_path, metadata, word):
 )
 def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
     """A width of 2^40 asked for a terabyte before its shape was compared with the file's."""
-    described = describe(unet())
+    described = describe(build_preset("unet"))
     kernel = changes.get("kernel", {})
     described["config"] |= {name: value for name, value in changes.items() if name != "kernel"}
     described["config"]["kernel"] = described["config"]["kernel"] | kernel if kernel is not None else None
@@ -152,14 +152,14 @@ def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
     ids=str,
 )
 def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
-    described = describe(fast())
+    described = describe(build_preset("fast"))
     described["config"] |= changes
     with pytest.raises(ValueError, match="weights"):
         load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
 
 
 def nested(depth):
-    described = describe(unet())
+    described = describe(build_preset("unet"))
     for _ in range(depth):
         described = {"model": "MultiScale", "scales": 2, "base": described}
     return described
@@ -180,17 +180,17 @@ def test_descriptions_that_nest_are_refused_before_anything_is_built(tmp_path, d
 @pytest.mark.parametrize(
     ("model", "changes", "word"),
     [
-        (paper, {"conv_size": 99}, "conv_size: expected a number up to 15, got 99"),
-        (paper, {"blocks": 255}, "blocks: expected a number up to 64"),
-        (paper, {"width": 10**400}, "width: expected a number up to 256, got 1000"),
-        (fast, {"frames": 255}, "frames: expected a number up to 15, got 255"),
-        (unet, {"widths": [256] * 250}, "expected shape|widths"),
-        (unet, {"kernel": {"frames": 5, "size": 255, "threshold": 0.5, "activation": "relu"}}, "size: expected"),
+        ("paper", {"conv_size": 99}, "conv_size: expected a number up to 15, got 99"),
+        ("paper", {"blocks": 255}, "blocks: expected a number up to 64"),
+        ("paper", {"width": 10**400}, "width: expected a number up to 256, got 1000"),
+        ("fast", {"frames": 255}, "frames: expected a number up to 15, got 255"),
+        ("unet", {"widths": [256] * 250}, "expected shape|widths"),
+        ("unet", {"kernel": {"frames": 5, "size": 255, "threshold": 0.5, "activation": "relu"}}, "size: expected"),
     ],
     ids=["conv_size", "blocks", "digits", "frames", "widths", "size"],
 )
 def test_what_would_take_for_ever_to_run_is_refused_too(tmp_path, model, changes, word):
-    described = describe(model())
+    described = describe(build_preset(model))
     described["config"] |= changes
     with pytest.raises(ValueError, match=word) as caught:
         load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
@@ -211,9 +211,9 @@ def test_a_message_quotes_no_more_than_a_line(tmp_path, capsys, entry):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 6e4, -6e4])
 def test_weights_that_are_not_finite_or_absurd_are_refused(tmp_path, value):
     """They made every picture NaN."""
-    model = fast()
+    model = build_preset("fast")
     with torch.no_grad():
-        model.known.weight[0, 0, 0, 0] = value
+        model.aux_conv.weight[0, 0, 0, 0] = value
     with pytest.raises(ValueError, match="finite"):
         load_model(write(tmp_path / "x.safetensors", model))
 

@@ -125,12 +125,12 @@ def write(folder, layers, frames=3):
 def denoised(folder, names, preset="fast"):
     """The AOVs and the picture of the middle frame, and the frame itself."""
     pytest.importorskip("torch")
-    from hybrid.neural.denoiser import Denoiser
+    from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
     shot = judged(folder, names)
     window = FrameStream(shot, only({"demodulate", "warp"}), first_pass=Classical(DRAFT)).align(2)
-    return Denoiser(shipped_weights(preset), precision="float32")(window), open_shot(folder, aovs=names).read(2)
+    return open_network(shipped_weights(preset), precision="float32")(window), open_shot(folder, aovs=names).read(2)
 
 
 @pytest.mark.neural

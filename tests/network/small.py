@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import torch
 
-from network.models import (
+from network.paper.models import (
     TKPCN,
     KernelConfig,
-    Model,
     MultiScale,
     MultiScaleConfig,
     RAResNet,
@@ -19,6 +18,7 @@ from network.models import (
     RAUNetConfig,
     TKPCNConfig,
 )
+from network.presets import Model
 from network.robust_unet import RobustUNet, RobustUNetConfig
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 import json
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,9 +18,9 @@ torch = pytest.importorskip("torch")
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from network.checkpoint import build, describe, load_model, load_notes, save_model
-from network.models import RAResNet, RAResNetConfig
-from tests.network.small import MODELS, make_model
+from network.checkpoint import _NAMES_OF_3, build, describe, load_model, load_notes, save_model, shipped_weights
+from network.paper.models import RAResNet, RAResNetConfig
+from tests.network.small import MODELS, make_model, make_robust
 
 pytestmark = pytest.mark.neural
 
@@ -80,7 +82,7 @@ def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
         metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     for change, message in [
         ({"format": "other"}, "expected format 'ravg-network', got 'other'"),
-        ({"version": "99"}, "expected version 3, got 99"),
+        ({"version": "99"}, "expected version 4, got 99"),
         ({"description": "{"}, "bad.safetensors"),
         ({"description": json.dumps(describe(RAResNet(RAResNetConfig(width=4))))}, "expected shape"),
     ]:
@@ -121,3 +123,30 @@ def test_weights_have_the_mode_that_the_umask_gives(tmp_path: Path, mask: int) -
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o666 & ~mask
+
+
+def test_files_of_version_3_are_read_by_the_names_that_tensors_had(tmp_path: Path) -> None:
+    path, old, model = tmp_path / "w.safetensors", tmp_path / "old.safetensors", make_robust()
+    save_model(path, model)
+    with safe_open(path, framework="pt") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    names_of_3 = {today: then for then, today in _NAMES_OF_3.items()}
+    tensors = {names_of_3[name.split(".")[0]] + name[name.index(".") :]: value for name, value in tensors.items()}
+    save_file(tensors, old, {**metadata, "version": "3"})
+    for loaded, value in zip(load_model(old).parameters(), load_model(path).parameters(), strict=True):
+        assert torch.equal(loaded, value)
+    save_file(tensors, old, metadata)
+    with pytest.raises(ValueError, match="expected shape"):
+        load_model(old)
+
+
+def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named() -> None:
+    with pytest.raises(ValueError, match=r"preset is 'tkpcn', which is no preset.*paper.weights.tkpcn\.safetensors"):
+        shipped_weights("tkpcn")
+
+
+def test_no_preset_needs_the_papers_networks() -> None:
+    code = "import sys; from network.checkpoint import load_model, shipped_weights; load_model(shipped_weights('fast'))"
+    code += "; print(*(name for name in sys.modules if name.startswith('network.paper')))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not done.stdout.strip()

@@ -7,8 +7,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from network import devices
-from network.devices import find_device
-from network.training.config import DEVICES
+from network.devices import DEVICES, find_device
 
 pytestmark = pytest.mark.neural
 

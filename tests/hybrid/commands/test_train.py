@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,8 +22,9 @@ from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
 from hybrid.files.exr import read_exr  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.files.sources import MADE_FROM  # noqa: E402
+from hybrid.neural import TrainInputs  # noqa: E402
 from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
-from network.models import unet  # noqa: E402
+from network.presets import build_preset  # noqa: E402
 from network.robust_unet import RobustUNet, RobustUNetConfig  # noqa: E402
 from network.training.clips import open_clips  # noqa: E402
 from network.training.config import SamplerConfig, TrainConfig  # noqa: E402
@@ -52,7 +54,7 @@ def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     model = RobustUNet(RobustUNetConfig(frames=3, size="small"))
-    torch.nn.init.constant_(model.keep.bias, 4)  # what an untrained trunk makes is no picture: little of it
+    torch.nn.init.constant_(model.average_blend.bias, 4)  # what an untrained trunk makes is no picture: little of it
     save_model(path, model)
     return path
 
@@ -119,7 +121,7 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
     assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")]]
     values = clips.read(0, 0, (0, "reference"))
     wanted = open_shot(str(kept / "reference.####.exr")).read(SCENE.first + 1).color
-    ratio = values["target"].float().permute(1, 2, 0).numpy() / wanted
+    ratio = values.target.float().permute(1, 2, 0).numpy() / wanted
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
 
 
@@ -177,7 +179,11 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
     assert (found.shots, len(found.of(["other"]))) == (["other", "wall"], 3)
     assert 3 <= len(found.of(["wall"])) <= 6  # two tiles of a frame, if they fit half a tile apart
 
-    train = ["train", clips, "-o", out, "--crop", "32", "--batch", "1", "--threads", "1", "--float32"]
+    plain = ["train", clips, "-o", out, "--crop", "32", "--batch", "1", "--threads", "1", "--float32"]
+    assert run(*plain, "--steps", "1") == 1
+    said = "expected windows of 5 frames, as fast has, got 3; --window 3 trains a network of so many"
+    assert said in " ".join(capsys.readouterr().err.split())
+    train = [*plain, "--window", "3"]
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "tensorboardX", None)
         assert run(*train, "--steps", "2", "--tensorboard", tmp_path / "logs") == 1
@@ -203,12 +209,13 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
         (["--steps", "1", "--resume"], "resume: no file"),
         (["--steps", "1", "--crop", "40"], "crop: expected a multiple of 16, as this model needs, got 40"),
         (["--steps", "1", "--init", "fast"], "expected windows of 5 frames as fast has, got 3"),
+        (["--steps", "1", "--terms", "power"], "terms: expected none, as this model predicts no kernels, got 'power'"),
         (["--steps", "1", "--validation", "nowhere"], "expected shots among"),
     ):
         assert run(*train, *more) == 1
         assert message in capsys.readouterr().err
     assert run("train", tmp_path / "logs", "-o", out, "--steps", "1") == 1
-    assert "expected what ravg prepare writes" in capsys.readouterr().err
+    assert "expected what ravg make-clips writes" in capsys.readouterr().err
 
 
 # Every field of a training's configuration: the words that set it, and what they make of it.
@@ -217,7 +224,7 @@ OPTIONS = {
     "minutes": (["--minutes", 1.5], 1.5),
     "batch": (["--batch", 3], 3),
     "rate": (["--rate", 2e-3], 2e-3),
-    "trunk_rate": (["--trunk-rate", 0.5], 0.5),
+    "backbone_rate": (["--backbone-rate", 0.5], 0.5),
     "warmup": (["--warmup", 11], 11),
     "clip_norm": (["--clip", 0.5], 0.5),
     "ema": (["--ema", 0.9], 0.9),
@@ -227,12 +234,11 @@ OPTIONS = {
     "whole": (["--whole", 0.25], 0.25),
     "differences": (["--differences", 0.75], 0.75),
     "slope": (["--slope", 2], 2.0),
-    "bfloat16": (["--float32"], False),
+    "float32": (["--float32"], True),
     "compile": (["--compile"], True),
     "device": (["--device", "cpu"], "cpu"),
     "workers": (["--workers", 2], 2),
     "seed": (["--seed", 5], 5),
-    "checkpoint_minutes": ([], 3.0),  # as often as it is validated
     "validate_minutes": (["--validate-minutes", 3], 3.0),
     "sampler": (
         ["--crop", 64, "--sets", 4, "--drop-frames", 0.3, "--pseudo", 0.25],
@@ -252,30 +258,32 @@ def asked(monkeypatch):
 
 def test_what_is_not_said_is_as_the_configuration_has_it(asked):
     assert run("train", "clips", "-o", "w.safetensors", "--steps", 7) == 0
-    (((clips, output, config), more),) = asked
-    assert (str(clips), str(output)) == ("clips", "w.safetensors")
+    (((inputs, output, config), more),) = asked
+    assert (inputs, str(output)) == (TrainInputs(Path("clips"), "fast"), "w.safetensors")
     assert config == TrainConfig(steps=7)
     del more["log"]
-    assert more == {
-        "preset": "fast", "init": None, "window": None, "validation": [], "threads": None, "resume": False,
-    }  # fmt: skip
+    assert more == {"threads": None, "resume": False}
 
 
 def test_every_option_arrives_where_it_belongs(asked):
     words = [word for option, _ in OPTIONS.values() for word in option]
     more = ["--preset", "quality", "--init", "balanced", "--window", 7, "--threads", 2, "--resume"]
     assert run("train", "clips", "-o", "w.safetensors", *words, *more, "--validation", "a,b", "--validation", "c") == 0
-    (((_, _, config), settings),) = asked
+    (((inputs, _, config), settings),) = asked
     assert set(OPTIONS) | NOT_OFFERED == {field.name for field in fields(TrainConfig)}
     plain = TrainConfig(steps=1)
     for name, (_, value) in OPTIONS.items():
         assert getattr(config, name) == value, name
         assert getattr(plain, name) != value, f"{name}: the same without the option"
+    assert inputs == TrainInputs(Path("clips"), "quality", "balanced", 7, ("a", "b", "c"))
     del settings["log"]
-    assert settings == {
-        "preset": "quality", "init": "balanced", "window": 7,
-        "validation": ["a", "b", "c"], "threads": 2, "resume": True,
-    }  # fmt: skip
+    assert settings == {"threads": 2, "resume": True}
+
+
+def test_the_former_name_of_an_option_still_works(asked):
+    assert run("train", "clips", "-o", "w.safetensors", "--steps", 1, "--trunk-rate", 0.5) == 0
+    (((_, _, config), _),) = asked
+    assert config.backbone_rate == 0.5
 
 
 @pytest.mark.posix
@@ -429,7 +437,7 @@ def test_resumed_frames_have_their_breakdown(weights, tmp_path, capsys):
 
 def test_a_network_without_estimates_says_so(tmp_path, capsys):
     path = tmp_path / "small.safetensors"
-    save_model(path, unet(frames=3))
+    save_model(path, build_preset("unet", frames=3))
     folder = SCENE.write(tmp_path / "in")
     words = ["denoise", folder, "--weights", path, "-o", tmp_path / "out", "--first-pass"]
     assert run(*words, "oidn") == 1

@@ -13,14 +13,15 @@ from hybrid import first_pass, pseudo_reference
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import Classical, find_first_pass
 from hybrid.neural import clips as module
-from hybrid.neural import denoiser
-from hybrid.neural.clips import write_clips
+from hybrid.neural import open_network, unet_denoiser
+from hybrid.neural.clips import ClipSource, write_clips
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, gated_average, gather_and_denoise
 from hybrid.stream import FrameStream
 from network.checkpoint import save_model
-from network.models import centre_of, fast
-from network.training.clips import Clip, open_clips
+from network.presets import build_preset
+from network.training.clips import Clip, Sample, open_clips
+from network.training.loop import centre_of
 from tests.scenes import Scene
 
 pytestmark = pytest.mark.neural
@@ -44,7 +45,7 @@ def prepare(shot, monkeypatch, tmp_path, **options) -> list[Clip]:
     """Clips of a shot, before they are packed into files."""
     found: list[Clip] = []
     monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
-    write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="nlm", **options)
+    write_clips(ClipSource("dim", {"noisy": shot}, [4], **options), tmp_path, tile=0, estimate="nlm")
     return found
 
 
@@ -54,22 +55,22 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     given = {}
 
     def spy(model, window, **options):
-        given.update(window)
+        given.update(window._asdict())
         raise StopIteration
 
-    monkeypatch.setattr(denoiser, "denoise_tile", spy)
-    save_model(tmp_path / "w.safetensors", fast())
+    monkeypatch.setattr(unet_denoiser, "denoise_window", spy)
+    save_model(tmp_path / "w.safetensors", build_preset("fast"))
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
     window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     with pytest.raises(StopIteration):
-        denoiser.Denoiser(tmp_path / "w.safetensors", tile=128, precision="float32")(window)
+        open_network(tmp_path / "w.safetensors", tile=128, precision="float32")(window)
     assert set(given) == {
-        "albedo", "normal", "estimate", "residual", "confidence", "modulation", "exposure", "gain"
+        "albedo", "normal", "first_pass", "residual", "confidence", "modulation", "exposure", "gain"
     }  # fmt: skip
     for name, value in given.items():
-        wanted = getattr(clip, name)
+        wanted = getattr(clip, "estimate" if name == "first_pass" else name)
         if name in ("albedo", "normal"):
-            wanted = centre_of(wanted)[:, None]  # all that it looks at
+            wanted = centre_of(wanted)
         np.testing.assert_array_equal(value, wanted, err_msg=name)
 
 
@@ -92,7 +93,7 @@ def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path
     monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **__: 0.5 * color)
     monkeypatch.setattr(pseudo_reference, "denoise_oidn", lambda color, *_, **__: 0.25 * color)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
-    write_clips({"noisy": shot}, [4], tmp_path, "dim", tile=0, estimate="oidn-fast")
+    write_clips(ClipSource("dim", {"noisy": shot}, [4]), tmp_path, tile=0, estimate="oidn-fast")
     window = FrameStream(shot, Rules(), first_pass=find_first_pass("oidn-fast", shot).first_pass).align(MIDDLE)
     image = found[0].pseudo_reference[0].permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(image, gather_and_denoise(window))
@@ -104,22 +105,23 @@ def test_clips_hold_what_the_network_is_given_and_what_it_should_say(tmp_path):
     clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
     frames = []
     levels = {"noisy": noisy, "clean": clean}
-    write_clips(levels, [4, 64], tmp_path, "wall", tile=0, estimate="nlm", advance=lambda: frames.append(1))
+    source = ClipSource("wall", levels, [4, 64])
+    write_clips(source, tmp_path, tile=0, estimate="nlm", advance=lambda: frames.append(1))
     clips = open_clips(tmp_path)
     assert len(clips) == len(frames) == SCENE.frames
     assert clips.shots == ["wall"]
     assert clips.pairs(2) == [[(1, "noisy"), (1, "pseudo_reference")], [(1, "pseudo_reference")]]
-    values = {name: value.float().numpy() for name, value in clips.read(2, 0, (1, "noisy")).items()}
+    values = Sample(*(value.float().numpy() for value in clips.read(2, 0, (1, "noisy"))))
     truth = SCENE.clean(2)["ViewLayer.Combined"].transpose(2, 0, 1)
-    unit = truth.mean() / values["target"].mean()  # radiance is stored over the exposure of the cleanest level
-    np.testing.assert_allclose(values["target"] * unit, truth, rtol=2e-3)  # half has 11 bits
+    unit = truth.mean() / values.target.mean()  # radiance is stored over the exposure of the cleanest level
+    np.testing.assert_allclose(values.target * unit, truth, rtol=2e-3)  # half has 11 bits
     # The division by the albedo and the multiplication by the modulation are inverse where guides have no noise.
-    radiance = values["color"][2] * values["modulation"] * unit
+    radiance = values.color[2] * values.modulation * unit
     np.testing.assert_allclose(radiance, SCENE.noisy(2)["ViewLayer.Combined"].transpose(2, 0, 1), rtol=1e-2)
 
 
 def test_a_clip_holds_the_guides_without_noise_that_a_network_is_given_when_it_runs(dim, tmp_path, monkeypatch):
-    assert module.clean_guides is denoiser.clean_guides
+    assert module.clean_guides is unet_denoiser.clean_guides
     monkeypatch.setattr(module, "clean_guides", lambda aligned: {"albedo": np.full_like(aligned.color[0], 0.25)})
     (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
     assert bool((clip.clean_albedo == 0.25).all())
@@ -155,17 +157,17 @@ def test_clips_of_whole_frames_know_the_way_to_the_next(tmp_path, monkeypatch):
 def test_tiles_are_cut_from_the_frames_and_keep_their_exposure(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"), frames=str(SCENE.first + 2))
     (tmp_path / "clips").mkdir()
-    write_clips({"noisy": shot}, [4], tmp_path / "clips", "whole", tile=0, estimate="nlm")
-    write_clips({"noisy": shot}, [4], tmp_path / "clips", "tiles", tile=32, tiles=3, estimate="nlm")
+    write_clips(ClipSource("whole", {"noisy": shot}, [4]), tmp_path / "clips", tile=0, estimate="nlm")
+    write_clips(ClipSource("tiles", {"noisy": shot}, [4]), tmp_path / "clips", tile=32, tiles=3, estimate="nlm")
     clips = open_clips(tmp_path / "clips")
     whole = clips.of(["whole"]).read(0, 0, (0, "pseudo_reference"))
     tiles = clips.of(["tiles"])
     assert len(tiles) == 3
     for index in range(3):
         tile = tiles.read(index, 0, (0, "pseudo_reference"))
-        assert tile["color"].shape == (5, 3, 32, 32)
-        assert float(tile["exposure"]) == float(whole["exposure"])
-        windows = whole["color"][2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
-        assert bool((windows == tile["color"][2]).all(-1).all(-1).all(-1).any())  # it is one of them
+        assert tile.color.shape == (5, 3, 32, 32)
+        assert float(tile.exposure) == float(whole.exposure)
+        windows = whole.color[2].unfold(1, 32, 1).unfold(2, 32, 1).permute(1, 2, 0, 3, 4)
+        assert bool((windows == tile.color[2]).all(-1).all(-1).all(-1).any())  # it is one of them
     with pytest.raises(ValueError, match="tile: expected at most the frame's 90×70 pixels, got 80"):
-        write_clips({"noisy": shot}, [4], tmp_path, "large", tile=80, estimate="nlm")
+        write_clips(ClipSource("large", {"noisy": shot}, [4]), tmp_path, tile=80, estimate="nlm")

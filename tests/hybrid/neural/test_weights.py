@@ -9,16 +9,18 @@ import pytest
 
 pytest.importorskip("torch")
 
+
 from hybrid.comparison.metrics import mean_bias, psnr
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, Classical
-from hybrid.neural.denoiser import Denoiser
+from hybrid.neural import open_network
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
 from hybrid.stream import FrameStream
 from network.checkpoint import load_model, shipped_weights
-from network.models import PRESETS, window_length
-from network.paper.blocks import ChannelAverage
+from network.paper import TKPCN_WEIGHTS
+from network.presets import build_preset
+from network.robust_average import ChannelAverage
 from nlm.average import robust_average
 
 pytestmark = pytest.mark.neural
@@ -52,10 +54,10 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
 
 @pytest.mark.parametrize("preset", [*OIDN_MODE_OF_PRESET, "tkpcn"])
 def test_weights_reach_what_their_card_says(reference, preset):
-    path = shipped_weights(preset)
+    path = TKPCN_WEIGHTS if preset == "tkpcn" else shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     promised = float(re.search(r"frame 11 of the bundled shot: (\d+\.\d+) dB", card)[1])
-    image = picture(Denoiser(path))
+    image = picture(open_network(path))
     # bfloat16 or float32, one processor or another: hundredths of a decibel
     assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
     assert preset == "tkpcn" or psnr(image, reference) > psnr(filter_window(window(), FINAL), reference)
@@ -65,8 +67,8 @@ def test_weights_reach_what_their_card_says(reference, preset):
 @pytest.mark.parametrize(("preset", "frames"), [("fast", 5), ("balanced", 5), ("quality", 7)])
 def test_windows_are_as_long_as_is_promised_and_as_trainings_begin_with(preset, frames):
     shipped = load_model(shipped_weights(preset))
-    assert window_length(shipped) == frames
-    assert shipped.config == PRESETS[preset]().config
+    assert shipped.frames == frames
+    assert shipped.config == build_preset(preset).config
 
 
 def identity(self, x, frames, centre=False):
@@ -84,7 +86,7 @@ def decibels(image, number=FRAME):
 @pytest.mark.parametrize(("preset", "gain"), [("fast", 0.4), ("balanced", 0.5), ("quality", 0.9)])
 def test_the_network_is_worth_more_than_the_average_it_starts_from(preset, gain):
     """Put `gated_average` in its place, and something must be missing."""
-    denoiser = Denoiser(shipped_weights(preset))
+    denoiser = open_network(shipped_weights(preset))
     assert decibels(picture(denoiser)) > decibels(gated_average(window(denoiser.radius))) + gain
 
 
@@ -92,7 +94,7 @@ def test_the_network_is_worth_more_than_the_average_it_starts_from(preset, gain)
 @pytest.mark.parametrize(("preset", "loss"), [("fast", 0.2), ("balanced", 0.15), ("quality", 0.9)])
 def test_the_networks_ra_blocks_are_worth_something(preset, loss, monkeypatch):
     """Put the identity in the place of all of them, and something must be missing."""
-    denoiser = Denoiser(shipped_weights(preset))
+    denoiser = open_network(shipped_weights(preset))
     whole = decibels(picture(denoiser))
     monkeypatch.setattr(ChannelAverage, "forward", identity)
     assert whole > decibels(picture(denoiser)) + loss

@@ -8,9 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from network import robust_average
 from network.cpu import fused_ops as fused
-from network.paper import blocks
-from network.paper.blocks import ChannelAverage, outermost_first
+from network.robust_average import ChannelAverage, outermost_first
 
 pytestmark = pytest.mark.neural
 
@@ -62,7 +62,7 @@ def test_it_is_taken_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
         taken.append(frames)
         return x
 
-    monkeypatch.setattr(blocks, "blend_channels", spy)
+    monkeypatch.setattr(robust_average, "blend_channels", spy)
     block, x = block_and_features(5)
     block(x, 5)
     assert not taken  # a gradient may be asked for
@@ -94,10 +94,10 @@ def test_the_last_convolution(count: int, channels: int, height: int, width: int
     layer = torch.nn.Conv2d(channels, 3, 3, padding=1)
     x = torch.randn(count, channels, height, width).to(dtype)
     wanted = layer(x.float()).detach()
-    assert not fused.can_end(x)  # with gradients: torch
+    assert not fused.can_project(x)  # with gradients: torch
     with torch.no_grad():
-        assert fused.can_end(x)
-        found = fused.convolve_to_picture(x.to(memory_format=torch.channels_last), layer.weight, layer.bias)
+        assert fused.can_project(x)
+        found = fused.convolve_to_rgb(x.to(memory_format=torch.channels_last), layer.weight, layer.bias)
     assert found.dtype == torch.float32
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
 
@@ -106,6 +106,6 @@ def test_what_is_not_finite_stays_where_the_last_convolution_sees_it() -> None:
     x = torch.zeros(1, 4, 8, 8)
     x[0, 2, 3, 4] = torch.nan
     with torch.no_grad():
-        found = fused.convolve_to_picture(x, torch.ones(3, 4, 3, 3), torch.ones(3))
+        found = fused.convolve_to_rgb(x, torch.ones(3, 4, 3, 3), torch.ones(3))
     assert torch.isnan(found[0, :, 2:5, 3:6]).all()
     assert torch.isfinite(found).sum() == 3 * (64 - 9)

@@ -10,9 +10,10 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from network import unet as trunk
-from network.cpu.upsample_conv import add_taps, can_enlarge, convolve_enlarged
-from network.unet import Convolutions
+from network import unet
+from network.bfloat16 import round_taps
+from network.cpu.upsample_conv import can_upsample, convolve_upsampled, merge_taps
+from network.unet import Stage
 
 pytestmark = pytest.mark.neural
 
@@ -27,11 +28,12 @@ def features(size: tuple[int, int], batch: int = 2) -> tuple[torch.Tensor, torch
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (9, 13)])
 def test_it_is_the_convolution_of_enlarged_features(size: tuple[int, int]) -> None:
     x, skip = features(size)
-    stage = Convolutions(17, (8,))
+    torch.manual_seed(0)
+    stage = Stage(17, (8,))
     weight, bias = stage[0].weight.detach(), stage[0].bias.detach()
     both = torch.cat([functional.interpolate(x, scale_factor=2.0), skip], 1).double()
     expected = torch.relu(functional.conv2d(both, weight.double(), bias.double(), padding=1))
-    found = convolve_enlarged(x, skip, add_taps(weight, x.shape[1]), bias)
+    found = convolve_upsampled(x, skip, merge_taps(weight, x.shape[1]), bias)
     # Sums of some hundred products of float32, of about 1.
     torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=2e-6)
 
@@ -39,14 +41,15 @@ def test_it_is_the_convolution_of_enlarged_features(size: tuple[int, int]) -> No
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (24, 32)])
 def test_in_bfloat16_it_is_nearly_as_exact_as_plain_operations(size: tuple[int, int]) -> None:
     x, skip = features(size, batch=1)
-    stage = Convolutions(17, (8,)).requires_grad_(False)
+    torch.manual_seed(0)
+    stage = Stage(17, (8,)).requires_grad_(False)
     both = torch.cat([functional.interpolate(x, scale_factor=2.0), skip], 1)
     exact = torch.relu(functional.conv2d(both.double(), stage[0].weight.double(), stage[0].bias.double(), padding=1))
-    stage.round_enlarged(x.shape[1])
+    stage.set_upsample_taps(x.shape[1], round_taps)
     stage.bfloat16()
     x, skip, both = (layer.bfloat16() for layer in (x, skip, both))
     with torch.no_grad():
-        found, plain = stage.enlarged(x, skip), stage(both)
+        found, plain = stage.upsample(x, skip), stage(both)
     assert found.dtype == torch.bfloat16
     error, expected = (float((layer.double() - exact).square().mean()) for layer in (found, plain))
     # What the enlarged features give is rounded once before the rest is added to it, as the sum is afterwards.
@@ -55,14 +58,14 @@ def test_in_bfloat16_it_is_nearly_as_exact_as_plain_operations(size: tuple[int, 
 
 def test_it_stands_for_plain_operations_where_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     x, skip = features((4, 6))
-    stage, calls = Convolutions(17, (8, 8)), []
-    monkeypatch.setattr(trunk, "convolve_enlarged", lambda *layers: calls.append(layers) or convolve_enlarged(*layers))
-    trained = stage.enlarged(x, skip)
+    stage, calls = Stage(17, (8, 8)), []
+    monkeypatch.setattr(unet, "convolve_upsampled", lambda *layers: calls.append(layers) or convolve_upsampled(*layers))
+    trained = stage.upsample(x, skip)
     assert not calls
     assert trained.requires_grad
     with torch.no_grad():
-        torch.testing.assert_close(stage.enlarged(x, skip), trained.detach(), rtol=1e-5, atol=2e-6)
+        torch.testing.assert_close(stage.upsample(x, skip), trained.detach(), rtol=1e-5, atol=2e-6)
     assert len(calls) == 1
-    assert can_enlarge(x, skip)
-    assert not can_enlarge(x, skip.bfloat16())
-    assert not can_enlarge(x.half(), skip.half())
+    assert can_upsample(x, skip)
+    assert not can_upsample(x, skip.bfloat16())
+    assert not can_upsample(x.half(), skip.half())

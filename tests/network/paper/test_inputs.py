@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.paper.inputs import CHANNELS, network_inputs
+from network.paper.inputs import CHANNELS, KernelWindow, network_inputs
 
 pytestmark = pytest.mark.neural
 
@@ -29,28 +29,28 @@ def window() -> dict[str, torch.Tensor]:
 
 def test_channels_and_their_order() -> None:
     data = window()
-    features = network_inputs(**data, exposure=torch.tensor([0.5]))
+    features = network_inputs(KernelWindow(**data, exposure=torch.tensor([0.5])))
     layers = [torch.log1p(data["color"] / 0.5), torch.log1p(data["albedo"]), data["normal"], data["confidence"]]
     torch.testing.assert_close(features, torch.cat(layers, 2))
 
 
 def test_what_is_missing_is_zero() -> None:
     data = window()
-    features = network_inputs(data["color"], None, None, data["confidence"], torch.ones(1))
+    features = network_inputs(KernelWindow(data["color"], data["confidence"], torch.ones(1)))
     assert not bool(features[:, :, 3:9].any())
 
 
 def test_features_do_not_depend_on_the_scale_of_the_radiance() -> None:
     data = window()
     scaled = {**data, "color": data["color"] * 4096}
-    features, same = (network_inputs(**d, exposure=d["color"].mean((1, 2, 3, 4))) for d in (data, scaled))
+    features, same = (network_inputs(KernelWindow(**d, exposure=d["color"].mean((1, 2, 3, 4)))) for d in (data, scaled))
     assert torch.equal(features, same)  # a power of two
 
 
 def test_extreme_radiance_stays_finite_and_moderate() -> None:
     data = window()
     data["color"][0, 0, 0, 0] = torch.tensor([1e6, -3.0, 0.0] * 4)
-    features = network_inputs(**data, exposure=torch.tensor([0.5]))
+    features = network_inputs(KernelWindow(**data, exposure=torch.tensor([0.5])))
     assert float(features.max()) < 16  # log1p(2e6) = 14.5
     assert float(features[:, :, :3].min()) == 0
 
@@ -60,21 +60,21 @@ def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
     data = window()
     data[name] = data[name][..., :-1]
     with pytest.raises(ValueError, match=f"{name}: expected shape"):
-        network_inputs(**data, exposure=torch.ones(1))
+        network_inputs(KernelWindow(**data, exposure=torch.ones(1)))
 
 
 def test_an_exposure_of_another_shape_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
-        network_inputs(**window(), exposure=torch.ones(2))
+        network_inputs(KernelWindow(**window(), exposure=torch.ones(2)))
 
 
 def test_numbers_of_channels_are_what_the_models_count_on() -> None:
     data = window()
-    assert network_inputs(**data, exposure=torch.ones(1)).shape[2] == CHANNELS
+    assert network_inputs(KernelWindow(**data, exposure=torch.ones(1))).shape[2] == CHANNELS
 
 
 def test_what_is_given_is_not_written_to() -> None:
     data = window()
     copies = {name: value.clone() for name, value in data.items()}
-    network_inputs(**data, exposure=torch.tensor([0.5]))
+    network_inputs(KernelWindow(**data, exposure=torch.tensor([0.5])))
     assert all(torch.equal(value, copies[name]) for name, value in data.items())

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import stat
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,8 @@ from safetensors.torch import save_file
 from torch.utils.data import DataLoader
 
 from network.training.clips import (
+    FIELDS,
+    INPUTS,
     Clip,
     Clips,
     Samples,
@@ -80,7 +82,7 @@ def test_where_there_is_a_reference_it_is_the_only_target(tmp_path: Path) -> Non
     clips = open_clips(tmp_path)
     assert clips.pairs(0) == [[(0, "reference")], [(1, "reference")], [(2, "reference")]]
     assert clips.pairs(1) == noise_pairs(SPP)
-    target = clips.read(0, 2, (2, "reference"))["target"].float()
+    target = clips.read(0, 2, (2, "reference")).target.float()
     torch.testing.assert_close(target, clean[2] / 2, rtol=2**-10, atol=0)  # over the last level's exposure, in half
     with pytest.raises(ValueError, match="reference: expected shape"):
         replace(make_clip(), reference=clean[:2])
@@ -92,7 +94,7 @@ def test_the_error_is_that_of_the_clips_better_input(tmp_path: Path) -> None:
     write_shards(tmp_path, "a", SPP, [replace(clip, estimate=bright.expand_as(clip.estimate), reference=clip.noisy)])
     sample = Samples(open_clips(tmp_path), PLAIN, 0)[0]
     # Ten per cent too bright; relmse divides by the mean of the channels and a floor of a third of the exposure.
-    assert 0.1 * 0.1**2 < float(sample["error"]) < 1.2 * 0.1**2
+    assert 0.1 * 0.1**2 < float(sample.error) < 1.2 * 0.1**2
 
 
 def test_targets_are_never_noisier_than_the_input_and_always_independent() -> None:
@@ -117,6 +119,15 @@ def test_a_clip_needs_something_to_be_trained_towards() -> None:
         replace(make_clip(), pseudo_reference=None)
 
 
+def test_one_table_has_every_field_and_samples_have_those_that_are_inputs() -> None:
+    clip = make_clip()
+    assert set(FIELDS) == {field.name for field in fields(Clip)}
+    assert list(INPUTS) == [name for name in FIELDS if name in INPUTS]
+    assert set(FIELDS) - set(INPUTS) == {"noisy", "linked", "pseudo_reference", "reference", "rendered"}
+    for name, value in clip.values().items():
+        assert FIELDS[name].shape(3, 3, 16, 16) == value.shape
+
+
 # Shards
 
 
@@ -129,12 +140,14 @@ def test_clips_come_back_from_their_shards(tmp_path: Path, monkeypatch: pytest.M
         clip = make_clip(index)
         values = clips.read(index, 2, (1, "noisy"))
         for name in ("albedo", "normal", "confidence", "modulation"):
-            torch.testing.assert_close(values[name].float(), getattr(clip, name)[2], rtol=1e-3, atol=1e-4)  # half
+            torch.testing.assert_close(
+                getattr(values, name).float(), getattr(clip, name)[2], rtol=1e-3, atol=1e-4
+            )  # half
         # Radiance is over the exposure of the last level, 2; the target is another level's.
-        torch.testing.assert_close(values["color"].float(), clip.color[2] / 2, rtol=1e-3, atol=1e-4)
-        torch.testing.assert_close(values["target"].float(), clip.noisy[1] / 2, rtol=1e-3, atol=1e-4)
-        assert float(values["exposure"]) == 1
-        assert float(clips.read(index, 0, (1, "noisy"))["exposure"]) == 0.25
+        torch.testing.assert_close(values.color.float(), clip.color[2] / 2, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(values.target.float(), clip.noisy[1] / 2, rtol=1e-3, atol=1e-4)
+        assert float(values.exposure) == 1
+        assert float(clips.read(index, 0, (1, "noisy")).exposure) == 0.25
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -144,7 +157,7 @@ def test_what_is_stored_does_not_depend_on_the_units_of_the_radiance(tmp_path: P
     scaled = replace(clip, **{name: getattr(clip, name) * scale for name in names})
     write_shards(tmp_path, "s", SPP, [scaled])
     values = open_clips(tmp_path).read(0, 2, (1, "noisy"))
-    torch.testing.assert_close(values["color"].float(), clip.color[2] / 2, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(values.color.float(), clip.color[2] / 2, rtol=1e-3, atol=1e-4)
 
 
 def test_fireflies_beyond_a_half_are_stored_as_its_largest(tmp_path: Path) -> None:
@@ -152,7 +165,7 @@ def test_fireflies_beyond_a_half_are_stored_as_its_largest(tmp_path: Path) -> No
     clip.color[0, 0, 0, 0, 0] = 1e9
     write_shards(tmp_path, "s", SPP, [clip])
     values = open_clips(tmp_path).read(0, 0, (1, "noisy"))
-    assert float(values["color"].max()) == 65504
+    assert float(values.color.max()) == 65504
 
 
 @pytest.mark.posix
@@ -171,8 +184,8 @@ def test_of_longer_windows_the_middle_is_taken(tmp_path: Path) -> None:
     whole, middle = (open_clips(tmp_path, frames).read(0, 1, (0, "noisy")) for frames in (None, 3))
     assert open_clips(tmp_path, 3).of(["s"]).frames == 3
     for name in ("color", "albedo", "normal", "estimate", "residual", "confidence"):
-        assert torch.equal(middle[name], whole[name][1:4])
-    assert torch.equal(middle["target"], whole["target"])
+        assert torch.equal(getattr(middle, name), getattr(whole, name)[1:4])
+    assert torch.equal(middle.target, whole.target)
     for frames in (7, 2):
         with pytest.raises(ValueError, match=f"expected an odd number of frames up to the clips' 5, got {frames}"):
             open_clips(tmp_path, frames)
@@ -215,7 +228,7 @@ def test_clips_that_do_not_fit_are_an_error(tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_clips_are_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="expected what ravg prepare writes"):
+    with pytest.raises(FileNotFoundError, match="expected what ravg make-clips writes"):
         open_clips(tmp_path)
     (path,) = write_shards(tmp_path, "s", SPP, [make_clip()])
     whole = path.read_bytes()
@@ -292,9 +305,8 @@ def test_a_sample_is_a_function_of_seed_and_number(tmp_path: Path) -> None:
     clips = folder_of(tmp_path, {"a": 5})
     one, other = Samples(clips, SamplerConfig(crop=16), 3), Samples(clips, SamplerConfig(crop=16), 3)
     one[7]  # whatever came before does not matter
-    for name, value in one[4].items():
-        assert torch.equal(value, other[4][name])
-    assert not torch.equal(one[4]["color"], Samples(clips, SamplerConfig(crop=16), 4)[4]["color"])
+    assert all(torch.equal(*pair) for pair in zip(one[4], other[4], strict=True))
+    assert not torch.equal(one[4].color, Samples(clips, SamplerConfig(crop=16), 4)[4].color)
 
 
 def test_samples_are_drawn_from_all_noise_levels_and_all_targets(tmp_path: Path) -> None:
@@ -310,8 +322,8 @@ def test_samples_are_drawn_from_all_noise_levels_and_all_targets(tmp_path: Path)
     drawn: dict[tuple[int, tuple[int, str]], int] = {}
     for number in range(600):
         sample = samples[number]
-        level = round(float(sample["modulation"][0, 0, 0])) - 1
-        value = 2 * float(sample["target"][0, 0, 0])  # over the last level's exposure, 2
+        level = round(float(sample.modulation[0, 0, 0])) - 1
+        value = 2 * float(sample.target[0, 0, 0])  # over the last level's exposure, 2
         target = round(value // 10) - 1, "noisy" if value % 10 < 2.5 else "pseudo_reference"
         drawn[level, target] = drawn.get((level, target), 0) + 1
     pairs = {(level, target) for level, targets in enumerate(noise_pairs(SPP)) for target in targets}
@@ -324,9 +336,9 @@ def test_samples_are_drawn_from_all_noise_levels_and_all_targets(tmp_path: Path)
 def test_processes_that_read_make_the_same_batches(tmp_path: Path) -> None:
     samples = Samples(folder_of(tmp_path, {"a": 3}), SamplerConfig(crop=16), 0)
     batches = [next(iter(DataLoader(samples, batch_sampler=[[0, 1, 2]], num_workers=workers))) for workers in (0, 1)]
-    assert batches[0]["color"].shape == (3, 3, 3, 16, 16)
-    assert batches[0]["exposure"].shape == (3,)
-    assert all(torch.equal(value, batches[1][name]) for name, value in batches[0].items())
+    assert batches[0].color.shape == (3, 3, 3, 16, 16)
+    assert batches[0].exposure.shape == (3,)
+    assert all(torch.equal(*pair) for pair in zip(*batches, strict=True))
 
 
 def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
@@ -341,15 +353,15 @@ def test_images_of_a_sample_stay_together(tmp_path: Path) -> None:
     for number in range(40):
         sample = samples[number]
         for name in ("albedo", "estimate", "residual"):
-            torch.testing.assert_close(sample[name], sample["color"])
+            torch.testing.assert_close(getattr(sample, name), sample.color)
         for name in ("modulation", "clean_albedo", "target"):
-            torch.testing.assert_close(sample[name], sample["color"][1])
-        torch.testing.assert_close(sample["clean_normal"], sample["normal"][1])
-        channel = [i for i in range(3) if torch.equal(sample["color"][0, i], sample["confidence"][0, 0])]
+            torch.testing.assert_close(getattr(sample, name), sample.color[1])
+        torch.testing.assert_close(sample.clean_normal, sample.normal[1])
+        channel = [i for i in range(3) if torch.equal(sample.color[0, i], sample.confidence[0, 0])]
         assert len(channel) == 1  # turned alike, wherever the red channel has gone
-        sizes = sample["normal"].abs()
-        assert all(any(torch.equal(sizes[:, i], sample["color"][:, j]) for j in range(3)) for i in range(3))
-        corner = int((sample["confidence"][0, 0] == image[0, 0, 0].half().float()).nonzero()[0][0])
+        sizes = sample.normal.abs()
+        assert all(any(torch.equal(sizes[:, i], sample.color[:, j]) for j in range(3)) for i in range(3))
+        corner = int((sample.confidence[0, 0] == image[0, 0, 0].half().float()).nonzero()[0][0])
         seen.add((channel[0], corner))
     assert len(seen) > 4
 
@@ -362,25 +374,25 @@ def test_crops_of_larger_clips_are_drawn_by_importance(tmp_path: Path) -> None:
     clip.color[..., :16, :16] = 8.0
     write_shards(tmp_path, "s", SPP, [clip])
     samples = Samples(open_clips(tmp_path), PLAIN, 0)
-    hits = np.mean([bool((samples[number]["color"] * samples.config.crop > 16).any()) for number in range(300)])
+    hits = np.mean([bool((samples[number].color * samples.config.crop > 16).any()) for number in range(300)])
     # Half by importance, all of it there, and half evenly: 4 of 15 places touch it. 0.63, standard deviation 0.03.
     assert 0.55 < hits < 0.72
-    assert samples[0]["color"].shape == (3, 3, 16, 16)
+    assert samples[0].color.shape == (3, 3, 16, 16)
 
 
 def test_variations_do_what_they_say(tmp_path: Path) -> None:
     clips = folder_of(tmp_path, {"a": 2})
     dropped = [Samples(clips, replace(PLAIN, drop_frames=1), 0)[number] for number in range(20)]
-    assert any(bool((sample["confidence"][0] == 0).all()) for sample in dropped)
+    assert any(bool((sample.confidence[0] == 0).all()) for sample in dropped)
     for sample in dropped:
         for frame in range(3):
-            if not bool(sample["confidence"][frame].any()):
+            if not bool(sample.confidence[frame].any()):
                 for name in ("color", "albedo", "normal", "estimate"):
-                    assert torch.equal(sample[name][frame], sample[name][1])
-        assert bool(sample["confidence"][1].any())  # never the centre
-    bright = Samples(clips, replace(PLAIN, fireflies=1), 0)[0]["color"]
+                    assert torch.equal(getattr(sample, name)[frame], getattr(sample, name)[1])
+        assert bool(sample.confidence[1].any())  # never the centre
+    bright = Samples(clips, replace(PLAIN, fireflies=1), 0)[0].color
     assert float(bright.max()) > 2  # without, below 1.1 / 2
-    away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n]["exposure"]) for n in range(20)]
+    away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n].exposure) for n in range(20)]
     assert 0.25 * 0.25 <= min(away) < max(away) <= 4
 
 
@@ -391,9 +403,9 @@ def test_a_target_is_a_pseudo_reference_as_often_as_is_asked_for(tmp_path: Path)
     clips = open_clips(tmp_path)
     assert clips.pairs(0)[1] == [(1, "reference"), (1, "rendered")]
     for pseudo, wanted in ((1.0, 2.0), (0.0, 4.0)):  # over the last level's exposure, 2
-        drawn = [Samples(clips, replace(PLAIN, pseudo=pseudo), 0)[n]["target"] for n in range(10)]
+        drawn = [Samples(clips, replace(PLAIN, pseudo=pseudo), 0)[n].target for n in range(10)]
         assert all(bool((target == wanted).all()) for target in drawn)
-    drawn = [float(Samples(clips, replace(PLAIN, pseudo=0.25), 0)[n]["target"].mean()) for n in range(400)]
+    drawn = [float(Samples(clips, replace(PLAIN, pseudo=0.25), 0)[n].target.mean()) for n in range(400)]
     assert np.mean([value == 2 for value in drawn]) == pytest.approx(0.25, abs=0.09)  # four standard deviations
 
 
@@ -416,9 +428,9 @@ def test_neighbours_are_varied_alike_and_their_motion_with_them(tmp_path: Path) 
     ways = set()
     for number in range(30):
         sample = samples[number]
-        assert sample["color"].shape == (2, 3, 3, 16, 16)
-        x, y = (int(value) for value in sample["to_next"][0, :, 0, 0])
-        here, there = sample["target"]
+        assert sample.color.shape == (2, 3, 3, 16, 16)
+        x, y = (int(value) for value in sample.to_next[0, :, 0, 0])
+        here, there = sample.target
         rows, columns = (slice(max(0, -d), 16 - max(0, d)) for d in (y, x))
         moved = there[:, rows.start + y : rows.stop + y, columns.start + x : columns.stop + x]
         torch.testing.assert_close(here[:, rows, columns], moved)
@@ -445,9 +457,9 @@ def test_whole_frames_are_every_level_towards_the_cleanest(tmp_path: Path) -> No
     batches = whole_frames(clips, 0, 4)
     assert len(batches) == 3
     for level, batch in enumerate(batches):
-        assert batch["color"].shape == (1, 3, 3, 16, 20)
-        assert batch["confidence"].shape == (1, 3, 1, 16, 20)
-        assert batch["target"].shape == (1, 3, 16, 20)
-        assert batch["exposure"].shape == (1,)
+        assert batch.color.shape == (1, 3, 3, 16, 20)
+        assert batch.confidence.shape == (1, 3, 1, 16, 20)
+        assert batch.target.shape == (1, 3, 16, 20)
+        assert batch.exposure.shape == (1,)
         target = make_clip(size=(18, 21)).noisy[1 if level == 0 else 0, :, :16, :20] / 2
-        torch.testing.assert_close(batch["target"][0], target, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(batch.target[0], target, rtol=1e-3, atol=1e-4)

@@ -8,7 +8,8 @@ from dataclasses import fields, replace
 
 import pytest
 
-from network.training.config import DEVICES, LOSSES, TERMS, SamplerConfig, TrainConfig
+from network.devices import DEVICES
+from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
 
 CONFIG = TrainConfig(steps=6)
 

@@ -18,10 +18,10 @@ torch = pytest.importorskip("torch")
 
 import network.training.loop
 from network.checkpoint import load_model, load_notes
-from network.models import Model
+from network.presets import Model
 from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
 from network.training import losses
-from network.training.clips import Clip, Clips, Samples, open_clips, split_by_shot, whole_frames, write_shards
+from network.training.clips import Clip, Clips, Sample, Samples, open_clips, split_by_shot, whole_frames, write_shards
 from network.training.config import LOSSES, SamplerConfig, TrainConfig
 from network.training.loop import batch_loss, image_loss, predict, train, validate
 from tests.network.small import MODELS, make_model, make_robust
@@ -74,11 +74,11 @@ def sets(clips: Clips) -> tuple[Clips, Clips]:
 
 
 CONFIG = TrainConfig(
-    steps=6, batch=2, rate=3e-3, warmup=3, ema=0.9, bfloat16=False, device="cpu", sampler=SamplerConfig(crop=16, sets=1)
+    steps=6, batch=2, rate=3e-3, warmup=3, ema=0.9, float32=True, device="cpu", sampler=SamplerConfig(crop=16, sets=1)
 )
 
 
-def a_batch(clips: Clips, config: TrainConfig, count: int) -> dict[str, torch.Tensor]:
+def a_batch(clips: Clips, config: TrainConfig, count: int) -> Sample:
     samples = Samples(clips, config.sampler, 7)
     return torch.utils.data.default_collate([samples[number] for number in range(count)])
 
@@ -97,12 +97,12 @@ def test_a_network_that_relies_on_its_guides_is_trained_with_those_without_noise
     batch, seen = a_batch(clips, CONFIG, 2), []
     model = RobustUNet(RobustUNetConfig(3, "small", clean_guides=clean))
 
-    def spy(frames: torch.Tensor, still: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        seen.append(still)
-        return model(frames, still, known)
+    def spy(frames: torch.Tensor, shared: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(static)
+        return model(frames, shared, static)
 
     predict(model, batch, run=spy)
-    wanted = batch["clean_albedo"] if clean else batch["albedo"][:, 1]  # ones and zeros
+    wanted = batch.clean_albedo if clean else batch.albedo[:, 1]  # ones and zeros
     torch.testing.assert_close(seen[0][:, 3:6, MIRRORED:-MIRRORED, MIRRORED:-MIRRORED], wanted)
 
 
@@ -110,12 +110,12 @@ def test_crops_are_mirrored_in_training_as_frames_are_in_running(clips: Clips) -
     """Without, a third of a crop of 80 pixels is spoilt by the darkness that a trunk sees beyond its borders."""
     batch, model, seen = a_batch(clips, CONFIG, 1), make_robust(), []
 
-    def spy(frames: torch.Tensor, still: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        seen.append(known)
-        return model(frames, still, known)
+    def spy(frames: torch.Tensor, shared: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(shared)
+        return model(frames, shared, static)
 
     picture = predict(model, batch, run=spy)
-    assert picture.irradiance.shape == batch["target"].shape
+    assert picture.irradiance.shape == batch.target.shape
     assert seen[0].shape[-2:] == (16 + 2 * MIRRORED,) * 2
     inner = seen[0][..., MIRRORED : MIRRORED + 5, :]
     torch.testing.assert_close(seen[0][..., MIRRORED - 4 : MIRRORED + 1, :].flip(-2), inner)
@@ -137,7 +137,7 @@ def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> Non
         sampler = replace(config.sampler, fireflies=0, drop_frames=0, exposure_stops=0)
         samples = Samples(open_clips(folder), sampler, 0, image_loss(config), neighbours=True)
         batch = torch.utils.data.default_collate([samples[0]])
-        plain = {name: pair.flatten(0, 1) for name, pair in batch.items()}
+        plain = Sample(*(pair.flatten(0, 1) for pair in batch))
         plain_loss = batch_loss(make_model(), plain, replace(config, differences=0), image_loss(config))
         values.append((batch_loss(make_model(), batch, config, image_loss(config)) - plain_loss).item())
     # An image that is nearly the estimate is off by a tenth, its input too: twice that from one frame to the next.
@@ -193,7 +193,7 @@ def test_bfloat16_training_stays_near_float32(
     none = sets[0].of([])
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: True)
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
-    half = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
+    half = train(sets[0], none, make_model(), replace(CONFIG, float32=False), tmp_path / "b.safetensors")
     assert half != full
     assert half == pytest.approx(full, rel=0.02)  # 8 bits in the features, averaged over all pixels
 
@@ -204,7 +204,7 @@ def test_a_device_without_bfloat16_trains_in_float32(
     none = sets[0].of([])
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: False)
-    same = train(sets[0], none, make_model(), replace(CONFIG, bfloat16=True), tmp_path / "b.safetensors")
+    same = train(sets[0], none, make_model(), replace(CONFIG, float32=False), tmp_path / "b.safetensors")
     assert same == full
 
 
@@ -226,10 +226,10 @@ def test_every_model_learns_with_all_of_its_weights(
 ) -> None:
     model = MODELS[name]()
     if isinstance(model, RobustUNet):  # as after some steps: what starts as a constant hides what is before it
-        torch.nn.init.normal_(model.keep.weight)
-        torch.nn.init.constant_(model.trunk.last.bias, 0.5)  # by chance all is black, where nothing follows a gradient
+        torch.nn.init.normal_(model.average_blend.weight)
+        torch.nn.init.constant_(model.backbone.last.bias, 0.5)  # else by chance all is black, without gradients
     before = [p.clone() for p in model.parameters()]
-    config = replace(CONFIG, steps=2, terms=terms, slope=2.0)
+    config = replace(CONFIG, steps=2, terms=None if isinstance(model, RobustUNet) else terms, slope=2.0)
     losses = train(sets[0], sets[0].of([]), model, config, tmp_path / "w.safetensors")
     assert np.isfinite(losses).all()
     assert all(not torch.equal(p, q) for p, q in zip(model.parameters(), before, strict=True))
@@ -292,7 +292,7 @@ def _train_and_be_killed(rank: int, folder: str, out: str) -> None:
         if step == 5:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    train(*_sets_of(folder), make_model(), replace(CONFIG, checkpoint_minutes=0.0), out, log=log)
+    train(*_sets_of(folder), make_model(), replace(CONFIG, validate_minutes=0.0), out, log=log)
 
 
 def _sets_of(folder: str | Path) -> tuple[Clips, Clips]:
@@ -327,7 +327,7 @@ def test_a_state_that_is_missing_cut_short_or_of_another_training_is_an_error(
     with pytest.raises(FileNotFoundError, match="resume: no file"):
         train(*sets, make_model(), CONFIG, out, resume=True)
     state = Path(f"{out}.state")
-    every_step = replace(CONFIG, checkpoint_minutes=0.0)
+    every_step = replace(CONFIG, validate_minutes=0.0)
     kept = tmp_path / "kept"
 
     def keep(step: int, values: dict[str, float]) -> None:
@@ -356,8 +356,8 @@ def test_validation_measures_what_it_says(tmp_path: Path) -> None:
     batch = whole_frames(clips, 0, model.multiple)[0]
     with torch.no_grad():
         image = predict(model, batch).irradiance
-    assert values["denoised"] == pytest.approx(float(losses.tone_mapped_psnr(image, batch["target"])), abs=0.1)
-    assert values["mean"] == pytest.approx(float(image.sum() / batch["target"].sum()), abs=0.01)
+    assert values["denoised"] == pytest.approx(float(losses.tone_mapped_psnr(image, batch.target)), abs=0.1)
+    assert values["mean"] == pytest.approx(float(image.sum() / batch.target.sum()), abs=0.01)
     assert values["side"] == pytest.approx(2 / 3, abs=0.02)  # of three frames of full confidence
 
 

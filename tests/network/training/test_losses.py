@@ -257,7 +257,7 @@ def test_frames_without_weight_are_judged_by_their_own_pixels() -> None:
     color, target = uniform(1, 5, 3, 4, 4), uniform(1, 3, 4, 4, seed=1)
     numerators, denominators = torch.zeros(1, 5, 3, 4, 4).double(), torch.zeros(1, 5, 1, 4, 4).double()
     numerators[:, 2], denominators[:, 2] = color[:, 2], 1
-    filtered = Filtered(numerators, denominators, denominators)
+    filtered = Filtered(numerators, denominators, denominators, color[:, 1])
     one = torch.ones(1, dtype=torch.float64)
     got = temporal_loss(l1, filtered, color, target, torch.ones_like(target), one, temporal_terms(5))
     images = [color[:, 2], color[:, [0, 3]].mean(1), color[:, [1, 4]].mean(1)]
@@ -269,11 +269,11 @@ def test_temporal_loss_does_not_depend_on_the_scale() -> None:
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     scale = torch.ones(1, dtype=torch.float64)
     terms = temporal_terms(3, 1.0)
-    once = temporal_loss(relmse, Filtered(*sums, sums[1]), color, target, modulation, scale, terms, 3.0)
+    once = temporal_loss(relmse, Filtered(*sums, sums[1], color[:, 1]), color, target, modulation, scale, terms, 3.0)
     numerators, denominators = sums
     scaled = temporal_loss(
         relmse,
-        Filtered(numerators * 512, denominators, denominators),
+        Filtered(numerators * 512, denominators, denominators, color[:, 1]),
         color * 512,
         target * 512,
         modulation,
@@ -289,7 +289,7 @@ def test_the_slope_weighs_each_terms_errors() -> None:
     sums = apply_kernels(predict_kernel(uniform(1, 27, 4, 4), centre=13), color)
     one = torch.ones(1, dtype=torch.float64)
     got = temporal_loss(
-        smape, Filtered(*sums, sums[1]), color, target, torch.ones_like(target), one, spatial_terms(3), 2.0
+        smape, Filtered(*sums, sums[1], color[:, 1]), color, target, torch.ones_like(target), one, spatial_terms(3), 2.0
     )
     image = mean_of(*sums, color[:, 1], SUBSET_EPSILON)
     expected = smape(image, target, one, asymmetry(image, target, color[:, 1], 2.0))

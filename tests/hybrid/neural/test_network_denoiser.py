@@ -1,6 +1,3 @@
-from itertools import pairwise
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,12 +9,12 @@ torch = pytest.importorskip("torch")
 from hybrid.breakdown import Breakdown  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.first_pass import Classical  # noqa: E402
-from hybrid.neural.denoiser import Denoiser  # noqa: E402
+from hybrid.neural import open_network  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
 from hybrid.validation import validate_layers  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
-from network.models import unet  # noqa: E402
+from network.presets import build_preset  # noqa: E402
 from nlm.pooling import pool_samples  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -32,7 +29,7 @@ def weights(request, tmp_path_factory):
     if request.param == "fast":
         return shipped_weights("fast")
     path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
-    model = unet(seed=3)
+    model = build_preset("unet", seed=3)
     with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
         model.head.window.weight.mul_(20)
     save_model(path, model)
@@ -56,37 +53,38 @@ def test_tiles_give_what_the_whole_image_gives(tmp_path, weights):
     scene = Scene(height=40, width=420, frames=5)
     shot = open_shot(scene.write(tmp_path))
     window = FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(scene.first + 2)
-    whole = Denoiser(weights, tile=512, precision="float32")(window).color
-    denoiser = Denoiser(weights, tile=32, precision="float32")
+    whole = open_network(weights, tile=512, precision="float32")(window).color
+    denoiser = open_network(weights, tile=32, precision="float32")
     assert 2 * denoiser.halo + 32 < scene.width
     # The receptive field of the U-Net is wider than the halo; what lies beyond has next to no influence: 4e-7 here.
     np.testing.assert_allclose(denoiser(window).color, whole, rtol=0, atol=1e-5 * whole.mean())
     assert np.abs(whole - window.color[2] * window.modulation).max() > 0.1  # it does something
 
 
-def test_tiles_show_their_seams_without_a_halo(tmp_path, weights, monkeypatch):
+def test_tiles_show_their_seams_without_a_halo(tmp_path, weights):
     """So the test above sees what it is for."""
     scene = Scene(height=40, width=420, frames=5)
     window = FrameStream(open_shot(scene.write(tmp_path)), only(STAGES), first_pass=Classical(DRAFT)).align(
         scene.first + 2
     )
-    whole = Denoiser(weights, tile=512, precision="float32")(window).color
-    monkeypatch.setattr(Denoiser, "halo", 0)
-    tiled = Denoiser(weights, tile=32, precision="float32")(window).color
+    whole = open_network(weights, tile=512, precision="float32")(window).color
+    denoiser = open_network(weights, tile=32, precision="float32")
+    denoiser.halo = 0
+    tiled = denoiser(window).color
     assert np.abs(tiled - whole).max() > 0.1 * whole.mean()  # measured: a sixth and a third
 
 
 def test_bfloat16_is_close_to_float32(folder, weights):
     window = align(folder)
-    exact = Denoiser(weights, precision="float32")(window).color
-    short = Denoiser(weights, precision="bfloat16")(window).color
+    exact = open_network(weights, precision="float32")(window).color
+    short = open_network(weights, precision="bfloat16")(window).color
     # Features have 8 bits; the kernels that come of them are applied in float32.
     assert np.sqrt(np.mean((short - exact) ** 2)) < 0.02 * exact.mean()
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
 def test_the_result_scales_with_the_radiance(tmp_path, folder, weights, scale):
-    denoiser = Denoiser(weights, precision="float32")
+    denoiser = open_network(weights, precision="float32")
     plain = denoiser(align(folder)).color
     scaled = denoiser(align(SCENE.write(tmp_path, scale=scale))).color
     np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-4 * scale)
@@ -97,14 +95,14 @@ def test_a_flat_picture_stays_as_it_is(tmp_path, weights):
         layers["ViewLayer.Combined"][:] = 0.7
         layers["ViewLayer.Denoising Albedo"][:] = 0.5
 
-    image = Denoiser(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
+    image = open_network(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
     # Kernels sum to 1. A trunk was 0.4 % off at most; 28 % at the borders, before they were mirrored.
     np.testing.assert_allclose(image, 0.7, rtol=1e-5 if weights.stem == "untrained" else 0.01)
 
 
 def test_without_guides_it_runs(tmp_path, weights):
     scene = SCENE.write(tmp_path, without={"Denoising Albedo", "Denoising Normal", "Depth"})
-    assert np.isfinite(Denoiser(weights)(align(scene)).color).all()
+    assert np.isfinite(open_network(weights)(align(scene)).color).all()
 
 
 def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
@@ -113,7 +111,7 @@ def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
         layers["mask"] = np.ones((SCENE.height, SCENE.width), np.float32)
         layers["ao"] = np.random.default_rng(index).uniform(0.5, 1.5, (SCENE.height, SCENE.width)).astype(np.float32)
 
-    denoiser = Denoiser(weights, precision="float32")
+    denoiser = open_network(weights, precision="float32")
     window = align(SCENE.write(tmp_path, edit=split), aovs=("direct", "mask", "ao"))
     aovs = denoiser(window).aovs
     assert aovs["direct"].shape == (SCENE.height, SCENE.width, 3)
@@ -123,64 +121,6 @@ def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):
     assert aovs["ao"].mean() == pytest.approx(1, rel=0.05)
 
 
-def test_layers_that_add_up_to_the_color_still_do(tmp_path):
-    """And a layer that is the color comes out as the color: it was 4 dB worse, and two halves missed it by 18 %."""
-
-    def split(index, layers):
-        color = layers["ViewLayer.Combined"]
-        share = np.random.default_rng(index).uniform(0.2, 0.5, (SCENE.height, SCENE.width, 1)).astype(np.float32)
-        layers["diffuse"], layers["glossy"], layers["same"] = share * color, (1 - share) * color, color.copy()
-
-    folder = SCENE.write(tmp_path, edit=split)
-    denoiser = Denoiser(shipped_weights("fast"), precision="float32")
-    made = denoiser(align(folder, aovs=("diffuse", "glossy")))
-    together = made.aovs["diffuse"] + made.aovs["glossy"]
-    assert np.abs(together - made.color).max() < 1e-4 * made.color.mean()
-    alone = denoiser(align(folder, aovs=("same",)))
-    np.testing.assert_allclose(alone.aovs["same"], alone.color, rtol=1e-4)
-
-
-def cycles_passes(index: int, layers: dict[str, np.ndarray]) -> None:
-    """Direct and indirect light without its color, emission, and two groups of lamps, as Cycles writes them."""
-    combined, size = layers["ViewLayer.Combined"], (SCENE.height, SCENE.width)
-    rng = np.random.default_rng(index)
-    emission = np.zeros_like(combined)
-    emission[10:20, 10:20] = 0.5
-    shares = rng.dirichlet([3, 2, 2, 1], size).astype(np.float32)
-    colors = {"Diff": layers["ViewLayer.Denoising Albedo"].copy(), "Gloss": np.full_like(combined, 0.04)}
-    colors["Gloss"][:, 60:] = 0  # no gloss there, nor light of it
-    shares[:, 60:, 2:] = 0
-    total = emission.copy()
-    for k, (lobe, kind) in enumerate((a, b) for a in colors for b in ("Dir", "Ind")):
-        light = shares[..., k, None] * combined / np.maximum(colors[lobe], 0.02)
-        layers[f"ViewLayer.{lobe}{kind}"] = light
-        total += light * colors[lobe]
-    layers |= {f"ViewLayer.{lobe}Col": color for lobe, color in colors.items()}
-    key = rng.uniform(0.3, 0.8, (*size, 1)).astype(np.float32)
-    layers |= {"ViewLayer.Emit": emission, "ViewLayer.Combined": total}
-    layers |= {"ViewLayer.Combined_key": key * total, "ViewLayer.Combined_fill": (1 - key) * total}
-
-
-@pytest.mark.parametrize("give_way", ["layers", "beauty"])
-def test_all_of_cycles_passes_and_light_groups_add_up(give_way, tmp_path):
-    window = align(SCENE.write(tmp_path, edit=cycles_passes), aovs=("all",))
-    passes = {f"ViewLayer.{lobe}{kind}": f"{lobe}Col" for lobe in ("Diff", "Gloss") for kind in ("Dir", "Ind")}
-    groups = {"ViewLayer.Combined_key", "ViewLayer.Combined_fill"}
-    assert {*window.aovs} == {*passes, *groups, "ViewLayer.Emit"}
-    denoiser = Denoiser(shipped_weights("fast"), precision="float32", add_layers=give_way == "beauty")
-    made = denoiser(window)
-    assert all((layer >= 0).all() and np.isfinite(layer).all() for layer in made.aovs.values())
-    frame = open_shot(tmp_path, aovs=("DiffCol", "GlossCol")).read(SCENE.first + 2)
-    together = made.aovs["ViewLayer.Emit"] + sum(made.aovs[name] * frame.aovs[tint] for name, tint in passes.items())
-    within = 1e-4 * made.color.mean()
-    assert np.abs(together - made.color).max() < within
-    assert np.abs(sum(made.aovs[name] for name in groups) - made.color).max() < within
-    alone = Denoiser(shipped_weights("fast"), precision="float32")(align(tmp_path)).color
-    assert (np.abs(made.color - alone).max() < within) == (give_way == "layers")
-    # A picture that is the sum of its parts is denoised too: its noise has a deviation of 0.3.
-    assert np.std(made.color - alone) < 0.1 * np.mean(alone)
-
-
 def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
     def cut_out(index, layers):
         alpha = np.random.default_rng(index).uniform(0.4, 0.6, (SCENE.height, SCENE.width, 1)).astype(np.float32)
@@ -188,7 +128,7 @@ def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
 
     shot = open_shot(SCENE.write(tmp_path, edit=cut_out))
     window = FrameStream(shot, only(STAGES | {"alpha"}), first_pass=Classical(DRAFT)).align(SCENE.first + 2)
-    alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"]
+    alpha = open_network(weights, precision="float32")(window).aovs["alpha"]
     assert alpha.shape == (SCENE.height, SCENE.width, 1)
     assert 0.4 <= alpha.min() <= alpha.max() <= 0.6  # kernels are convex
     assert alpha.std() < 0.5 * window.aovs["alpha"][2].std()
@@ -206,7 +146,7 @@ def test_what_is_opaque_stays_opaque(tmp_path, weights):
         open_shot(SCENE.write(tmp_path, edit=disc)), only(STAGES | {"alpha"}), first_pass=Classical(DRAFT)
     ).align(SCENE.first + 2)
     given = window.aovs["alpha"][2][..., 0]
-    alpha = Denoiser(weights, precision="float32")(window).aovs["alpha"][..., 0]
+    alpha = open_network(weights, precision="float32")(window).aovs["alpha"][..., 0]
     for value in (0, 1):
         inside = cv2.erode((given == value).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         assert inside.any()
@@ -220,7 +160,7 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
 
     scene = Scene(height=40, width=320, frames=5)  # wide enough for tiles whose halo holds no edge
     shot = open_shot(scene.write(tmp_path, edit=blank))
-    denoiser = Denoiser(weights, tile=16, precision="float32")
+    denoiser = open_network(weights, tile=16, precision="float32")
     aligners = [FrameStream(shot, only(STAGES | extra), first_pass=Classical(DRAFT)) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
     # What is lit is mirrored by 32 pixels. A trunk leaves next to nothing where there is nothing: 0.002 beside an edge.
@@ -231,7 +171,7 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
 
 def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, weights):
     window, counted = align(folder), Breakdown()
-    denoised = Denoiser(weights, precision="float32", tile=32, breakdown=counted)(window)
+    denoised = open_network(weights, precision="float32", tile=32, breakdown=counted)(window)
     names = ["before2", "before1", "centre", "after1", "after2"]
     added = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
     assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
@@ -248,32 +188,3 @@ def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, we
         assert [float(figure) for figure in row[1:]] == pytest.approx(
             [share.mean(), share.min(), share.max()], abs=1e-4
         )
-
-
-def test_bad_options_are_refused(weights):
-    for options, word in (
-        ({"precision": "int8"}, "precision"),
-        ({"tile": 3}, "tile"),
-        ({"threshold": 1.0}, "threshold"),
-        *([({"threshold": 0.5}, "no kernels")] if weights.stem == "fast" else []),
-    ):
-        with pytest.raises(ValueError, match=word):
-            Denoiser(weights, **options)
-    with pytest.raises(ValueError, match="expected one of"):
-        shipped_weights("slowest")
-
-
-def test_more_threshold_stays_closer_to_the_input_and_to_its_own_frame():
-    """On a rendered shot, with a small network that takes no estimates: 150 steps on two other scenes."""
-    shot = open_shot("examples/shot/noisy.####.exr", frames="11")
-    window = FrameStream(shot, only(STAGES)).align(11)
-    noisy = window.color[2] * window.modulation
-    distances, weights_of_centre = [], []
-    for threshold in (0.0, 0.25, 0.5, 0.75, 0.95):
-        counted = Breakdown()
-        path = Path(__file__).parents[2] / "data" / "small.safetensors"
-        image = Denoiser(path, precision="float32", threshold=threshold, breakdown=counted)(window).color
-        distances.append(float(np.abs(image / (1 + image) - noisy / (1 + noisy)).mean()))
-        weights_of_centre.append(float(list(counted.rows())[2][1]))
-    assert all(more < less for less, more in pairwise(distances))
-    assert all(more > less for less, more in pairwise(weights_of_centre))

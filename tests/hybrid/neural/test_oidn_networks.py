@@ -16,10 +16,11 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import OIDN_MODES, denoise_frame_oidn, find_first_pass
-from hybrid.neural import denoiser, unet
-from hybrid.neural.unet import denoise_bundled, denoise_unet
+from hybrid.neural import oidn_networks
+from hybrid.neural.oidn_networks import denoise_bundled, denoise_unet
 from hybrid.stream import FrameStream
-from network.unet import OIDN_WEIGHTS, Trunk, TrunkConfig
+from network.oidn_weights import OIDN_WEIGHTS
+from network.unet import OidnUNet, OidnUNetConfig
 from tests.scenes import Scene, only
 
 pytestmark = [
@@ -67,7 +68,7 @@ def test_clean_guides_are_declared_so(frame) -> None:
 def test_tiles_do_not_show(frame, monkeypatch) -> None:
     tall = Frame(1, *(np.tile(layer, (5, 1, 1)) for layer in (frame.color, frame.albedo, frame.normal)))
     whole = denoise_frame_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
-    monkeypatch.setattr(unet, "TILE", 64)
+    monkeypatch.setattr(oidn_networks, "TILE", 64)
     parts = denoise_frame_oidn(tall, denoise_unet, quality="high", prefilter="balanced")
     # Exact but for the order of sums in bfloat16.
     assert psnr(parts, whole) > 70
@@ -96,9 +97,9 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
 def test_denoise_takes_them_unless_float32_is_asked_for(tmp_path, monkeypatch, precision, known) -> None:
     folder, calls = SCENE.write(tmp_path / "noisy"), []
     if not known:  # another version of OIDN
-        unet._network.cache_clear()
+        oidn_networks._network.cache_clear()
         monkeypatch.setitem(OIDN_WEIGHTS, "rt_hdr_alb_nrm_small", (641480, "0" * 64))
-    monkeypatch.setattr(denoiser, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
+    monkeypatch.setattr(oidn_networks, "denoise_unet", lambda color, *_, **mode: calls.append(mode) or color)
     words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--frames", "1002", "--precision", precision]
     assert main(words) == 0
     assert bool(calls) == (precision != "float32" and known)
@@ -106,5 +107,5 @@ def test_denoise_takes_them_unless_float32_is_asked_for(tmp_path, monkeypatch, p
 
 @pytest.mark.parametrize(("there", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_bfloat16_is_for_processors_that_have_it(there, dtype, monkeypatch):
-    monkeypatch.setattr(unet, "has_bfloat16", lambda device: there)
-    assert unet._for_running(Trunk(TrunkConfig(9, "small"))).first.weight.dtype == dtype
+    monkeypatch.setattr(oidn_networks, "has_bfloat16", lambda device: there)
+    assert oidn_networks._for_inference(OidnUNet(OidnUNetConfig(9, "small"))).first.weight.dtype == dtype

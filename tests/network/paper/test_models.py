@@ -10,8 +10,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network.models import (
-    PRESETS,
+from network.paper.inputs import KernelWindow, network_inputs
+from network.paper.kernels import apply_kernels, mean_of
+from network.paper.models import (
     TKPCN,
     KernelConfig,
     KernelHead,
@@ -22,14 +23,10 @@ from network.models import (
     RAUNet,
     RAUNetConfig,
     TKPCNConfig,
-    denoise_tile,
+    filter_window,
     for_inference,
-    paper,
-    unet,
-    window_length,
 )
-from network.paper.inputs import network_inputs
-from network.paper.kernels import apply_kernels, mean_of
+from network.presets import build_preset
 
 pytestmark = pytest.mark.neural
 
@@ -74,7 +71,7 @@ def exposure(color: torch.Tensor) -> torch.Tensor:
 @torch.no_grad()
 def run(model: RAUNet | RAResNet | TKPCN | MultiScale, data: dict[str, torch.Tensor]) -> torch.Tensor:
     """Kernels of a window."""
-    return model(network_inputs(**data, exposure=exposure(data["color"])), data["confidence"])
+    return model(network_inputs(KernelWindow(**data, exposure=exposure(data["color"]))), data["confidence"])
 
 
 # Kernels of an untrained model
@@ -122,7 +119,7 @@ def test_a_higher_threshold_at_run_time_uses_fewer_taps() -> None:
     with torch.no_grad():
         model.head.window.weight.mul_(30)  # an untrained head is nearly uniform
     data = window()
-    features = network_inputs(**data, exposure=torch.ones(1))
+    features = network_inputs(KernelWindow(**data, exposure=torch.ones(1)))
     used = [int((model(features, data["confidence"], t) > 0).sum()) for t in (0, 0.3, 0.6, 0.95)]
     assert used[0] > used[1] > used[2] > used[3]
 
@@ -130,7 +127,7 @@ def test_a_higher_threshold_at_run_time_uses_fewer_taps() -> None:
 @pytest.mark.parametrize("threshold", [1.0, -0.1])
 def test_a_threshold_of_one_or_more_is_an_error(threshold: float) -> None:
     data = window()
-    features = network_inputs(**data, exposure=torch.ones(1))
+    features = network_inputs(KernelWindow(**data, exposure=torch.ones(1)))
     with pytest.raises(ValueError, match="threshold: expected 0 <= t·K < 1"):
         small_unet()(features, data["confidence"], threshold)
     with pytest.raises(ValueError, match="threshold: expected 0 <= t·K < 1"):
@@ -180,7 +177,7 @@ def test_the_papers_network_is_wired_as_its_figure() -> None:
     torch.manual_seed(0)
     model = RAResNet(RAResNetConfig(SMALL, width=4, blocks=6, ra_after=(2, 3, 6), skips=2))
     data = window()
-    features = network_inputs(**data, exposure=exposure(data["color"]))
+    features = network_inputs(KernelWindow(**data, exposure=exposure(data["color"])))
     blocks, average, skip = model.blocks, model.average, model.skip
     with torch.no_grad():
         start = model.stem(features.transpose(0, 1).flatten(0, 1))
@@ -194,14 +191,14 @@ def test_the_papers_network_is_wired_as_its_figure() -> None:
 
 def test_the_paper_has_its_ra_blocks_where_its_figure_has_them() -> None:
     """After blocks 3, 6, 9, 12, 15 and 24 of 24; the first four sections are skipped."""
-    model = paper()
+    model = build_preset("paper")
     order: list[str] = []
     for name, module in model.named_modules():
         if name.startswith(("blocks.", "average.", "skip.")) and name.count(".") == 1:
             module.register_forward_hook(lambda *_, name=name: order.append(name))
     data = window(t=5)
     with torch.no_grad():
-        model.trunk(network_inputs(**data, exposure=exposure(data["color"])))
+        model.trunk(network_inputs(KernelWindow(**data, exposure=exposure(data["color"]))))
     expected: list[str] = []
     for block in range(1, 25):
         expected.append(f"blocks.{block - 1}")
@@ -271,16 +268,6 @@ def test_any_robust_average_network_can_predict_at_several_resolutions(base: RAU
     torch.testing.assert_close(denoised(model, constant), torch.full((1, 3, 8, 12), 3.7))
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_models_of_any_window_length(name: str) -> None:
-    sizes = {"fast": 330_000, "balanced": 930_000, "quality": 3_900_000, "unet": 250_000, "multiscale": 1_700_000}
-    sizes |= {"paper": 3_600_000, "tkpcn": 3_400_000}
-    for frames in (3, 5):
-        model = PRESETS[name](frames=frames, seed=1)
-        assert window_length(model) == frames
-        assert sum(p.numel() for p in model.parameters()) < sizes[name]
-
-
 def test_the_paper_network_has_the_parameters_it_should() -> None:
     """The parts' counts, width 80 and 3×3 convolutions; the sum is not the paper's 24 M."""
     conv = 80 * 80 * 9 + 80
@@ -291,20 +278,10 @@ def test_the_paper_network_has_the_parameters_it_should() -> None:
         "skip": 4 * (160 * 80 + 80),
         "head": 80 * 25 * 9 + 25,
     }
-    model = paper()
+    model = build_preset("paper")
     found = {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()}
     assert found == expected
     assert sum(expected.values()) == 3_541_471
-
-
-def test_presets_are_reproducible_and_leave_the_global_generator_alone() -> None:
-    torch.manual_seed(1)
-    expected = torch.rand(1)
-    torch.manual_seed(1)
-    first, second, other = unet(seed=3), unet(seed=3), unet(seed=4)
-    assert torch.equal(torch.rand(1), expected)
-    assert torch.equal(first.stem.weight, second.stem.weight)
-    assert not torch.equal(first.stem.weight, other.stem.weight)
 
 
 @pytest.mark.parametrize(("height", "width", "axis"), [(9, 12, "height"), (8, 10, "width"), (0, 12, "height")])
@@ -345,8 +322,9 @@ def test_configurations_say_what_is_wrong(make, message: str) -> None:  # type: 
 # Denoising
 
 
+@torch.no_grad()
 def denoised(model: RAUNet, data: dict[str, torch.Tensor], **more: torch.Tensor) -> torch.Tensor:
-    return denoise_tile(model, {"exposure": exposure(data["color"]), **data, **more})[0]
+    return filter_window(model, KernelWindow(**{"exposure": exposure(data["color"]), **data, **more})).irradiance
 
 
 def test_denoising_is_scale_equivariant() -> None:
@@ -375,17 +353,12 @@ def test_denoising_stays_within_the_range_of_its_input() -> None:
     assert not bool(black.any())
 
 
-def test_a_model_without_estimates_ignores_one() -> None:
-    model, data = small_unet(), window()
-    with_one = denoised(model, data, estimate=uniform(1, 3, 3, 8, 12, seed=5))
-    assert torch.equal(with_one, denoised(model, data))
-
-
 def test_layers_are_filtered_with_the_kernels_of_the_color() -> None:
     model, data = small_unet(), window()
     layers = torch.cat([data["color"], data["color"][:, :, :1] * 2], 2)
-    out, _, aovs = denoise_tile(model, {**data, "exposure": torch.ones(1)}, aovs=layers)
-    torch.testing.assert_close(aovs, torch.cat([out, out[:, :1] * 2], 1))
+    found = filter_window(model, KernelWindow(**data, exposure=torch.ones(1)))
+    out = found.irradiance
+    torch.testing.assert_close(found.apply(layers), torch.cat([out, out[:, :1] * 2], 1))
 
 
 def test_bfloat16_is_close_to_float32() -> None:

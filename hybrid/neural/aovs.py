@@ -1,0 +1,138 @@
+"""Light passes and other AOVs of a window: filtered, and kept consistent with the denoised color."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid.alignment.prepare import ALPHA
+from hybrid.alignment.transfer import compress
+from hybrid.alignment.window import AlignedWindow
+from hybrid.files.passes import BEAUTY
+from nlm.average import average
+from nlm.parts import add_light, filter_layers, split_light
+
+Array = NDArray[np.float32]
+
+
+class SharedLight(NamedTuple):
+    """AOVs and color whose sums agree.
+
+    Attributes
+    ----------
+    aovs : dict of str to (H, W, C) array
+        Radiance.
+    color : (H, W, 3) array
+        Radiance.
+    parts : frozenset of str
+        Names of the AOVs that are parts of a sum.
+    """
+
+    aovs: dict[str, Array]
+    color: Array
+    parts: frozenset[str]
+
+
+def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
+    """Average the AOVs of a window over time, and filter each guided by the denoised light; alpha is only averaged.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        The window.
+    irradiance : (H, W, 3) array
+        The denoised centre.
+
+    Returns
+    -------
+    dict of str to (H, W, C) array
+        By name; `BEAUTY`, where some sums are incomplete, is the color filtered alike.
+    """
+    means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
+    names = [name for name in means if name != ALPHA]
+    if not names:
+        return means
+    for name in names:
+        if aligned.aovs[name][aligned.centre].min() >= 0:
+            np.maximum(means[name], 0, out=means[name])  # interpolation undershoots
+    light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
+    guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
+    moments = aligned.moments[:, : guide.shape[-1]]
+    if any(not found.complete for found in aligned.passes.sums):
+        means[BEAUTY] = average(aligned.color, aligned.confidence)
+        names.append(BEAUTY)
+    return means | dict(zip(names, filter_layers([means[n] for n in names], guide, moments=moments), strict=True))
+
+
+def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Array, *, add: bool) -> SharedLight:
+    """Make filtered AOVs that are parts of the color, or of another AOV, add up to it.
+
+    Parameters
+    ----------
+    aligned : AlignedWindow
+        The window.
+    filtered : dict of str to (H, W, C) array
+        The AOVs, without texture where they are textured.
+    irradiance : (H, W, 3) array
+        The denoised centre.
+    add : bool
+        Whether the color becomes the sum of its parts; otherwise the parts are scaled to it.
+
+    Returns
+    -------
+    SharedLight
+    """
+    sums, exposure = aligned.passes.sums, aligned.exposure
+    aovs = {name: layer for name, layer in filtered.items() if name != BEAUTY}
+    filtered_color = filtered.get(BEAUTY, irradiance) * aligned.modulation
+    factors = {name: _factor(name, aligned) for name in aovs}
+    images = {name: add_light([part], [factors[name]]) for name, part in aovs.items()}
+    images[BEAUTY] = irradiance * aligned.modulation
+    # The color becomes one sum alone; other sums of the same light are scaled to it then.
+    first = next((found for found in sums if found.whole == BEAUTY and found.complete), None) if add else None
+    for found in ([first] if first else []) + [other for other in sums if other is not first]:
+        parts, whole = [filtered[name] for name in found.parts], found.whole
+        by = [factors[name] for name in found.parts]
+        if found is first:
+            images[BEAUTY] = add_light(parts, by)
+            split = parts
+        elif found.complete:
+            bounds = [
+                average(aligned.aovs[name], aligned.confidence) if name in aligned.pass_colors else None
+                for name in found.parts
+            ]
+            split = split_light(parts, images[whole], exposure=exposure, factors=by, bounds=bounds)
+        else:
+            # The light that is in none of the parts is a further part.
+            rest = np.maximum(filtered_color - add_light(parts, by), 0)
+            split = split_light([*parts, rest], images[whole], exposure=exposure, factors=[*by, None])[:-1]
+        for name, part, factor in zip(found.parts, split, by, strict=True):
+            aovs[name] = part
+            images[name] = add_light([part], [factor])
+    for name in aovs:
+        if name == ALPHA:
+            centre_alpha = aligned.aovs[name][aligned.centre]
+            aovs[name] = np.where(_is_uniform(centre_alpha), centre_alpha, aovs[name])
+        elif name not in aligned.pass_colors and (factor := factors[name]) is not None:
+            aovs[name] = aovs[name] * factor
+    return SharedLight(aovs, images[BEAUTY], frozenset(name for found in sums for name in found.parts))
+
+
+def _factor(name: str, aligned: AlignedWindow) -> Array | None:
+    """Factor from a filtered AOV to radiance; None: 1."""
+    if name in aligned.pass_colors:
+        return aligned.pass_colors[name]
+    if name not in aligned.passes.textured:
+        return None
+    modulation = aligned.modulation
+    return modulation if aligned.aovs[name].shape[-1] == 3 else modulation.mean(axis=-1, keepdims=True)
+
+
+def _is_uniform(alpha: Array) -> NDArray[np.bool_]:
+    """Where a pixel and its 3×3 neighbours are all opaque or all transparent: nothing to filter (H, W, 1)."""
+    box = np.ones((3, 3), np.uint8)
+    opaque, transparent = (cv2.erode((alpha[..., 0] == value).astype(np.uint8), box) > 0 for value in (1, 0))
+    return np.logical_or(opaque, transparent)[..., None]

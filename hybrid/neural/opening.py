@@ -1,0 +1,87 @@
+"""Open the denoiser that a file of weights belongs to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hybrid.breakdown import Breakdown
+from hybrid.neural.network_denoiser import NetworkDenoiser, Setup
+from hybrid.neural.unet_denoiser import UNetDenoiser
+from hybrid.runtime.timing import Timings
+from network.checkpoint import load_model
+from network.devices import find_device, has_bfloat16
+from network.robust_unet import RobustUNet
+
+PRECISIONS = ("auto", "float32", "bfloat16")
+# Side of a tile where memory is short, pixels.
+SMALL_TILE = 384
+
+
+def open_network(
+    weights: Path,
+    *,
+    tile: int | None = None,
+    precision: str = "auto",
+    device: str = "cpu",
+    threshold: float | None = None,
+    breakdown: Breakdown | None = None,
+    add_layers: bool = False,
+    timings: Timings | None = None,
+) -> NetworkDenoiser:
+    """Load weights, and return the denoiser that runs them.
+
+    Parameters
+    ----------
+    weights : Path
+        Output of a training, or of a preset.
+    tile : int, optional
+        Side of the squares that the network processes at once, pixels; a halo is added around each. Default: the
+        denoiser's `default_tile`.
+    precision : str
+        One of `PRECISIONS`; "auto" is bfloat16 where the processor computes in it.
+    device : str
+        As for `network.devices.find_device`.
+    threshold : float, optional
+        t·K of predicted kernels, in [0, 1); higher stays closer to the input. Default: that of the training.
+    breakdown : Breakdown, optional
+        Counts the weights of the frames; each frame's contribution and weight are then further layers.
+    add_layers : bool
+        Whether the image is the sum of its light passes, instead of these being scaled to it.
+    timings : Timings, optional
+        Counts the stage "network".
+
+    Returns
+    -------
+    NetworkDenoiser
+
+    Raises
+    ------
+    ValueError
+        A bad option, a threshold for a network without kernels, or a file without a model.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision is {precision!r}, expected one of {', '.join(PRECISIONS)}")
+    if tile is not None and tile < 16:
+        raise ValueError(f"tile is {tile}, expected at least 16 pixels")
+    if threshold is not None and not 0 <= threshold < 1:
+        raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
+    name, torch_device = find_device(device)
+    bfloat16 = precision == "bfloat16" or (precision == "auto" and has_bfloat16(torch_device))
+    setup = Setup(
+        device=name,
+        torch_device=torch_device,
+        bfloat16=bfloat16,
+        exact=precision == "float32",
+        tile=tile,
+        add_layers=add_layers,
+        breakdown=breakdown,
+        timings=timings or Timings(),
+    )
+    model = load_model(weights)
+    if isinstance(model, RobustUNet):
+        if threshold is not None:
+            raise ValueError(f"threshold is {threshold}, expected none: the network of {weights.name} has no kernels")
+        return UNetDenoiser(model, setup)
+    from hybrid.neural.kernel_denoiser import KernelDenoiser  # here, since no preset needs it
+
+    return KernelDenoiser(model, setup, threshold)

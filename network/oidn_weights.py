@@ -1,0 +1,176 @@
+"""Weights of Intel Open Image Denoise (OIDN), read from the library that the package ``pyoidn`` installs.
+
+References
+----------
+The weights are those of RenderKit/oidn-weights, Apache-2.0 (see NOTICE). None of them is part of this module.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import mmap
+import struct
+from itertools import chain
+from math import prod
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from network.unet import ENCODERS, OidnUNet, OidnUNetConfig
+
+#: Bytes and SHA-256 of each network in version 2.5.1.
+OIDN_WEIGHTS = {
+    "rt_hdr": (1830792, "a097e8fe9b1ba71ec43cde3e6df3fcf54fa4f8f2f4dd41eac01d0a76a16261e3"),
+    "rt_hdr_small": (634568, "c9171947f2bceb4367725b7a0d5b4e0d663ac44108386af42f1b49e4361952e7"),
+    "rt_hdr_alb": (1835976, "a8e4fbbd3a794e0098f88e23882faf5459840bda5b0ff39f22bcaaf2cfd03b5a"),
+    "rt_hdr_alb_small": (638024, "1f3839dfc949e969bc5ad4d600e85bfa96187e0cb5ffee2f4715c791e6221fba"),
+    "rt_hdr_alb_nrm": (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
+    "rt_hdr_alb_nrm_small": (641480, "980ea307e7825cae23ed8b1addf8de62ece84b61094795a5631ebf1c91b2e1a7"),
+    "rt_hdr_calb_cnrm": (1841160, "d0057057bd76c64e3e67b449728ef8f4fd2f11ccfb74c1e59b9d50dafd50ee0e"),
+    "rt_hdr_calb_cnrm_small": (641480, "a6c43bfdbff01bdd8a9c777e139720f9e58b872a50c8db07079bddd007482dc5"),
+    "rt_hdr_calb_cnrm_large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
+    "rt_alb": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
+    "rt_alb_large": (7684615, "a8efbe6eed511f41c8f5ff9145923214cefb0703cf91a3b00a1dc131ade1600a"),
+    "rt_nrm": (1830792, "fb8f7f5571332b602406f88a0b570d809dd3c06aebb530f5d048828f57490bc7"),
+    "rt_nrm_large": (7684615, "8ac7705ec5ac303116b40ad2f0880cd741ed1f4280828bf2f18f7635c3377257"),
+}
+# First bytes of a TZA file: magic and version.
+_TZA = struct.pack("<HBB", 0x41D7, 2, 0)
+
+
+def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
+    """Read the tensors of a TZA file, OIDN's archive of weights.
+
+    Parameters
+    ----------
+    data : bytes
+        The file, of version 2.
+    where : str
+        Name of the file in error messages.
+
+    Returns
+    -------
+    dict of str to Tensor
+        Float32, in the order of the file, which is the order of the layers.
+
+    Raises
+    ------
+    ValueError
+        If data is no TZA file, is cut short, or holds numbers that are not finite.
+
+    Notes
+    -----
+    All little-endian. Magic 0x41D7 (uint16), version (2 × uint8), offset of the table (uint64); in the table the number
+    of tensors (uint32), and for each the length of its name (uint16), the name, the number of dimensions (uint8), sizes
+    (uint32), layout (a letter each), type (``f`` or ``h``), offset of the values (uint64).
+    """
+    position = 0
+
+    def take(form: str) -> tuple[int, ...]:
+        nonlocal position
+        size = struct.calcsize("<" + form)
+        if position + size > len(data):
+            raise ValueError(f"{where}: expected {size} bytes at {position}, got {max(len(data) - position, 0)}")
+        values = struct.unpack_from("<" + form, data, position)
+        position += size
+        return values
+
+    def take_text(length: int) -> str:
+        try:
+            return bytes(take(f"{length}B")).decode("ascii")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{where}: expected ASCII at {position - length}") from error
+
+    magic, major, _, position = take("HBBQ")
+    if (magic, major) != (0x41D7, 2):
+        raise ValueError(f"{where}: expected magic 0x41d7 and version 2, got {magic:#x} and {major}")
+    tensors: dict[str, Tensor] = {}
+    for _ in range(*take("I")):
+        name = take_text(*take("H"))
+        shape = take(f"{take('B')[0]}I")
+        layout, kind = take_text(len(shape)), take_text(1)
+        (offset,) = take("Q")
+        if name in tensors or layout not in ("x", "oihw") or kind not in ("f", "h"):
+            raise ValueError(f"{where}: expected a new tensor, x or oihw, f or h, got {name!r}, {layout!r}, {kind!r}")
+        count, dtype = prod(shape), torch.float32 if kind == "f" else torch.float16
+        if count == 0 or offset + count * dtype.itemsize > len(data):
+            raise ValueError(f"{where}: {name} of shape {shape}: expected some values, all within the file")
+        values = torch.frombuffer(bytearray(data[offset : offset + count * dtype.itemsize]), dtype=dtype).float()
+        if not bool(values.isfinite().all()):
+            raise ValueError(f"{where}: {name}: expected finite numbers, got others among them")
+        tensors[name] = values.view(shape)
+    return tensors
+
+
+def build_unet(tensors: dict[str, Tensor], where: str = "TZA") -> OidnUNet:
+    """Build the U-Net that the tensors of a TZA file belong to.
+
+    Parameters
+    ----------
+    tensors : dict of Tensor
+        From `read_tza`.
+    where : str
+        Name of the file in error messages.
+
+    Returns
+    -------
+    OidnUNet
+        Float32, with these weights.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are not those of a small, base or large U-Net.
+    """
+    found = [tuple(value.shape) for value in tensors.values()]
+    inputs = found[0][1] if found and len(found[0]) == 4 else 1
+    # On the device "meta" networks take no memory: a file cannot ask for more than it holds.
+    with torch.device("meta"):
+        unets = [OidnUNet(OidnUNetConfig(inputs, size)) for size in ENCODERS]
+    for unet in unets:
+        state = unet.state_dict()
+        if found == [tuple(value.shape) for value in state.values()]:
+            unet.load_state_dict(dict(zip(state, tensors.values(), strict=True)), assign=True)
+            return unet
+    raise ValueError(f"{where}: expected the layers of a small, base or large U-Net, got {len(found)} other tensors")
+
+
+def load_oidn(name: str) -> OidnUNet:
+    """Load a network of OIDN, one of `OIDN_WEIGHTS`, in float32.
+
+    Raises
+    ------
+    ValueError
+        If there is no such network, or the library does not hold its weights.
+    FileNotFoundError
+        If there is no such library.
+    """
+    if name not in OIDN_WEIGHTS:
+        raise ValueError(f"OIDN's weights: expected one of {', '.join(OIDN_WEIGHTS)}, got {name!r}")
+    path = find_library()
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as library:
+        return build_unet(read_tza(_find_blob(library, name, path), name), name)
+
+
+def find_library() -> Path:
+    """Path of the library of ``pyoidn`` that holds the weights; FileNotFoundError without one."""
+    spec = importlib.util.find_spec("pyoidn")
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    found = sorted(chain.from_iterable(Path(folder).rglob("*OpenImageDenoise_core.*") for folder in folders))
+    if not found:
+        raise FileNotFoundError("OIDN's weights: expected libOpenImageDenoise_core of the package pyoidn, found none")
+    return found[0]
+
+
+def _find_blob(library: mmap.mmap, name: str, path: Path) -> bytes:
+    """Bytes of a network's weights, found in the library by their SHA-256."""
+    size, digest = OIDN_WEIGHTS[name]
+    start = library.find(_TZA)
+    while start >= 0:
+        blob = library[start : start + size]
+        if len(blob) == size and hashlib.sha256(blob).hexdigest() == digest:
+            return blob
+        start = library.find(_TZA, start + 1)
+    raise ValueError(f"OIDN's weights: expected {name} of OIDN 2.5.1 in {path.name}, found none of that SHA-256")

@@ -1,0 +1,80 @@
+"""Networks by name, with initial weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+
+from network.paper.models import (
+    TKPCN,
+    KernelConfig,
+    KernelModel,
+    MultiScale,
+    MultiScaleConfig,
+    RAResNet,
+    RAResNetConfig,
+    RAUNet,
+    RAUNetConfig,
+    TKPCNConfig,
+)
+from network.robust_unet import RobustUNet, RobustUNetConfig
+
+Model = RobustUNet | KernelModel
+
+
+class Preset(NamedTuple):
+    """A network by the length of its windows, and its usual length."""
+
+    build: Callable[[int], Model]
+    frames: int = 5
+
+
+def _multiscale(frames: int) -> MultiScale:
+    base = RAUNetConfig(KernelConfig(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
+    return MultiScale(MultiScaleConfig(base))
+
+
+PRESETS: dict[str, Preset] = {
+    # The final stage on OIDN's small, base and large U-Net: 0.3, 0.9 and 3.9 M parameters.
+    "fast": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "small"))),
+    "balanced": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "base"))),
+    "quality": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True)), frames=7),
+    # From noisy frames alone: a small U-Net of 0.24 M parameters; a four-scale U-Net with RA blocks at every scale and
+    # kernels at three resolutions; the paper's network of 24 blocks of width 80; the paper's baseline of that size.
+    "unet": Preset(lambda frames: RAUNet(RAUNetConfig(KernelConfig(frames)))),
+    "multiscale": Preset(_multiscale),
+    "paper": Preset(lambda frames: RAResNet(RAResNetConfig(KernelConfig(frames)))),
+    "tkpcn": Preset(lambda frames: TKPCN(TKPCNConfig(KernelConfig(frames)))),
+}
+
+
+def build_preset(name: str, frames: int | None = None, seed: int = 0) -> Model:
+    """Build a network of `PRESETS` with initial weights; the global generator is left as it was.
+
+    Parameters
+    ----------
+    name : str
+        Of `PRESETS`.
+    frames : int, optional
+        Length of the windows, odd. Default: the preset's.
+    seed : int
+        Of the initial weights.
+
+    Returns
+    -------
+    Model
+        For training.
+
+    Raises
+    ------
+    ValueError
+        If there is no such preset.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset is {name!r}, expected one of {', '.join(PRESETS)}")
+    preset = PRESETS[name]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return preset.build(preset.frames if frames is None else frames)

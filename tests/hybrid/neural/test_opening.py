@@ -1,0 +1,56 @@
+"""Files of weights are opened as the denoiser that they belong to."""
+
+import pytest
+
+from tests.scenes import Scene, only
+
+torch = pytest.importorskip("torch")
+
+from hybrid.files.shots import open_shot  # noqa: E402
+from hybrid.neural import open_network  # noqa: E402
+from hybrid.stream import FrameStream  # noqa: E402
+from network.checkpoint import save_model, shipped_weights  # noqa: E402
+from network.paper import TKPCN_WEIGHTS  # noqa: E402
+from network.presets import build_preset  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+
+@pytest.fixture(params=["fast", "unet"])
+def weights(request, tmp_path):
+    save_model(tmp_path / f"{request.param}.safetensors", build_preset(request.param))
+    return tmp_path / f"{request.param}.safetensors"
+
+
+def test_bad_options_are_refused(weights):
+    for options, word in (
+        ({"precision": "int8"}, "precision"),
+        ({"tile": 3}, "tile"),
+        ({"threshold": 1.0}, "threshold"),
+        *([({"threshold": 0.5}, "no kernels")] if weights.stem == "fast" else []),
+    ):
+        with pytest.raises(ValueError, match=word):
+            open_network(weights, **options)
+    with pytest.raises(ValueError, match="expected one of"):
+        shipped_weights("slowest")
+
+
+def test_the_denoiser_is_that_of_the_weights():
+    final, kernels = open_network(shipped_weights("quality")), open_network(TKPCN_WEIGHTS)
+    assert (final.needs_first_pass, final.radius, final.tile) == (True, 3, 2048)
+    assert (kernels.needs_first_pass, kernels.radius, kernels.tile) == (False, 2, 640)
+
+
+def test_memory_is_that_of_a_tile_with_its_halo():
+    """float32 takes twice as much, and a tile no more than the frame."""
+    half, full = (open_network(shipped_weights("fast"), precision=p, tile=64) for p in ("bfloat16", "float32"))
+    assert half.memory((1080, 1920)) == 100 * (64 + 2 * half.halo) ** 2
+    assert full.memory((1080, 1920)) == 2 * half.memory((1080, 1920))
+    assert half.memory((10, 20)) == 100 * 10 * 20
+
+
+def test_a_network_that_needs_a_first_pass_says_so(tmp_path):
+    shot = open_shot(Scene(frames=5).write(tmp_path))
+    window = FrameStream(shot, only({"warp"})).align(shot.numbers[2])
+    with pytest.raises(ValueError, match="estimate: expected those of the frames, as this network takes, got none"):
+        open_network(shipped_weights("fast"))(window)

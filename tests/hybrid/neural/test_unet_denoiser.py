@@ -1,0 +1,60 @@
+"""Windows on their way to the final stage: guides, and frames without light."""
+
+import numpy as np
+import pytest
+
+from tests.scenes import Scene, only
+
+torch = pytest.importorskip("torch")
+
+from hybrid.files.shots import open_shot  # noqa: E402
+from hybrid.first_pass import Classical  # noqa: E402
+from hybrid.neural import open_network, unet_denoiser  # noqa: E402
+from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
+from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.stream import FrameStream  # noqa: E402
+from network.checkpoint import shipped_weights  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+SCENE = Scene(height=40, width=48, frames=5)
+
+
+def align(folder, *stages):
+    return FrameStream(open_shot(folder), only({"warp", *stages}), first_pass=Classical(DRAFT)).align(SCENE.first + 2)
+
+
+def test_a_black_frame_stays_black(tmp_path, monkeypatch):
+    """No network runs on it: there is no exposure to run it at."""
+
+    def darken(index, layers):
+        layers["ViewLayer.Combined"][:] = 0
+
+    window = align(SCENE.write(tmp_path, edit=darken))
+    monkeypatch.setattr(unet_denoiser, "denoise_window", None)
+    assert not open_network(shipped_weights("fast"))(window).color.any()
+
+
+def test_guides_are_cleaned_where_they_have_noise(tmp_path, monkeypatch):
+    folder = SCENE.write(tmp_path)
+    plain = align(folder)
+    assert clean_guides(plain) is plain.guides
+    noisy = align(folder, "prefilter")
+    monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda: False)
+    ours = clean_guides(noisy)
+    np.testing.assert_array_equal(np.concatenate(list(ours.values()), axis=-1), noisy.guide)
+    monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda: True)
+    monkeypatch.setattr(unet_denoiser, "prefilter_guides", lambda guides: {name: -guides[name] for name in guides})
+    for name, guide in clean_guides(noisy).items():
+        np.testing.assert_array_equal(guide, -noisy.guides[name])
+
+
+@pytest.mark.parametrize("preset", ["fast", "quality"])
+def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, monkeypatch):
+    folder = SCENE.write(tmp_path)
+    denoiser = open_network(shipped_weights(preset), precision="float32")
+    seen = []
+    monkeypatch.setattr(unet_denoiser, "clean_guides", lambda aligned: seen.append(aligned) or aligned.guides)
+    aligner = FrameStream(open_shot(folder), only({"warp"}), radius=denoiser.radius, first_pass=Classical(DRAFT))
+    denoiser(aligner.align(SCENE.first + 2))
+    assert bool(seen) == (preset == "quality")
