@@ -143,7 +143,7 @@ class DenoiseOptions:
         preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release
         if preset == "tkpcn":
             weights = "network/paper/weights/tkpcn.safetensors"
-            raise ValueError(f"preset is 'tkpcn', which is no preset any more, expected its weights: --weights {weights}")
+            raise ValueError(f"preset is 'tkpcn', no preset any more, expected --weights {weights}")
         if preset and preset not in METHOD_OF_PRESET:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(METHOD_OF_PRESET)}")
         method = self.method or METHOD_OF_PRESET.get(preset, "network")

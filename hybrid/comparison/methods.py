@@ -159,7 +159,7 @@ class Classical:
 
 @dataclass(frozen=True)
 class Network:
-    """Denoise with a network and the weights of a preset; the other settings are those of `hybrid.neural.Denoiser`.
+    """Denoise with a network and the weights of a preset; the other settings are those of `hybrid.neural.open_network`.
 
     The radius of the windows is that of the network.
     """

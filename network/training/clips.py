@@ -463,7 +463,8 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
     """
     paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:
-        raise FileNotFoundError(f"clips: no *.safetensors in {os.fspath(folder)!r}; expected what ravg make-clips writes")
+        where = os.fspath(folder)
+        raise FileNotFoundError(f"clips: no *.safetensors in {where!r}; expected what ravg make-clips writes")
     shards = []
     for path in paths:
         where = f"clips {os.fspath(path)!r}"

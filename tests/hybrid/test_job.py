@@ -225,3 +225,8 @@ def test_presets_and_methods_belong_together():
 def test_the_old_name_of_the_first_pass_is_accepted():
     with pytest.warns(DeprecationWarning, match="estimate is now first_pass"):
         assert replace_options(None, {"estimate": "nlm"}).first_pass == "nlm"
+
+
+def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named():
+    with pytest.raises(ValueError, match=r"preset is 'tkpcn', no preset any more, expected --weights .*tkpcn\.safet"):
+        job.DenoiseOptions(preset="tkpcn")
