@@ -5,12 +5,11 @@
 Writes one multi-layer EXR per frame and noise level, in the layout that Blender's own
 "OpenEXR MultiLayer" output has: ``out/shot/noisy.0008.exr``, ``out/shot/reference.0008.exr``.
 The image is a crop (render border) of a film-size camera, so that motion and texture have the
-statistics of a real shot and not those of a thumbnail. Frames that exist are left alone, so a run
-that was stopped goes on where it was.
+statistics of a real shot and not those of a thumbnail. Existing frames are skipped, so an interrupted
+run can be resumed.
 
-It is kept for what was made with it: the bundled shot, the shots of the report and those that the weights were trained
-on, their moving objects and seeds as they were, and frames as Blender's defaults render them. For new shots there is
-`ravg simulate`.
+The script reproduces the bundled shot, the shots of the report, those that the weights were trained on, and frames
+with Blender's default settings. For new shots use `ravg simulate`.
 """
 
 from __future__ import annotations
@@ -33,21 +32,17 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("out", type=Path)
     parser.add_argument("--camera", default="Camera_move")
     parser.add_argument("--frames", default="8-14", help="first-last")
-    parser.add_argument("--size", default="320x180", help="of the crop that is rendered")
-    parser.add_argument("--film", default="1920x1080", help="of the whole camera")
-    parser.add_argument("--center", default="0.5,0.5", help="of the crop, as fractions, x right, y down")
+    parser.add_argument("--size", default="320x180", help="pixels of the rendered crop")
+    parser.add_argument("--film", default="1920x1080", help="pixels of the whole camera")
+    parser.add_argument("--center", default="0.5,0.5", help="center of the crop in the film, as fractions, y down")
     parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
-    parser.add_argument("--reference", type=int, default=0, help="samples of the reference; 0: none")
-    parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="of the reference; default: all")
-    parser.add_argument("--second-reference", action="store_true", help="another one, reference_b, of other seeds")
-    parser.add_argument("--movers", type=int, default=0, help="moving objects to add in front of the camera")
-    parser.add_argument(
-        "--defaults",
-        action="store_true",
-        help="as a new Blender file renders: denoised by OIDN with its passes stored, adaptive sampling, indirect "
-        "light clamped at 10, one seed for all frames",
-    )
-    parser.add_argument("--compact", action="store_true", help="all channels as half, without the denoising depth")
+    parser.add_argument("--reference", type=int, default=0, help="samples per pixel of a reference; 0: none")
+    parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="frames with a reference; default: all")
+    parser.add_argument("--second-reference", action="store_true", help="add reference_b, of other seeds")
+    parser.add_argument("--moving-objects", "--movers", type=int, default=0, help="add objects that cross the crop")
+    defaults = "Blender's defaults: OIDN with its passes stored, adaptive sampling, clamped indirect light, one seed"
+    parser.add_argument("--defaults", action="store_true", help=defaults)
+    parser.add_argument("--compact", action="store_true", help="write all channels as half, without denoising depth")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args(argv)
@@ -66,7 +61,7 @@ def set_crop(render: bpy.types.RenderSettings, film: str, size: str, center: str
 
 
 def random_material(rng: random.Random) -> bpy.types.Material:
-    """A two-tone noise-textured surface, diffuse to glossy, sometimes metal."""
+    """Make a two-tone noise texture, diffuse to glossy, sometimes metal."""
     material = bpy.data.materials.new("mover")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -83,8 +78,8 @@ def random_material(rng: random.Random) -> bpy.types.Material:
     return material
 
 
-def add_mover(scene: bpy.types.Scene, rng: random.Random, film: str, size: str, center: str, mid: int) -> None:
-    """Add an object that crosses the crop at a few pixels per frame, half way to what lies behind it."""
+def add_moving_object(scene: bpy.types.Scene, rng: random.Random, film: str, size: str, center: str, mid: int) -> None:
+    """Add an object that crosses the crop at a few pixels per frame, between the camera and the scene."""
     (film_w, film_h), (w, h) = (map(int, text.split("x")) for text in (film, size))
     cx, cy = map(float, center.split(","))
     scene.frame_set(mid)
@@ -101,33 +96,26 @@ def add_mover(scene: bpy.types.Scene, rng: random.Random, film: str, size: str, 
     depth = rng.uniform(0.4, 0.8) * distance
     plane = (top_left + x * right + y * down - eye).length
     pixel = right.length / film_w * depth / plane  # world units per film pixel there
-    add = rng.choice(
-        [
-            bpy.ops.mesh.primitive_monkey_add,
-            bpy.ops.mesh.primitive_torus_add,
-            bpy.ops.mesh.primitive_cube_add,
-            bpy.ops.mesh.primitive_uv_sphere_add,
-        ]
-    )
-    add(location=eye + direction * depth)
-    mover = bpy.context.active_object
-    mover.scale = Vector((1, 1, 1)) * pixel * rng.uniform(0.12, 0.3) * h
-    mover.data.materials.clear()
-    mover.data.materials.append(random_material(rng))
-    if mover.data.polygons and rng.random() < 0.7:
+    shape = rng.choice(["monkey", "torus", "cube", "uv_sphere"])
+    getattr(bpy.ops.mesh, f"primitive_{shape}_add")(location=eye + direction * depth)
+    item = bpy.context.active_object
+    item.scale = Vector((1, 1, 1)) * pixel * rng.uniform(0.12, 0.3) * h
+    item.data.materials.clear()
+    item.data.materials.append(random_material(rng))
+    if item.data.polygons and rng.random() < 0.7:
         bpy.ops.object.shade_smooth()
     speed = 10 ** rng.uniform(0.2, 1.1)  # 1.6 to 12.6 film pixels per frame
     along = Vector((rng.gauss(0, 1), rng.gauss(0, 0.6)))
     along.normalize()
     velocity = (right.normalized() * along.x + down.normalized() * along.y) * pixel * speed
-    start, turn = mover.location.copy(), [rng.gauss(0, 0.06) for _ in range(3)]
+    start, turn = item.location.copy(), [rng.gauss(0, 0.06) for _ in range(3)]
     # Keys one window beyond the shot, so that the vectors are valid on its first and last frame.
     for frame_number in range(mid - 12, mid + 13):
         step = frame_number - mid
-        mover.location = start + velocity * step
-        mover.rotation_euler = [angle * step for angle in turn]
-        mover.keyframe_insert("location", frame=frame_number)
-        mover.keyframe_insert("rotation_euler", frame=frame_number)
+        item.location = start + velocity * step
+        item.rotation_euler = [angle * step for angle in turn]
+        item.keyframe_insert("location", frame=frame_number)
+        item.keyframe_insert("rotation_euler", frame=frame_number)
 
 
 def configure(scene: bpy.types.Scene, threads: int) -> None:
@@ -152,7 +140,7 @@ def configure(scene: bpy.types.Scene, threads: int) -> None:
 
 
 def set_defaults(scene: bpy.types.Scene) -> None:
-    """What a new file of Blender 5.0 has, where `configure` differs from it."""
+    """Set the defaults of Blender 5.0, where `configure` differs from them."""
     cycles = scene.cycles
     cycles.use_denoising, cycles.denoiser = True, "OPENIMAGEDENOISE"
     cycles.use_adaptive_sampling, cycles.adaptive_threshold = True, 0.01
@@ -176,7 +164,7 @@ def render_level(scene: bpy.types.Scene, folder: Path, name: str, spp: int, fram
 
 
 def compact(path: Path) -> None:
-    """Write a file again as half and without the second depth: a third of the size, for shots in a repository."""
+    """Rewrite a file as half, without the second depth: a third of the size, for shots in a repository."""
     source = OpenEXR.File(str(path), separate_channels=True)
     channels = {
         name: OpenEXR.Channel(channel.pixels.clip(-65504, 65504).astype(np.float16))
@@ -203,8 +191,8 @@ def main(argv: list[str]) -> int:
     first, last = map(int, options.frames.split("-"))
     frames = range(first, last + 1)
     rng = random.Random(options.seed)
-    for _ in range(options.movers):
-        add_mover(scene, rng, options.film, options.size, options.center, (first + last) // 2)
+    for _ in range(options.moving_objects):
+        add_moving_object(scene, rng, options.film, options.size, options.center, (first + last) // 2)
     options.out.mkdir(parents=True, exist_ok=True)
     out = options.out.resolve()
     for number, level in enumerate(options.levels.split(",")):

@@ -154,25 +154,11 @@ def needed_bounces(
     samples: int,
     target_samples: int,
 ) -> list[EffectDecision]:
-    """Measure how many bounces of each kind an image needs.
+    """Measure how many bounces an image needs: all together, and of each kind that `settings` allow.
 
-    Parameters
-    ----------
-    render : callable
-        `render(settings, seed)` returns a small image, (H, W, 3) float32 linear radiance, of `samples` samples per
-        pixel. The same seed must give the same paths.
-    settings : dict of str to object
-        As `settings_of` returns them.
-    samples, target_samples : int
-        Samples per pixel of the pilot, and of the cleanest image to be rendered.
+    `render(settings, seed)` returns a pilot, (H, W, 3) float32 linear radiance, of `samples` samples per pixel; the
+    same seed must give the same paths. `target_samples` are those of the cleanest image to be rendered.
 
-    Returns
-    -------
-    list of EffectDecision
-        One for all bounces together, and one for each kind of bounce that is still possible.
-
-    Notes
-    -----
     With one seed, an image of depth d and one of unlimited depth share all paths up to d, so their difference Δ is the
     light from deeper paths, without the noise of the rest. A depth is enough if
 

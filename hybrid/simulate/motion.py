@@ -18,6 +18,14 @@ from hybrid.simulate.random_assets import add_asset, log_uniform, material, warm
 from hybrid.simulate.scene_assets import Point, Rng, add_lamp, add_object
 from hybrid.simulate.shot import ShotSettings
 
+
+def key(owner: Any, name: str, frames: range, middle: int, value: Callable[[int], Any]) -> None:
+    """Key a property on each frame; `value` is a function of the frames since `middle`."""
+    for frame in frames:
+        setattr(owner, name, value(frame - middle))
+        owner.keyframe_insert(name, frame=frame)
+
+
 # ---------------------------------------------------------------------------------------------------------------
 # Cameras
 
@@ -228,15 +236,12 @@ def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None
     start, turn = item.location.copy(), item.rotation_euler.copy()
     bend = add_bend(rng, item) if kind == "deform" else None
     item.rotation_mode = "XYZ"
-    for frame in shot.keyed:
-        step = frame - shot.middle
-        item.location = start + velocity * (math.sin(rate * step) / rate if kind == "swing" else step)
-        item.rotation_euler = [a + s * step for a, s in zip(turn, spin, strict=True)]
-        item.keyframe_insert("location", frame=frame)
-        item.keyframe_insert("rotation_euler", frame=frame)
-        if bend is not None:
-            bend.value = math.sin(rate * step)
-            bend.keyframe_insert("value", frame=frame)
+    swing = kind == "swing"
+    span = (shot.keyed, shot.middle)
+    key(item, "location", *span, lambda t: start + velocity * (math.sin(rate * t) / rate if swing else t))
+    key(item, "rotation_euler", *span, lambda t: [a + s * t for a, s in zip(turn, spin, strict=True)])
+    if bend is not None:
+        key(bend, "value", *span, lambda t: math.sin(rate * t))
     scene.frame_set(shot.middle)
     return {"object": item.name, "motion": kind, "pixels": round(pixels, 2)}
 
@@ -244,11 +249,8 @@ def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None
 def key_motion(item: Any, frames: range, velocity: Point = (0, 0, 0), spin: Point = (0, 0, 0)) -> None:
     """Key steady motion, in metres and radians per frame, through the current pose in the middle of `frames`."""
     location, turn, middle = Vector(item.location), Vector(item.rotation_euler), frames[len(frames) // 2]
-    for frame in frames:
-        item.location = location + Vector(velocity) * (frame - middle)
-        item.rotation_euler = turn + Vector(spin) * (frame - middle)
-        item.keyframe_insert("location", frame=frame)
-        item.keyframe_insert("rotation_euler", frame=frame)
+    key(item, "location", frames, middle, lambda t: location + Vector(velocity) * t)
+    key(item, "rotation_euler", frames, middle, lambda t: turn + Vector(spin) * t)
 
 
 def key_swing(item: Any, frames: range, axis: str, amplitude: float, rate: float, phase: float = 0.0) -> None:
@@ -293,17 +295,13 @@ def move_light(rng: Rng, shot: ShotSettings) -> dict[str, Any]:
     flicker = rng.random() < 0.25
     direction = Vector(rng.normal(0, 1, 3)).normalized()
     speed = log_uniform(rng, 0.01, 0.08)
-    for frame in shot.keyed:
-        step = frame - shot.middle
-        if flicker:
-            lamp.data.energy = power * float(1 + 0.5 * math.sin(1.3 * step))
-            lamp.data.keyframe_insert("energy", frame=frame)
-        elif lamp.data.type == "SUN":
-            lamp.rotation_euler = (turn.x + speed * step * 0.5, turn.y, turn.z + speed * step)
-            lamp.keyframe_insert("rotation_euler", frame=frame)
-        else:
-            lamp.location = start + direction * speed * step * (start - focus).length
-            lamp.keyframe_insert("location", frame=frame)
+    span = (shot.keyed, shot.middle)
+    if flicker:
+        key(lamp.data, "energy", *span, lambda t: power * float(1 + 0.5 * math.sin(1.3 * t)))
+    elif lamp.data.type == "SUN":
+        key(lamp, "rotation_euler", *span, lambda t: (turn.x + speed * t * 0.5, turn.y, turn.z + speed * t))
+    else:
+        key(lamp, "location", *span, lambda t: start + direction * speed * t * (start - focus).length)
     scene.frame_set(shot.middle)
     return {"light": lamp.name, "motion": "flicker" if flicker else "moves", "speed": round(speed, 3)}
 
