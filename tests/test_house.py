@@ -110,7 +110,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/memory.py",
     "hybrid/neural/train.py",
     "hybrid/simulate/evaluation.py",
-    "hybrid/simulate/fixed.py",
     "hybrid/simulate/motion.py",
     "hybrid/simulate/random_assets.py",
     "hybrid/simulate/scene_assets.py",

@@ -25,7 +25,6 @@ import OpenEXR
 
 from hybrid.simulate import scenes
 from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
-from hybrid.simulate.fixed import fixed_shot
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, frame_seed
 
 ATTEMPTS = 8  # random shots of one seed that are tried
@@ -133,7 +132,7 @@ def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
     if shot.scene in RANDOM:
         description = scenes.random_shot(shot, attempt)
     elif shot.scene.partition(":")[0] in FIXED:
-        description = fixed_shot(shot)
+        description = scenes.fixed_shot(shot)
     else:
         description = scenes.file_shot(shot)
     settings = EVERYTHING if shot.effects == "all" else {**EVERYTHING, **dict.fromkeys(PASSES, False)}

@@ -11,12 +11,10 @@ import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 from hybrid.files.replace import write_file
@@ -156,37 +154,25 @@ class _Worker:
     def __init__(self, shot: ShotSettings, out: Path, frames: list[int], plan: Any, threads: int, python: str) -> None:
         self.out = out
         self._folder = tempfile.TemporaryDirectory(prefix="ravg-")
-        job, log = Path(self._folder.name) / "job.json", Path(self._folder.name) / "log"
+        job, self._log, answers = (Path(self._folder.name) / name for name in ("job.json", "log", "answers"))
         data = {"shot": shot.to_json(), "out": str(out.resolve()), "frames": frames, "plan": plan, "threads": threads}
         job.write_text(json.dumps(data), encoding="utf-8")
-        self._log = log
-        package = str(Path(__file__).parents[2])
-        path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
-        with log.open("wb") as errors:
+        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]))
+        # Files rather than pipes: reading a file never blocks, on any system.
+        with answers.open("wb") as output, self._log.open("wb") as errors:
             self._process = subprocess.Popen(
                 [python, "-m", "hybrid.simulate.cycles", str(job)],
-                stdout=subprocess.PIPE,
+                stdout=output,
                 stderr=errors,
                 env={**os.environ, "PYTHONPATH": path},
             )
-        if self._process.stdout is None:
-            raise SimulationError("Blender: its output cannot be read")
-        self._pipe = self._process.stdout
-        # A thread reads: Python before 3.12 has no non-blocking reads on Windows.
-        self._lines: SimpleQueue[bytes] = SimpleQueue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        for line in self._pipe:
-            self._lines.put(line)
+        self._answers = answers.open("rb")
+        self._unread = b""
 
     def messages(self) -> list[dict[str, Any]]:
         """Return the messages since the last call."""
-        if self.ended():
-            self._reader.join(5)  # seconds; it reads to the end of the pipe
-        lines = [self._lines.get() for _ in range(self._lines.qsize())]
-        return [json.loads(line) for line in lines if line.startswith(b"{") and line.endswith(b"\n")]
+        *lines, self._unread = (self._unread + self._answers.read()).split(b"\n")
+        return [json.loads(line) for line in lines if line.startswith(b"{")]
 
     def ended(self) -> bool:
         """Return whether the process has ended."""
@@ -194,7 +180,7 @@ class _Worker:
 
     def close(self) -> None:
         """Remove the process's files; raise SimulationError if it failed."""
-        self._pipe.close()
+        self._answers.close()
         lines = [line for line in self._log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         self._folder.cleanup()
         if self._process.returncode != 0:
@@ -209,8 +195,7 @@ class _Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._reader.join(5)
-        self._pipe.close()
+        self._answers.close()
         for partial in self.out.glob(f".{self._process.pid}-*"):
             partial.unlink()
         self._folder.cleanup()

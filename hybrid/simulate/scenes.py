@@ -1,4 +1,4 @@
-"""Random shots, and shots of scenes from files. All random numbers come from the seed of the shot.
+"""Random shots, fixed shots, and shots of scenes from files. All random numbers come from the seed of the shot.
 
 A random shot is a *set* (room, studio, outdoors, night, wall), objects in it, lights, a camera on a path, and a crop
 of its film-size image. Lengths are metres, z is up. Brightness is left to `exposure`.
@@ -15,8 +15,9 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from hybrid.simulate import evaluation, validation
 from hybrid.simulate.effects import visible_points
-from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera
+from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera, set_crop
 from hybrid.simulate.random_assets import (
     add_bulb_sphere,
     clutter,
@@ -35,6 +36,7 @@ from hybrid.simulate.scene_assets import (
     add_box,
     add_lamp,
     add_mesh,
+    add_object,
     fill_with_fog,
     fill_with_smoke,
     fur,
@@ -258,6 +260,7 @@ SURFACES: dict[str, tuple[str | None, ...]] = {
     "lens": (None,),
 }
 FILMS = {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18}  # 0x0: no more than is rendered
+FIXED_SHOTS = {"validation": validation.SHOTS, "test": evaluation.SHOTS}
 CREDIT = ("title", "author", "licence", "licence_url", "original")
 
 
@@ -397,6 +400,23 @@ def light_by_bulbs(rng: Rng) -> None:
             add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
         else:
             add_bulb_sphere(radius, where, shades[number // 2 % 3])
+
+
+def fixed_shot(shot: ShotSettings) -> dict[str, Any]:
+    """Build the shot `KIND:NAME`, the same for every seed; return its description."""
+    kind, _, name = shot.scene.partition(":")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = shot.keyed[0], shot.keyed[-1]
+    film, center = shot.film or shot.size, shot.center or (0.5, 0.5)
+    scene.render.resolution_x, scene.render.resolution_y = film
+    scene.camera = add_object("camera", bpy.data.cameras.new("camera"))
+    # Not `shot.keyed`: Blender's frame_start is never below 0, and the shots are built around the middle of this range.
+    frames = range(scene.frame_start, scene.frame_end + 1)
+    FIXED_SHOTS[kind][name](np.random.default_rng(7), frames)  # the shot's seed is that of the samples alone
+    set_crop(scene.render, film, shot.size, center)
+    scene.frame_set(shot.middle)
+    return {kind: name, "film": list(film), "center": list(center)}
 
 
 def file_shot(shot: ShotSettings) -> dict[str, Any]:
