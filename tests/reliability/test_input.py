@@ -228,7 +228,7 @@ RESULTS = (
 def test_results_that_are_none_are_refused(folder, text):
     (folder / "report").mkdir()
     (folder / "report" / "results.json").write_text(text)
-    ravg("compare", "--beside", "report", "-o", "page", folder=folder, seconds=60).is_refused()
+    ravg("compare", "--with-report", "report", "-o", "page", folder=folder, seconds=60).is_refused()
 
 
 WITHOUT_LIBRARY = """
