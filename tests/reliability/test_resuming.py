@@ -71,7 +71,7 @@ class Project:
         return self.folder / "in"
 
     @property
-    def estimates(self) -> Path:
+    def first_pass(self) -> Path:
         return self.folder / "single"
 
     @property
