@@ -1,7 +1,4 @@
-"""The pseudo-reference: the clean centre of an aligned window, estimated without a network.
-
-It is the classical result, and what training targets are made of.
-"""
+"""Classical denoisers of an aligned window; training targets are made by them too."""
 
 from __future__ import annotations
 
@@ -21,27 +18,25 @@ from nlm.pooling import pool_samples
 
 Array = NDArray[np.float32]
 
-# How much of the gathered picture denoised, the rest being the average of estimates: errors of two pictures that are
-# made differently cancel in part. 0.12 dB over all of it, in the mean of thirteen shots.
+# Weight of OIDN's result on the pooled samples against the average of first passes: errors of two images that are made
+# differently cancel in part. 0.12 dB over all of it, in the mean of thirteen shots.
 SECOND_LOOK = 0.8
 
 
 @dataclass(frozen=True)
 class ClassicalPreset:
-    """Settings of the classical estimate; each preset is a measured point of accuracy against time.
+    """A measured point of accuracy against time.
 
     Attributes
     ----------
     name : str
-        What the user calls it.
-    nlm_radius : int
-        Search radius of the non-local means, pixels; 0: the robust average alone.
-    nlm_patch_radius : int
-        Radius of the patches it compares, pixels.
+        As in ``--preset``.
+    nlm_radius, nlm_patch_radius : int
+        Search radius and patch radius of the non-local means, pixels; search radius 0: the robust average alone.
     guided_radius : int
         Radius of the guided filter that follows, pixels; 0: none.
     guided_eps : float
-        Its regularisation, relative to the guides' scale.
+        Regularisation of the guided filter, relative to the guides' scale.
     """
 
     name: str
@@ -60,21 +55,16 @@ CLASSICAL_PRESETS = {preset.name: preset for preset in (DRAFT, STANDARD, FINAL)}
 def filter_window(
     aligned: AlignedWindow, preset: ClassicalPreset = STANDARD, *, timings: Timings | None = None
 ) -> Array:
-    """Estimate the clean centre frame from an aligned window, without a network.
+    """Denoise the centre of a window from its noisy frames alone; radiance (H, W, 3), finite.
 
     Parameters
     ----------
     aligned : AlignedWindow
-        From `Aligner.align`.
+        Without or with a first pass, which is not used.
     preset : ClassicalPreset
-        How much work to put in.
+        Radii of the filters.
     timings : Timings, optional
-        Where to count the stages "average", "nlm" and "guided".
-
-    Returns
-    -------
-    (H, W, 3) array
-        Radiance, finite.
+        Counts the stages "average", "nlm" and "guided".
 
     Notes
     -----
@@ -101,8 +91,8 @@ def filter_window(
         with timings.stage("guided"):
             guides = [] if aligned.guide is None else [aligned.guide]
             if preset.nlm_radius:
-                # Edges of shadows and highlights are in no guide, but in what the non-local means have made of the
-                # light. Without this channel the filter lost 2 dB on a sunlit shot.
+                # Edges of shadows and highlights are in no guide, but in the result of the non-local means. Without
+                # this channel the filter lost 2 dB on a sunlit shot.
                 light = irradiance.mean(axis=-1, keepdims=True)
                 guides.append(compress(light, aligned.exposure))
             if guides:
@@ -118,24 +108,14 @@ def filter_window(
 
 
 def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> Array:
-    """Make the given estimates stable: average them over the frames that show the same light.
+    """Average the first passes of the frames that show the same light; radiance (H, W, 3), finite.
 
     Parameters
     ----------
     aligned : AlignedWindow
-        With estimates.
+        With a first pass; ValueError without.
     timings : Timings, optional
-        Where to count the stage "average".
-
-    Returns
-    -------
-    (H, W, 3) array
-        Radiance, finite.
-
-    Raises
-    ------
-    ValueError
-        If the window has no estimates.
+        Counts the stage "average".
 
     Notes
     -----
@@ -150,54 +130,42 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
 
 
 def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
-    """Gather the samples of the window at the centre, and have OIDN denoise it once more: our best without training.
+    """Pool the samples of a window at its centre, and denoise them with OIDN; radiance (H, W, 3), finite.
 
     Parameters
     ----------
     aligned : AlignedWindow
-        With estimates; the cheapest do (`oidn-fast`).
+        With a first pass, ValueError without; the cheapest suffices (`oidn-fast`).
     device : str
-        Of OIDN, as for `hybrid.oidn.denoise_oidn`.
+        OIDN's device, as for `hybrid.oidn.denoise_oidn`; ImportError without pyoidn.
     timings : Timings, optional
-        Where to count the stages "gather" and "denoise".
-
-    Returns
-    -------
-    (H, W, 3) array
-        Radiance, finite.
-
-    Raises
-    ------
-    ValueError
-        If the window has no estimates.
-    ImportError
-        If pyoidn is not installed.
+        Counts the stages "gather" and "denoise".
 
     Notes
     -----
-    G is the gated average of the estimates, b the gathered picture (`nlm.pooling`), O = OIDN(b) with clean guides. The
-    result is G + 0.8 (O − G). A share found by cross-validation
-    (both made once more without the centre, whose noisy picture is then regressed on their difference) takes a third
-    run of OIDN, and was worth 0.05 dB less than the constant on thirteen shots.
+    With G the gated average of the first passes, b the pooled image (`nlm.pooling`) and O = OIDN(b) with clean guides,
+    the result is G + 0.8 (O − G). A weight found by cross-validation (both made once more without the centre, whose
+    noisy image is then regressed on their difference) takes a third run of OIDN, and was worth 0.05 dB less than the
+    constant on thirteen shots.
     """
     if aligned.first_pass is None or aligned.residual is None or aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("gather"):
-        gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
-        average = gathered.average * aligned.modulation
-        image = gathered.image * aligned.modulation
+        pooled = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
+        mean = pooled.average * aligned.modulation
+        image = pooled.image * aligned.modulation
     with timings.stage("denoise"):
         albedo, normal = aligned.guides.get("albedo"), aligned.guides.get("normal")
-        noisy = "prefilter" in aligned.stages
-        seen = denoise_oidn(
+        noisy_guides = "prefilter" in aligned.stages
+        denoised = denoise_oidn(
             np.maximum(image, 0),
             albedo,
-            None if albedo is None else normal,  # OIDN takes no normal alone
-            prefilter="balanced" if noisy else None,
-            clean=not noisy,
+            None if albedo is None else normal,  # OIDN accepts no normal alone
+            prefilter="balanced" if noisy_guides else None,
+            clean=not noisy_guides,
             scale=measure_gain(aligned.centre_first_pass),
             device=device,
         )
     with timings.stage("gather"):
-        return np.asarray(average + np.float32(SECOND_LOOK) * (seen - average), np.float32)
+        return np.asarray(mean + np.float32(SECOND_LOOK) * (denoised - mean), np.float32)

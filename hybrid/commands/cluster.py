@@ -1,8 +1,8 @@
-"""Work handed to the workers of a Dask cluster: the same command, a chunk of the frames or shots at a time.
+"""Run a command in chunks of frames or shots on the workers of a Dask cluster.
 
-A chunk runs in a process of its own on the worker, so that what it takes is given back, and an error ends it alone.
-The folders must be shared, under the same paths. Dask gives the chunk of a worker that has died to another one, which
-leaves alone what was finished.
+A chunk runs in a process of its own on the worker, which returns all memory at the end and fails alone. Folders must be
+shared under the same paths. Dask gives the chunk of a worker that has died to another worker, which skips what is
+finished.
 """
 
 from __future__ import annotations
@@ -30,32 +30,30 @@ SchedulerOption = Annotated[
     typer.Option(
         metavar="ADDRESS",
         envvar="RAVG_SCHEDULER",
-        help="of a Dask scheduler, such as tcp://host:8786: its workers do it, over shared folders",
+        help="Dask scheduler, such as tcp://host:8786, whose workers run the command over shared folders",
         rich_help_panel=RESOURCES,
     ),
 ]
 ChunkOption = Annotated[
     int,
-    typer.Option(
-        min=1, metavar="N", help="frames that a worker of --scheduler makes at a time", rich_help_panel=RESOURCES
-    ),
+    typer.Option(min=1, metavar="N", help="frames in a chunk of --scheduler", rich_help_panel=RESOURCES),
 ]
-# Of the process of a chunk: what is said where, is for the one that hands it out to say.
+# Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
-# How long a connection may take, seconds.
+# Seconds that a connection may take.
 PATIENCE = 10
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A part of the work: the words of its command, and its share of the whole in frames or samples."""
+    """A part of the work: arguments of its command, and its size in frames or samples."""
 
     arguments: Sequence[str]
     size: float
 
 
 def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str]:
-    """The words of this command with the options that were given, but for some changes."""
+    """Return the arguments of this command as they were given, with some parameters changed."""
     words, positional = [str(context.info_name)], []
     for parameter in context.command.params:
         name = str(parameter.name)
@@ -76,28 +74,11 @@ def _longest(names: Sequence[str]) -> str:
     return next(name for name in names if name.startswith("--"))
 
 
-def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
-    """Let the workers of a scheduler run all chunks, and tell how far they have come.
+def run_on_cluster(address: str, title: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
+    """Run chunks, by name, on the workers of a scheduler, and log their progress.
 
-    Parameters
-    ----------
-    address : str
-        Of the scheduler.
-    what : str
-        What is being done.
-    chunks : mapping of str to Chunk
-        By name.
-    unit : str
-        Of the chunks' sizes.
-
-    Raises
-    ------
-    ImportError
-        If distributed is not installed.
-    OSError
-        If the scheduler does not answer.
-    typer.Exit
-        With 1 if a chunk ended with an error, when all others are done; with 130 if Ctrl-C has ended it.
+    Raises OSError if the scheduler does not answer, and typer.Exit with 1 if a chunk failed, after all others ended,
+    or with 130 for Ctrl-C.
     """
     try:
         from distributed import Client, Event, as_completed
@@ -113,19 +94,14 @@ def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: s
         LOG.info(f"{len(chunks)} chunks for {len(workers)} workers of {address}")
         if not workers:
             LOG.warning("the scheduler has no workers yet, expected some as `dask worker` starts them")
-        bar, shares = Progress(what, sum(chunk.size for chunk in chunks.values()), unit), dict.fromkeys(chunks, 0.0)
+        bar, shares = Progress(title, sum(chunk.size for chunk in chunks.values()), unit), dict.fromkeys(chunks, 0.0)
 
-        def hear(event: tuple[float, dict[str, Any]]) -> None:
-            _tell(event[1], chunks, shares, bar)
-
-        client.subscribe_topic(topic, hear)
+        client.subscribe_topic(topic, lambda event: _log_record(event[1], chunks, shares, bar))
         stop, failed = Event(f"{topic}-stop", client=client), []
-        tasks = {
-            client.submit(
-                run_chunk, name, list(chunk.arguments), str(Path.cwd()), topic, key=f"{topic}-{name}", pure=False
-            ): name
-            for name, chunk in chunks.items()
-        }
+        folder, tasks = str(Path.cwd()), {}
+        for name, chunk in chunks.items():
+            key = f"{topic}-{name}"
+            tasks[client.submit(run_chunk, name, list(chunk.arguments), folder, topic, key=key, pure=False)] = name
 
         def report() -> None:
             LOG.error("stopped: what is finished is kept; the same command goes on from there")
@@ -141,12 +117,8 @@ def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: s
                         failed.append(tasks[task])
                         LOG.error(f"{tasks[task]}: {words}")
                     else:
-                        _tell(
-                            {"chunk": tasks[task], "percent": 100, "message": f"{tasks[task]} done"},
-                            chunks,
-                            shares,
-                            bar,
-                        )
+                        done = {"chunk": tasks[task], "percent": 100, "message": f"{tasks[task]} done"}
+                        _log_record(done, chunks, shares, bar)
         except KeyboardInterrupt:
             stop.set()
             client.cancel(list(tasks))
@@ -156,8 +128,8 @@ def run_on_cluster(address: str, what: str, chunks: Mapping[str, Chunk], unit: s
             raise typer.Exit(1)
 
 
-def _tell(record: dict[str, Any], chunks: Mapping[str, Chunk], shares: dict[str, float], bar: Progress) -> None:
-    """Pass on what a chunk has told: warnings, and how far it has come."""
+def _log_record(record: dict[str, Any], chunks: Mapping[str, Chunk], shares: dict[str, float], bar: Progress) -> None:
+    """Log a warning of a chunk, or advance the bar by its progress."""
     name = record["chunk"]
     if "percent" in record:
         shares[name] = max(shares[name], record["percent"] / 100 * chunks[name].size)
@@ -168,13 +140,7 @@ def _tell(record: dict[str, Any], chunks: Mapping[str, Chunk], shares: dict[str,
 
 
 def run_chunk(name: str, arguments: Sequence[str], folder: str, topic: str) -> str:
-    """Run a chunk on a worker, and pass on what it tells.
-
-    Returns
-    -------
-    str
-        Its error; "" where there was none.
-    """
+    """Run a chunk on a worker, and send its log records to the topic; return its error, or ""."""
     from distributed import Event, get_client, get_worker
 
     worker = get_worker()
