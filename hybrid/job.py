@@ -1,6 +1,6 @@
 """Denoise a shot: one description of what is asked for, and one way to run it.
 
-The command, the Python API, chunks on a cluster and ``--resume`` all go through `open_job` and `run_job`.
+The command, the Python API, chunks on a cluster and ``--resume`` all go through `Job`.
 """
 
 from __future__ import annotations
@@ -15,29 +15,20 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
 from hybrid.denoisers import AverageDenoiser, ClassicalDenoiser, PooledDenoiser, WindowDenoiser
 from hybrid.files.passes import BEAUTY
-from hybrid.files.replace import temporary_folder
+from hybrid.files.replace import check_outputs, temporary_folder
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import PACKAGES, versions
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, OIDN_MODES, SPECS, FirstPassSource, PerFrame, find_first_pass
 from hybrid.memory import parse_size, plan_rows
 from hybrid.oidn import find_device
-from hybrid.pipeline import (
-    Failed,
-    Finished,
-    RunSettings,
-    SourcesOf,
-    View,
-    check_written,
-    denoise_frames,
-    sources_of,
-    temporal_support,
-)
+from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames, sources_of, temporal_support
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
@@ -57,9 +48,11 @@ PRESETS: dict[str, tuple[str, ...]] = {
 }
 METHOD_OF_PRESET = {preset: method for method, presets in PRESETS.items() for preset in presets}
 FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-fast"}
-PRECISIONS = ("auto", "float32", "bfloat16")
-AOV_SUMS = ("layers", "beauty")
-# Presets that --budget chooses from, the most accurate first.
+CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
+LEAST = {"passes": 1, "tile": 16, "threads": 1}
+# Options that only a network has.
+OF_NETWORKS = ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile")
+# Presets that a budget chooses from, the most accurate first.
 MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))
 
 
@@ -70,17 +63,17 @@ class DenoiseOptions:
     Attributes
     ----------
     method : str
-        "network" (needs torch), "classical" or "pooled"; without: that of the preset, or "network".
+        "network" (needs torch), "classical" or "pooled"; default: that of the preset, or "network".
     preset : str
-        One of `PRESETS` of the method; without: the first of them. "auto" needs `budget`.
+        One of `PRESETS` of the method, by default the first; "auto" needs `budget`.
     budget : str or None
-        Time per frame, such as "10s": the most accurate preset that fits it is measured and taken.
+        Time per frame, such as "10s": the most accurate preset that is measured to fit is taken.
     weights : Path or None
         A weights file in place of a preset.
     threshold : float or None
-        For networks that predict kernels, in [0, 1): higher drops more taps.
+        For weights that predict kernels, in [0, 1): higher drops more taps.
     first_pass : str
-        Source of the denoised image per frame (`hybrid.first_pass.find_first_pass`), or a finished sequence. Without:
+        Source of a denoised image per frame (`hybrid.first_pass.find_first_pass`), or a finished sequence. Default:
         "auto" for a network, "none" for the classical chain, "oidn-fast" for pooled samples.
     keep_first_pass : str or None
         Pattern or folder where OIDN's first pass is kept for later runs.
@@ -93,17 +86,17 @@ class DenoiseOptions:
     stages, no_stages : collection of str
         Stages that run, or do not, whatever was measured.
     tile : int or None
-        Pixels on a side that the network is given at once, at least 16.
+        Pixels on a side that the network processes at once, at least 16.
     precision : str
         Of the network: "float32", "bfloat16", or "auto", bfloat16 where the processor has it.
     device : str
         For ravg's networks and OIDN's: "cpu", "cuda", "hip", "sycl", "metal", or "auto", the first that is there.
     resume : bool
-        Leave frames alone that are there, whole, and would be the same.
+        Skip frames that are there, whole, and would be the same.
     keep_going : bool
-        Go on after a frame that cannot be made.
+        Continue after a frame that cannot be denoised.
     max_memory : str or None
-        Such as "8G": frames are worked on in bands of rows.
+        Such as "8G": frames are denoised in bands of rows.
     strict : bool
         Refuse layers that make no sense, and cuts, instead of working around them.
     reuse_freed_memory : bool
@@ -160,49 +153,79 @@ class DenoiseOptions:
             object.__setattr__(self, name, value)
         check_first_pass(first_pass)
         self._check_values()
-        self._check_method()
+        self._check_combinations()
 
     def _check_values(self) -> None:
-        for name, value, expected in (
-            ("precision", self.precision, PRECISIONS),
-            ("aov-sum", self.aov_sum, AOV_SUMS),
-        ):
-            if value not in expected:
-                raise ValueError(f"{name} is {value!r}, expected one of {', '.join(expected)}")
-        for name, number, least in (("passes", self.passes, 1), ("tile", self.tile, 16), ("threads", self.threads, 1)):
-            if number is not None and number < least:
+        """Refuse values that an option cannot have."""
+        for name, expected in CHOICES.items():
+            if (value := getattr(self, name)) not in expected:
+                raise ValueError(f"{name.replace('_', '-')} is {value!r}, expected one of {', '.join(expected)}")
+        for name, least in LEAST.items():
+            if (number := getattr(self, name)) is not None and number < least:
                 raise ValueError(f"{name} is {number}, expected at least {least}")
         if self.threshold is not None and not 0 <= self.threshold < 1:
             raise ValueError(f"threshold is {self.threshold}, expected 0 <= threshold < 1, in units of 1/K")
-        if (self.preset == "auto") != (self.budget is not None) or (self.weights is not None and self.budget):
-            raise ValueError("--budget chooses the preset, expected it with --preset auto, and without --weights")
         if self.budget is not None:
             parse_budget(self.budget)
         if self.max_memory is not None:
             parse_size(self.max_memory)
         if self.breakdown is not None:
             check_png(self.breakdown, "breakdown")
-            if self.max_memory is not None:
-                raise ValueError("--breakdown looks at whole frames, expected no --max-memory with it")
 
-    def _check_method(self) -> None:
-        """Refuse stages that do not exist, and options of the network beside another method."""
+    def _check_combinations(self) -> None:
+        """Refuse options that contradict each other, and stages that do not exist."""
+        if (self.preset == "auto") != (self.budget is not None) or (self.weights is not None and self.budget):
+            raise ValueError("--budget chooses the preset, expected it with --preset auto, and without --weights")
+        if self.breakdown is not None and self.max_memory is not None:
+            raise ValueError("--breakdown looks at whole frames, expected no --max-memory with it")
         rules = self.rules
         if self.method == "network":
             return
         if neural := rules.on & NEURAL_STAGES:
             raise ValueError(f"--stages: {min(neural)} is a stage of the network, expected one that {self.method} has")
-        defaults = {entry.name: entry.default for entry in fields(self)}
-        for name in ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile"):
-            if getattr(self, name) != defaults[name]:
+        for name in OF_NETWORKS:
+            if getattr(self, name) != DEFAULTS[name]:
                 option = name.replace("_", "-")
                 raise ValueError(f"--{option} is of the network, expected none with method {self.method}")
 
     @property
     def rules(self) -> Rules:
         """The forced stages; those that only a network has are off without one."""
-        off = frozenset(self.no_stages) if self.method == "network" else frozenset(self.no_stages) | NEURAL_STAGES
+        off = frozenset(self.no_stages) | (frozenset() if self.method == "network" else NEURAL_STAGES)
         return Rules(frozenset(self.stages), off)
+
+    @property
+    def weights_file(self) -> Path | None:
+        """The file of the network's weights; with the preset "auto", that of the most accurate preset."""
+        if self.method != "network" or self.weights is not None:
+            return None if self.weights is None else Path(self.weights)
+        return Path(import_neural().shipped_weights(MEASURED[0] if self.preset == "auto" else self.preset))
+
+    @property
+    def oidn_mode(self) -> str:
+        """The mode of OIDN in the first pass "auto"."""
+        return "oidn-clean" if self.weights is not None else OIDN_MODE_OF_PRESET.get(self.preset, "oidn-clean")
+
+
+DEFAULTS = {entry.name: entry.default for entry in fields(DenoiseOptions)}
+
+
+def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
+    """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist.
+
+    Parameters
+    ----------
+    options : DenoiseOptions or None
+    changes : mapping of str to object
+        Field → value; "estimate", the old name of `first_pass`, is accepted with a warning.
+    """
+    given = dict(changes)
+    if "estimate" in given:
+        warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
+        given["first_pass"] = given.pop("estimate") or ""
+    if unknown := given.keys() - DEFAULTS.keys():
+        raise ValueError(f"option {min(unknown)!r} is not there, expected one of {', '.join(DEFAULTS)}")
+    return DenoiseOptions(**given) if options is None else replace(options, **given)  # type: ignore[arg-type]
 
 
 def check_first_pass(spec: str) -> None:
@@ -228,12 +251,11 @@ def import_neural() -> ModuleType:
 def open_denoiser(
     options: DenoiseOptions, timings: Timings | None = None, breakdown: Breakdown | None = None
 ) -> WindowDenoiser:
-    """Return the denoiser that is asked for.
+    """Return the denoiser that is asked for; with the preset "auto", the most accurate one.
 
     Parameters
     ----------
     options : DenoiseOptions
-        With the preset "auto", the most accurate one.
     timings : Timings, optional
         Counts the stages of the denoiser.
     breakdown : Breakdown, optional
@@ -254,8 +276,8 @@ def open_denoiser(
             return AverageDenoiser(timings)
         return ClassicalDenoiser(CLASSICAL_PRESETS[options.preset], timings)
     neural = import_neural()
-    return neural.open_network(  # type: ignore[no-any-return]
-        weights_of(options),
+    denoiser: WindowDenoiser = neural.open_network(
+        options.weights_file,
         tile=neural.SMALL_TILE if options.tile is None and options.max_memory is not None else options.tile,
         precision=options.precision,
         device=options.device,
@@ -264,14 +286,160 @@ def open_denoiser(
         add_layers=options.aov_sum == "beauty",
         timings=timings,
     )
+    if not denoiser.needs_first_pass and options.first_pass not in ("auto", "none"):
+        name = Path(str(options.weights_file)).name
+        raise ValueError(
+            f"first-pass is {options.first_pass!r}, expected auto or none: the network of {name} takes none"
+        )
+    return denoiser
 
 
-def weights_of(options: DenoiseOptions) -> Path:
-    """Return the weights file of a network; with the preset "auto", that of the most accurate preset."""
-    if options.weights is not None:
-        return Path(options.weights)
-    preset = MEASURED[0] if options.preset == "auto" else options.preset
-    return Path(import_neural().shipped_weights(preset))
+def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> FirstPassSource:
+    """Return the first pass of a view; errors are those of `hybrid.first_pass.find_first_pass`.
+
+    Parameters
+    ----------
+    view : Shot
+    options : DenoiseOptions
+        With "none", a denoiser that needs a first pass has the classical one.
+    denoiser : WindowDenoiser
+    """
+    if not denoiser.needs_first_pass:
+        return FirstPassSource("none", None, "the denoiser takes none")
+    support = temporal_support(None, denoiser.radius, options.rules)
+    quicker, bundled = denoiser.backends
+    return find_first_pass(
+        "nlm" if options.first_pass == "none" else options.first_pass,
+        view.with_neighbours(support * (options.passes - 1)),
+        own=CLASSICAL_PRESETS.get(options.preset, FINAL),
+        kept=options.keep_first_pass,
+        mode=options.oidn_mode,
+        forced=options.rules.forced,
+        quicker=quicker,
+        bundled=bundled,
+        device=options.device,
+    )
+
+
+class Paths(NamedTuple):
+    """Files of a run beside its frames, by what they are called: those that are read, and those that are written."""
+
+    reads: Mapping[str, str | Path | None] = {}
+    writes: Mapping[str, Path | None] = {}
+
+
+NO_PATHS = Paths()
+
+
+def check_paths(
+    shot: Shot,
+    output: str | Path,
+    options: DenoiseOptions,
+    first_passes: Sequence[FirstPassSource] = (),
+    paths: Paths = NO_PATHS,
+) -> None:
+    """Refuse, before any pixel is read, a run that would write over its inputs, or that lacks frames.
+
+    Parameters
+    ----------
+    shot : Shot
+    output : str or Path
+        Pattern or folder of the denoised frames.
+    options : DenoiseOptions
+    first_passes : sequence of FirstPassSource
+    paths : Paths
+
+    Raises
+    ------
+    ValueError, OSError
+        As `hybrid.files.replace.check_outputs`.
+    FileNotFoundError
+        If frames were asked for that are not there, and `keep_going` is not set.
+    """
+    if shot.missing and not options.keep_going:
+        missing = format_frames(shot.missing)
+        raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
+    written = [("output", output_path(output, shot, number)) for number in shot.numbers]
+    written += [("keep-first-pass", path) for source in first_passes for path in source.kept]
+    further = {"breakdown": options.breakdown, **paths.writes}
+    written += [(name, Path(path)) for name, path in further.items() if path is not None]
+    read = [("frame", path) for number in shot.files for path in shot.paths(number)]
+    read += [("first-pass", path) for source in first_passes if source.files for path in source.files.files.values()]
+    inputs = {"weights": options.weights_file, **paths.reads}
+    read += [(name, Path(path)) for name, path in inputs.items() if path is not None]
+    check_outputs(written, read)
+
+
+def judge_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
+    """Return the views of a shot without layers that make no sense, and the findings.
+
+    Parameters
+    ----------
+    shot : Shot
+        Pairs of its frames are read.
+    strict : bool
+        Raise ValueError with all findings instead.
+    """
+    reports = [validate_layers(view) for view in shot.views]
+    findings = [finding for report in reports for finding in report.findings]
+    report = replace(reports[0], findings=tuple(dict.fromkeys(findings)))
+    if strict and (words := [*shot.warnings, *report.warnings]):
+        raise ValueError("; ".join(words))
+    return tuple(own.apply(view) for own, view in zip(reports, shot.views, strict=True)), report
+
+
+def _check_views(views: Sequence[Shot], report: ValidationReport, options: DenoiseOptions) -> None:
+    """Refuse cuts, if `strict`, and to make a beauty of layers that do not add up to it."""
+    for view in views:
+        plan_cuts = plan_shot(view).cuts if options.strict else ()
+        if cuts := [cut for pair in plan_cuts if (cut := find_cut(*pair)) not in report.findings]:
+            raise ValueError("; ".join(cut.message for cut in cuts))
+        complete = any(found.whole == BEAUTY and found.complete for found in view.passes.sums)
+        if options.aov_sum == "beauty" and view.aovs and not complete:
+            raise ValueError(
+                f"{view.path(view.numbers[0])}: --aov-sum beauty: no layers add up to the beauty, all of them "
+                f"together have {view.passes.light:.2f} times its light, expected layers of which it is the sum"
+            )
+
+
+def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
+    """The options with the most accurate preset that is measured to fit the budget, or with the fastest."""
+
+    def load(preset: str) -> tuple[WindowDenoiser, FirstPassSource]:
+        # Nothing is kept: the frames that are measured are parts.
+        measured = replace(options, preset=preset, budget=None, keep_first_pass=None)
+        denoiser = open_denoiser(measured)
+        return denoiser, choose_first_pass(view, measured, denoiser)
+
+    limit, tried = parse_budget(str(options.budget)), []
+    for measured in measure_presets(view, options.rules, MEASURED, load):
+        tried.append(f"{measured.preset} {measured.seconds:.2g} s")
+        fits = measured.seconds <= limit
+        if fits:
+            break
+    LOG.info(f"preset: {measured.preset} ({', '.join(tried)} a frame; {options.budget} asked for)")
+    if not fits:
+        LOG.warning("not even the fastest preset fits")
+    return replace(options, preset=measured.preset, budget=None)
+
+
+def _digest(path: Path) -> str:
+    """Identify the content of a file of weights."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The state of a job after a frame of pass `run` of `runs`; `done` of `total` frames of all passes."""
+
+    result: Finished | Failed
+    run: int
+    runs: int
+    done: int
+    total: int
+
+
+Progress = Callable[[Step], bool | None]
 
 
 @dataclass(frozen=True)
@@ -286,15 +454,11 @@ class Job:
         Pattern or folder of the frames.
     views : tuple of Shot
         Each view layer and stereo view of the files, without layers that make no sense.
-    judgement : ValidationReport
+    report : ValidationReport
         Of the first view, with the findings of all.
     denoiser : WindowDenoiser
     first_passes : tuple of FirstPassSource
         One for each view.
-    rows : int or None
-        Rows of a frame that are worked on at a time; None: all.
-    settings : mapping of str to object
-        JSON values that pixels depend on, beside preset, stages and versions.
     timings : Timings
         Seconds and memory of each stage.
     breakdown : Breakdown or None
@@ -304,13 +468,44 @@ class Job:
     options: DenoiseOptions
     output: str
     views: tuple[Shot, ...]
-    judgement: ValidationReport
+    report: ValidationReport
     denoiser: WindowDenoiser
     first_passes: tuple[FirstPassSource, ...]
-    rows: int | None
-    settings: Mapping[str, object]
     timings: Timings
     breakdown: Breakdown | None
+
+    @classmethod
+    def open(
+        cls,
+        shot: Shot,
+        output: str | Path,
+        options: DenoiseOptions,
+        paths: Paths = NO_PATHS,
+        judging: AbstractContextManager[object] | None = None,
+    ) -> Job:
+        """Validate everything that a job depends on; `judging` is entered while frames are read and validated.
+
+        Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be
+        overwritten, or memory does not suffice.
+        """
+        timings, breakdown = Timings(), None if options.breakdown is None else Breakdown()
+        check_paths(shot, output, options, paths=paths)
+        denoiser = open_denoiser(options, timings, breakdown)
+        if options.method != "network" and shot.aovs:
+            raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
+        with judging or nullcontext():
+            if options.max_memory is not None:  # even with no stage, before any pixel is read
+                plan_rows(parse_size(options.max_memory), shot, ())
+            views, report = judge_views(shot, strict=options.strict)
+            _check_views(views, report, options)
+        if options.preset == "auto":
+            options = _fit_budget(views[0], options)
+            denoiser = open_denoiser(options, timings, breakdown)
+        first_passes = tuple(choose_first_pass(view, options, denoiser) for view in views)
+        check_paths(shot, output, options, first_passes, paths)
+        job = cls(options, str(output), views, report, denoiser, first_passes, timings, breakdown)
+        job.plan_rows()
+        return job
 
     @property
     def preset(self) -> str:
@@ -319,20 +514,30 @@ class Job:
 
     @property
     def first_pass(self) -> str:
-        """Where the last pass over the shot has its denoised images per frame from."""
+        """The first pass of the last pass over the shot, which may be the pass before."""
         passes = self.options.passes
         return self.first_passes[0].name if passes == 1 else f"pass {passes - 1} of {passes}"
 
     @property
-    def total(self) -> int:
-        """Frames of all passes together."""
-        return sum(len(self.views[0].with_neighbours(margin)) for margin in self._margins)
-
-    @property
-    def _margins(self) -> list[int]:
-        """For each pass, the frames on each side of those asked for that later passes need."""
-        support = temporal_support(None, self.denoiser.radius, self.options.rules)
-        return [support * (self.options.passes - number) for number in range(1, self.options.passes + 1)]
+    def settings(self) -> dict[str, object]:
+        """JSON values that pixels depend on, beside preset, stages and versions; frames name their files."""
+        options, first_pass = self.options, self.first_passes[0]
+        weights = {} if options.weights_file is None else {"weights": _digest(options.weights_file)}
+        if first_pass.name == "bundled":
+            neural = import_neural()
+            bundled = neural.bundled_preset(OIDN_MODES[options.oidn_mode]["quality"])
+            weights["bundled"] = _digest(neural.shipped_weights(bundled))
+        return {
+            "method": options.method,
+            "aovs": list(self.views[0].aovs),
+            "aov-sum": options.aov_sum,
+            "first-pass": "sequence" if first_pass.files else options.first_pass,
+            "passes": options.passes,
+            "breakdown": options.breakdown is not None,
+            "device": {**self.denoiser.devices, **({"oidn": first_pass.device} if first_pass.device else {})},
+            **self.denoiser.settings,
+            **weights,
+        }
 
     def header(self) -> dict[str, str]:
         """Attributes for the header of each frame: where they differ, pixels may."""
@@ -347,334 +552,72 @@ class Job:
             "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
         }
 
-
-@dataclass(frozen=True)
-class Step:
-    """The state of a job after a frame.
-
-    Attributes
-    ----------
-    result : Finished or Failed
-        The frame.
-    run, runs : int
-        Which pass over the shot it belongs to, from 1, and how many there are.
-    done, total : int
-        Frames of all passes.
-    """
-
-    result: Finished | Failed
-    run: int
-    runs: int
-    done: int
-    total: int
-
-
-Progress = Callable[[Step], bool | None]
-
-
-def check_paths(
-    shot: Shot,
-    output: str | Path,
-    options: DenoiseOptions,
-    sources: Sequence[FirstPassSource] = (),
-    *,
-    reads: Mapping[str, str | Path | None] = {},
-    writes: Mapping[str, Path | None] = {},
-) -> None:
-    """Refuse, before anything is read or written, a run that would write over its inputs.
-
-    Parameters
-    ----------
-    shot : Shot
-        The noisy frames.
-    output : str or Path
-        Pattern or folder of the denoised frames.
-    options : DenoiseOptions
-        Name further files.
-    sources : sequence of FirstPassSource
-        First passes, whose files are read or written.
-    reads, writes : mapping of str to path or None
-        Further files.
-
-    Raises
-    ------
-    ValueError, OSError
-        As `hybrid.files.replace.check_outputs`.
-    FileNotFoundError
-        If frames were asked for that are not there, and `keep_going` is not set.
-    """
-    if shot.missing and not options.keep_going:
-        missing = format_frames(shot.missing)
-        raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
-    weights = weights_of(options) if options.method == "network" else None
-    check_written(shot, output, sources, {"weights": weights, **reads}, {"breakdown": options.breakdown, **writes})
-
-
-def open_job(
-    shot: Shot,
-    output: str | Path,
-    options: DenoiseOptions = DenoiseOptions(),
-    *,
-    reads: Mapping[str, str | Path | None] = {},
-    writes: Mapping[str, Path | None] = {},
-    judging: AbstractContextManager[object] | None = None,
-) -> Job:
-    """Validate everything that a job depends on, and read what decides its options.
-
-    Parameters
-    ----------
-    shot : Shot
-        The noisy frames.
-    output : str or Path
-        ``OUT.####.exr``, or a folder.
-    options : DenoiseOptions
-        What is asked for.
-    reads, writes : mapping of str to path or None
-        Further files, which the frames may not write over.
-    judging : context manager, optional
-        Entered while frames are read and validated.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If an option cannot be had here, a file is damaged or would be overwritten, or memory does not suffice.
-    """
-    timings, breakdown = Timings(), None if options.breakdown is None else Breakdown()
-    check_paths(shot, output, options, reads=reads, writes=writes)
-    denoiser = open_denoiser(options, timings, breakdown)
-    _check_first_pass_of(denoiser, options)
-    if options.method != "network" and shot.aovs:
-        raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
-    with judging or nullcontext():
-        if options.max_memory is not None:  # even with no stage, before any pixel is read
-            plan_rows(parse_size(options.max_memory), shot, ())
-        views, judgement = judge_views(shot, strict=options.strict)
-        if options.strict:
-            _refuse_cuts(views, judgement)
-        if options.aov_sum == "beauty":
-            _check_sums(views)
-    if options.preset == "auto":
-        options = _fit_budget(views[0], options)
-        denoiser = open_denoiser(options, timings, breakdown)
-    first_passes = tuple(choose_first_pass(view, options, denoiser) for view in views)
-    check_paths(shot, output, options, first_passes, reads=reads, writes=writes)
-    settings = _settings(options, views[0], denoiser, first_passes[0])
-    rows = _plan_rows(options, views, denoiser, first_passes[0])
-    output = str(output)
-    return Job(options, output, views, judgement, denoiser, first_passes, rows, settings, timings, breakdown)
-
-
-def judge_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
-    """Return the views of a shot without layers that make no sense, and the findings.
-
-    Parameters
-    ----------
-    shot : Shot
-        Pairs of its frames are read.
-    strict : bool
-        Raise ValueError with all findings instead.
-    """
-    views = shot.views
-    judged = [validate_layers(view) for view in views]
-    findings = [finding for judgement in judged for finding in judgement.findings]
-    judgement = replace(judged[0], findings=tuple(dict.fromkeys(findings)))
-    if strict and (words := [*shot.warnings, *judgement.warnings]):
-        raise ValueError("; ".join(words))
-    return tuple(own.apply(view) for own, view in zip(judged, views, strict=True)), judgement
-
-
-def _refuse_cuts(views: Sequence[Shot], judgement: ValidationReport) -> None:
-    for view in views:
-        cuts = [finding for cut in plan_shot(view).cuts if (finding := find_cut(*cut)) not in judgement.findings]
-        if cuts:
-            raise ValueError("; ".join(cut.message for cut in cuts))
-
-
-def _check_sums(views: Sequence[Shot]) -> None:
-    """Refuse to make a beauty of layers that do not add up to it."""
-    for view in views:
-        passes = view.passes
-        if view.aovs and not any(found.whole == BEAUTY and found.complete for found in passes.sums):
-            raise ValueError(
-                f"{view.path(view.numbers[0])}: --aov-sum beauty: no layers add up to the beauty, all of them "
-                f"together have {passes.light:.2f} times its light, expected layers of which it is the sum"
-            )
-
-
-def _check_first_pass_of(denoiser: WindowDenoiser, options: DenoiseOptions) -> None:
-    if not denoiser.needs_first_pass and options.first_pass not in ("auto", "none"):
-        raise ValueError(
-            f"first-pass is {options.first_pass!r}, expected auto or none: the network of {weights_of(options).name} "
-            "takes none"
+    def plan_rows(self) -> int | None:
+        """How many rows of a frame are denoised at a time, None for all; ValueError where not even a band fits."""
+        if self.options.max_memory is None:
+            return None
+        return plan_rows(
+            parse_size(self.options.max_memory) // len(self.views),
+            self.views[0],
+            self.options.rules.allowed,
+            self.first_passes[0].first_pass,
+            radius=self.denoiser.radius,
+            network=self.denoiser.memory(self.views[0].shape),
+            gathers=self.denoiser.pools,
         )
 
+    def margins(self) -> list[int]:
+        """For each pass, the frames on each side of those asked for that later passes need."""
+        support = temporal_support(None, self.denoiser.radius, self.options.rules)
+        return [support * (self.options.passes - number) for number in range(1, self.options.passes + 1)]
 
-def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> FirstPassSource:
-    """Return the first pass of a view; a network that needs one has the classical one where none is asked for.
+    def total(self) -> int:
+        """Frames of all passes together."""
+        return sum(len(self.views[0].with_neighbours(margin)) for margin in self.margins())
 
-    Parameters
-    ----------
-    view : Shot
-        The noisy frames.
-    options : DenoiseOptions
-        With the preset that was chosen.
-    denoiser : WindowDenoiser
-        Says whether it needs a first pass, and brings functions for it.
+    def run(self, progress: Progress | None = None) -> Iterator[Finished | Failed]:
+        """Denoise the frames and write them; yield each frame of the last pass.
 
-    Raises
-    ------
-    ValueError, ImportError, FileNotFoundError
-        As `hybrid.first_pass.find_first_pass`.
-    """
-    if not denoiser.needs_first_pass:
-        return FirstPassSource("none", None, "the denoiser takes none")
-    support = temporal_support(None, denoiser.radius, options.rules)
-    quicker, bundled = denoiser.backends
-    return find_first_pass(
-        "nlm" if options.first_pass == "none" else options.first_pass,
-        view.with_neighbours(support * (options.passes - 1)),
-        own=CLASSICAL_PRESETS.get(options.preset, FINAL),
-        kept=options.keep_first_pass,
-        mode=_oidn_mode(options),
-        forced=options.rules.forced,
-        quicker=quicker,
-        bundled=bundled,
-        device=options.device,
-    )
-
-
-def _oidn_mode(options: DenoiseOptions) -> str:
-    """The mode of OIDN that the first pass "auto" has."""
-    return "oidn-clean" if options.weights is not None else OIDN_MODE_OF_PRESET.get(options.preset, "oidn-clean")
-
-
-def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
-    """The options with the most accurate preset that is measured to fit the budget, or with the fastest."""
-
-    def with_preset(preset: str) -> DenoiseOptions:
-        return replace(options, preset=preset, budget=None)
-
-    def load(preset: str) -> tuple[WindowDenoiser, FirstPassSource]:
-        # Nothing is kept: the frames that are measured are parts.
-        measured = replace(with_preset(preset), keep_first_pass=None)
-        denoiser = open_denoiser(measured)
-        return denoiser, choose_first_pass(view, measured, denoiser)
-
-    limit, tried = parse_budget(str(options.budget)), []
-    for measured in measure_presets(view, options.rules, MEASURED, load):
-        tried.append(f"{measured.preset} {measured.seconds:.2g} s")
-        fits = measured.seconds <= limit
-        if fits:
-            break
-    LOG.info(f"preset: {measured.preset} ({', '.join(tried)} a frame; {options.budget} asked for)")
-    if not fits:
-        LOG.warning("not even the fastest preset fits")
-    return with_preset(measured.preset)
-
-
-def _settings(
-    options: DenoiseOptions, view: Shot, denoiser: WindowDenoiser, first_pass: FirstPassSource
-) -> dict[str, object]:
-    """What pixels depend on beside preset, stages and versions, and without paths: frames name their files."""
-    weights = {}
-    if options.method == "network":
-        weights["weights"] = _digest(weights_of(options))
-    if first_pass.name == "bundled":
-        neural = import_neural()
-        bundled = neural.bundled_preset(OIDN_MODES[_oidn_mode(options)]["quality"])
-        weights["bundled"] = _digest(neural.shipped_weights(bundled))
-    return {
-        "method": options.method,
-        "aovs": list(view.aovs),
-        "aov-sum": options.aov_sum,
-        "first-pass": "sequence" if first_pass.files else options.first_pass,
-        "passes": options.passes,
-        "breakdown": options.breakdown is not None,
-        "device": {**denoiser.devices, **({"oidn": first_pass.device} if first_pass.device else {})},
-        **denoiser.settings,
-        **weights,
-    }
-
-
-def _digest(path: Path) -> str:
-    """Identify the content of a file of weights."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-
-
-def _plan_rows(
-    options: DenoiseOptions, views: Sequence[Shot], denoiser: WindowDenoiser, first_pass: FirstPassSource
-) -> int | None:
-    if options.max_memory is None:
-        return None
-    return plan_rows(
-        parse_size(options.max_memory) // len(views),
-        views[0],
-        options.rules.allowed,
-        first_pass.first_pass,
-        radius=denoiser.radius,
-        network=denoiser.memory(views[0].shape),
-        gathers=denoiser.pools,
-    )
-
-
-def run_job(job: Job, progress: Progress | None = None) -> Iterator[Finished | Failed]:
-    """Denoise the frames of a job and write them.
-
-    Parameters
-    ----------
-    job : Job
-        From `open_job`.
-    progress : callable, optional
-        Called after each frame of each pass; if it returns False, the job ends there.
-
-    Yields
-    ------
-    Finished or Failed
-        Each frame of the last pass. Frames that are written are whole, also where the generator is closed early.
-    """
-    options, runs, done = job.options, job.options.passes, 0
-    if options.threads is not None:
-        limit_threads(options.threads)
-    if options.reuse_freed_memory and options.max_memory is None:
-        reuse_freed_memory()
-    views = [View(shot, source.first_pass) for shot, source in zip(job.views, job.first_passes, strict=True)]
-    sources: SourcesOf | None = None
-    home = output_path(job.output, job.views[0], job.views[0].numbers[0]).parent
-    with ExitStack() as stack:
-        for run, margin in enumerate(job._margins, start=1):
-            last = run == runs
-            shot = views[0].shot.with_neighbours(margin)
-            output = job.output if last else str(stack.enter_context(temporary_folder(home / f"pass{run}")))
-            settings = RunSettings(
-                rows=job.rows,
-                background=options.max_memory is None,
-                resume=options.resume and last,
-                keep_going=options.keep_going and last,
-                attributes=job.header(),
-                sources=sources,
-            )
-            frames = denoise_frames(
-                [View(shot, views[0].first_pass), *views[1:]],
-                output,
-                job.denoiser if last or job.breakdown is None else open_denoiser(options, job.timings),
-                options.rules,
-                settings,
-                radius=job.denoiser.radius,
-                timings=job.timings,
-            )
-            for frame in frames:
-                done += 1
-                if progress is not None and progress(Step(frame, run, runs, done, job.total)) is False:
-                    frames.close()  # type: ignore[attr-defined]
-                    return
-                if last:
-                    yield frame
-            if not last:
-                sources = sources_of(views, job.denoiser.radius, options.rules, sources)
-                files = {number: output_path(output, shot, number) for number in shot.numbers}
-                views = [View(view.shot.reopened(files), PerFrame(lambda frame: frame.color)) for view in views]
-        if options.breakdown is not None:
-            write_breakdown(list(job.views), job.output, 2 * job.denoiser.radius + 1, options.breakdown)
+        `progress` is called after each frame of each pass; if it returns False, the job ends there. Frames that are
+        written are whole, also where the generator is closed early.
+        """
+        options, runs, done, total = self.options, self.options.passes, 0, self.total()
+        if options.threads is not None:
+            limit_threads(options.threads)
+        if options.reuse_freed_memory and options.max_memory is None:
+            reuse_freed_memory()
+        views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
+        settings = RunSettings(self.plan_rows(), options.max_memory is None, attributes=self.header())
+        home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent
+        with ExitStack() as stack:
+            for run, margin in enumerate(self.margins(), start=1):
+                last = run == runs
+                shot, output = views[0].shot.with_neighbours(margin), self.output
+                if not last:
+                    output = str(stack.enter_context(temporary_folder(home / f"pass{run}")))
+                frames = denoise_frames(
+                    [View(shot, views[0].first_pass), *views[1:]],
+                    output,
+                    self.denoiser if last or self.breakdown is None else open_denoiser(options, self.timings),
+                    options.rules,
+                    replace(settings, resume=options.resume and last, keep_going=options.keep_going and last),
+                    radius=self.denoiser.radius,
+                    timings=self.timings,
+                )
+                for frame in frames:
+                    done += 1
+                    if progress is not None and progress(Step(frame, run, runs, done, total)) is False:
+                        frames.close()  # type: ignore[attr-defined]
+                        return
+                    if last:
+                        yield frame
+                if not last:
+                    sources = sources_of(views, self.denoiser.radius, options.rules, settings.sources)
+                    settings = replace(settings, sources=sources)
+                    files = {number: output_path(output, shot, number) for number in shot.numbers}
+                    views = [View(view.shot.reopened(files), PerFrame(lambda frame: frame.color)) for view in views]
+            if options.breakdown is not None:
+                write_breakdown(list(self.views), self.output, 2 * self.denoiser.radius + 1, options.breakdown)
 
 
 def denoise_shot(
@@ -687,8 +630,8 @@ def denoise_shot(
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, as the command does: the same files, which ``--resume`` continues.
 
-    Everything is validated when this function is called; frames are made while the iterator is consumed. Closing the
-    iterator, or a `progress` that returns False, ends the work after a frame; frames that are written are whole.
+    Everything is validated when this function is called; frames are denoised while the iterator is consumed. Closing
+    the iterator, or a `progress` that returns False, ends the work after a frame; frames that are written are whole.
 
     Parameters
     ----------
@@ -724,31 +667,4 @@ def denoise_shot(
     >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr", preset="draft")]
     ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
     """
-    return run_job(open_job(shot, output, replace_options(options, changes)), progress)
-
-
-def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
-    """Return options with some fields replaced.
-
-    Parameters
-    ----------
-    options : DenoiseOptions or None
-        None: the defaults.
-    changes : mapping of str to object
-        Field → value; the old names of fields are accepted with a warning, and None for a default.
-
-    Raises
-    ------
-    ValueError
-        If there is no such option.
-    """
-    known = {entry.name for entry in fields(DenoiseOptions)}
-    given = {}
-    for name, value in changes.items():
-        if name == "estimate":
-            warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
-            name, value = "first_pass", value or ""
-        if name not in known:
-            raise ValueError(f"option {name!r} is not there, expected one of {', '.join(sorted(known))}")
-        given[name] = value
-    return DenoiseOptions(**given) if options is None else replace(options, **given)  # type: ignore[arg-type]
+    return Job.open(shot, output, replace_options(options, changes)).run(progress)

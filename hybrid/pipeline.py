@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.fireflies import REACH
-from hybrid.files.replace import check_outputs, remove_leftovers
+from hybrid.files.replace import remove_leftovers
 from hybrid.files.shots import Shot, output_path
-from hybrid.files.sources import MADE_FROM, PACKAGES, Source, describe_sources, versions, why_stale
-from hybrid.first_pass import OIDN_MODES, FirstPassSource
+from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
 from hybrid.plan import Plan, Rules
 from hybrid.prefetch import Prefetcher
 from hybrid.runtime.timing import Timings
@@ -62,80 +60,6 @@ class Finished:
     resumed: bool = False  # it was there already
     again: str = ""  # why it was made again, if it was there and an earlier run was to be resumed
     seconds: float = 0.0  # that it took, but for what was read and written beside the work
-
-
-def check_written(
-    shot: Shot,
-    output: str | Path,
-    sources: Sequence[FirstPassSource],
-    inputs: Mapping[str, str | Path | None],
-    others: Mapping[str, Path | None],
-) -> None:
-    """Refuse a run that would write over anything it reads, or over a file that is somebody else's.
-
-    Parameters
-    ----------
-    shot : Shot
-        What is denoised.
-    output : str or Path
-        As for `denoise_frames`.
-    sources : sequence of FirstPassSource
-        Whose files are read, or kept.
-    inputs, others : mapping of str to Path or None
-        What else is read, and what else is written: what it is called → where.
-
-    Raises
-    ------
-    ValueError, OSError
-        As `hybrid.files.replace.check_outputs`.
-    """
-    written = [("output", output_path(output, shot, number)) for number in shot.numbers]
-    written += [("keep-estimates", path) for source in sources for path in source.kept]
-    written += [(what, path) for what, path in others.items() if path is not None]
-    read = [("frame", path) for number in shot.files for path in shot.paths(number)]
-    read += [("estimate", path) for source in sources if source.files for path in source.files.files.values()]
-    read += [(what, Path(path)) for what, path in inputs.items() if path is not None]
-    check_outputs(written, read)
-
-
-def describe_run(
-    command: str,
-    preset: str,
-    source: FirstPassSource,
-    rules: Rules,
-    settings: Mapping[str, object],
-    *,
-    neural: bool = False,
-) -> dict[str, str]:
-    """Describe how the frames of a run are made: where that differs, they may be others.
-
-    Parameters
-    ----------
-    command, preset : str
-        What makes them.
-    source : FirstPassSource
-        Where their estimates come from.
-    rules : Rules
-        What the user has forced.
-    settings : mapping of str to object
-        All other options that pixels depend on, as JSON has them.
-    neural : bool
-        Whether there is a network.
-
-    Returns
-    -------
-    dict of str to str
-        Attributes of their headers.
-    """
-    packages = [*PACKAGES, *(["torch"] if neural else []), *(["pyoidn"] if source.name in OIDN_MODES else [])]
-    return {
-        "ravg/command": command,
-        "ravg/preset": preset,
-        "ravg/estimate": source.name,
-        "ravg/forced": rules.forced,
-        "ravg/settings": json.dumps(settings, sort_keys=True),
-        "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
-    }
 
 
 class View(NamedTuple):

@@ -55,7 +55,7 @@ from hybrid.files.layers import summarize_layers
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.first_pass import SPECS
-from hybrid.job import DenoiseOptions, Job, Step, check_paths, open_job, run_job
+from hybrid.job import DenoiseOptions, Job, Paths, Step, check_paths
 from hybrid.pipeline import Failed, Finished
 from hybrid.plan import NEURAL_STAGES, Plan, merge
 from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
@@ -84,14 +84,10 @@ class Request:
                 check_png(self.contact_sheet, "contact-sheet")
 
     @property
-    def reads(self) -> dict[str, str | None]:
-        """Further files that are read."""
-        return {"profile": self.shot.profile}
-
-    @property
-    def writes(self) -> dict[str, Path | None]:
-        """Further files that are written."""
-        return {"preview": self.preview, "contact-sheet": self.contact_sheet, "log-file": log_file()}
+    def paths(self) -> Paths:
+        """Further files that are read and written."""
+        writes = {"preview": self.preview, "contact-sheet": self.contact_sheet, "log-file": log_file()}
+        return Paths({"profile": self.shot.profile}, writes)
 
 
 def denoise(
@@ -261,7 +257,7 @@ def denoise(
 def _hand_out(context: typer.Context, request: Request, view: str, scheduler: str, size: int) -> None:
     """Let a cluster denoise the shot, a chunk of its frames at a time."""
     shot = request.shot.open()
-    check_paths(shot, request.output, request.options, reads=request.reads, writes=request.writes)
+    check_paths(shot, request.output, request.options, paths=request.paths)
     parts = [shot.numbers[start : start + size] for start in range(0, len(shot.numbers), size)]
     chunks = {}
     for part in parts:
@@ -279,15 +275,8 @@ def _hand_out(context: typer.Context, request: Request, view: str, scheduler: st
 def _denoise(request: Request) -> None:
     """Denoise a shot; leave a record beside the frames however it ends; stopped by Ctrl-C, log what is finished."""
     shot = request.shot.open()
-    job = open_job(
-        shot,
-        request.output,
-        request.options,
-        reads=request.reads,
-        writes=request.writes,
-        judging=_failure_on_record(request, shot),
-    )
-    log_findings(job.judgement, job.views)
+    job = Job.open(shot, request.output, request.options, request.paths, _failure_on_record(request, shot))
+    log_findings(job.report, job.views)
     first = output_path(request.output, shot, shot.numbers[0])
     record = Record(
         first.parent,
@@ -348,7 +337,7 @@ class _Report:
 
     def __init__(self, job: Job, record: Record) -> None:
         self.job, self.record = job, record
-        self.findings: list[Finding] = list(job.judgement.findings)
+        self.findings: list[Finding] = list(job.report.findings)
         self.pixels = self.outliers = 0
         self.means: list[tuple[float, float]] = []  # radiance of each noisy frame, with and without its fireflies
         self.plans: dict[int, Plan] = {}
@@ -411,14 +400,14 @@ def _run(job: Job, record: Record) -> None:
     view, source = job.views[0], job.first_passes[0]
     taken = view.layers(view.numbers[0])
     layers = summarize_layers(taken)
-    found = [finding.message for finding in job.judgement.findings if not finding.warning]
+    found = [finding.message for finding in job.report.findings if not finding.warning]
     for words in (f"layers: {layers}", *taken.notes, *found, *view.recompressed_parts(job.views[1:])):
         LOG.info(printable(words))
     later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
     LOG.info(f"first pass: {source.name} ({source.reason}){later}")
-    judged = [vars(finding) for finding in job.judgement.findings]
+    judged = [vars(finding) for finding in job.report.findings]
     record.write(job.timings, layers=layers, warnings=view.warnings, judged=judged)
-    report, bar = _Report(job, record), Progress("denoise", job.total)
+    report, bar = _Report(job, record), Progress("denoise", job.total())
 
     def advance(step: Step) -> None:
         number = step.result.number
@@ -430,7 +419,7 @@ def _run(job: Job, record: Record) -> None:
             facts |= {"seconds": round(step.result.seconds, 3), "path": str(step.result.path)}
         bar.advance(1, report.add(step.result), **facts)
 
-    for _ in run_job(job, advance):
+    for _ in job.run(advance):
         pass
     report.finish()
 

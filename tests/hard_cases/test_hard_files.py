@@ -133,7 +133,8 @@ def test_the_output_is_never_an_input_by_another_name(tmp_path, capsys):
         assert main(["pseudoref", str(source), "-o", str(target), "--preset", "draft"]) == 1
         assert "would overwrite an input" in capsys.readouterr().err
     out = ["-o", str(tmp_path / "out"), "--preset", "draft"]
-    assert main(["pseudoref", str(source), *out, "--preview", str(source)]) == 1
+    os.link(source, tmp_path / "look.png")
+    assert main(["pseudoref", str(source), *out, "--preview", str(tmp_path / "look.png")]) == 1
     assert "preview" in capsys.readouterr().err
     assert source.read_bytes() == before
 
@@ -196,12 +197,12 @@ def test_side_outputs_spare_all_that_is_read_and_all_that_is_made(tmp_path, caps
     words += ["--profile", str(profile)]
     same = str(tmp_path / "same.png")
     for more, said in [
-        (["--preview", str(tmp_path / "soft.png")], "preview .* would overwrite an input: estimate"),
-        (["--contact", str(tmp_path / "hard.png")], "contact .* would overwrite an input: profile"),
+        (["--preview", str(tmp_path / "soft.png")], "preview .* would overwrite an input: first-pass"),
+        (["--contact-sheet", str(tmp_path / "hard.png")], "contact-sheet .* would overwrite an input: profile"),
         (["--preview", str(tmp_path / "null.png")], "null.png is a device"),
         (["--preview", str(tmp_path / "folder.png")], "folder.png is a folder"),
-        (["--preview", same, "--contact", same], "contact .* would overwrite preview"),
-        (["-o", str(estimates)], "output .* would overwrite an input: estimate"),
+        (["--preview", same, "--contact-sheet", same], "contact-sheet .* would overwrite preview"),
+        (["-o", str(estimates)], "output .* would overwrite an input: first-pass"),
     ]:
         assert main([*words, *more]) == 1
         assert re.search(said, capsys.readouterr().err)

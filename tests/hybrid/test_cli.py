@@ -303,7 +303,7 @@ def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, method):
     theirs = Path(shutil.copytree(shot_folder, tmp_path / "theirs"))
     before = {path: path.read_bytes() for path in theirs.iterdir()}
     words = ("denoise", "--method", method, shot_folder, "--first-pass", theirs, "-o", theirs)
-    assert "would overwrite an input: estimate" in one_line_error(capsys, *words)
+    assert "would overwrite an input: first-pass" in one_line_error(capsys, *words)
     assert {path: path.read_bytes() for path in theirs.iterdir()} == before
 
 
