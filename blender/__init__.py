@@ -1,4 +1,4 @@
-"""ravg in Blender: set up the passes, render, denoise with the installed command, and load the result."""
+"""ravg in Blender: set up passes, render, denoise with the installed command, and load the result."""
 
 import bpy
 
@@ -18,12 +18,12 @@ CLASSES = (
 )
 HANDLERS = (
     ("load_pre", jobs.stop_current),
-    ("load_post", jobs.give_back_all),
+    ("load_post", jobs.restore_all),
     ("render_init", jobs.protect),
     ("render_complete", jobs.protected),
     ("render_cancel", jobs.protected),
 )
-_command = []  # what unregisters the command line
+_command = []  # the handle that unregisters the command line
 
 
 def register() -> None:

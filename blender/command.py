@@ -1,4 +1,4 @@
-"""The command `ravg`, found and run in a process of its own. Knows nothing of Blender."""
+"""Find the command `ravg` and run it in a process of its own. Independent of Blender."""
 
 from __future__ import annotations
 
@@ -26,13 +26,7 @@ _STOPPABLE = {"RAVG_STOP_WITH_STDIN": "1"}
 
 
 def find_command(named: str) -> str:
-    """Return the path of the command that a user has named: a path, or a name that PATH knows.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none; one line that says where to name it.
-    """
+    """Return the path of a command given by its path or its name on PATH, or raise FileNotFoundError."""
     found = shutil.which(os.path.expanduser(named.strip() or "ravg"))
     if found is None:
         raise FileNotFoundError(f"no command {named or 'ravg'!r}: {WHERE}")
@@ -40,23 +34,16 @@ def find_command(named: str) -> str:
 
 
 class Version:
-    """The version of a command, asked for in a process of its own: a panel cannot wait for it."""
+    """The version of a command, read in the background: a panel cannot wait for the answer."""
 
     def __init__(self, executable: str) -> None:
         self.executable = executable
         self._text = ""
         try:
             self._process: subprocess.Popen[str] | None = subprocess.Popen(
-                [executable, "--version"],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                encoding="utf-8",
-                errors="replace",
-                env={**os.environ, **_PLAIN},
-                **_windowless(),
-            )
+                [executable, "--version"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                encoding="utf-8", errors="replace", env={**os.environ, **_PLAIN}, **_windowless(),
+            )  # fmt: skip
         except OSError as error:
             self._process = None
             self._text = str(error)
@@ -67,13 +54,7 @@ class Version:
         return self._process is None or self._process.poll() is not None
 
     def problem(self, expected: str) -> str:
-        """Wait for the answer; return why a command of this version cannot be used, or nothing.
-
-        Parameters
-        ----------
-        expected : str
-            The first two numbers of the version, such as ``0.2``.
-        """
+        """Wait for the answer; return why the command cannot be used, or "" if its version is `expected`, as in 0.2."""
         if self._process is not None:
             try:
                 self._text = self._process.communicate(timeout=ANSWER_WITHIN)[0]
@@ -91,22 +72,10 @@ class Version:
 
 
 class Run:
-    """`ravg` at work.
+    """A running command whose output goes to `log`; raises OSError if the command cannot be started.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        The command and what it is given.
-    outputs : iterable of Path
-        The files that it is to write. It renames each into its place when it is whole, so that their number tells
-        how far the work has come.
-    log : Path
-        Where to put what it prints.
-
-    Raises
-    ------
-    OSError
-        If the command cannot be started.
+    `outputs` are the files that it will write. Each is renamed into its place when complete, so that counting them
+    measures the progress.
     """
 
     def __init__(self, arguments: Sequence[str], outputs: Iterable[Path], log: Path) -> None:
@@ -115,32 +84,28 @@ class Run:
         self._stopped_at: float | None = None
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
-                list(arguments),
-                stdin=subprocess.PIPE,
-                stdout=sink,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, **_PLAIN, **_STOPPABLE},
-                **_windowless(),
-            )
+                list(arguments), stdin=subprocess.PIPE, stdout=sink, stderr=subprocess.STDOUT,
+                env={**os.environ, **_PLAIN, **_STOPPABLE}, **_windowless(),
+            )  # fmt: skip
 
     @property
     def total(self) -> int:
-        """How many frames there are to make."""
+        """The number of frames to make."""
         return len(self._before)
 
     @property
     def finished(self) -> int:
-        """How many of them this run has made."""
+        """The number of frames that this run has made."""
         return sum(_version(path) not in (None, before) for path, before in self._before.items())
 
     @property
     def stopped(self) -> bool:
-        """Whether it was asked to stop."""
+        """Whether `stop` was called while the command ran."""
         return self._stopped_at is not None
 
     @property
     def code(self) -> int | None:
-        """The exit code; None while it runs. A process that was asked to stop and does not is killed in time."""
+        """The exit code; None while the command runs. A stopped process that does not end is killed in time."""
         code = self._process.poll()
         if code is None and self._stopped_at is not None:
             waited = time.monotonic() - self._stopped_at
@@ -152,38 +117,37 @@ class Run:
         return code
 
     def stop(self) -> None:
-        """Ask it to stop; finished frames stay."""
+        """Ask the command to stop; finished frames stay."""
         if self._stopped_at is None and self._process.poll() is None:
             self._stopped_at = time.monotonic()
             with suppress(OSError):
                 self._process.stdin.close()
 
     def wait(self) -> int:
-        """Wait for its end and return the exit code."""
+        """Wait for the end and return the exit code."""
         while (code := self.code) is None:
             time.sleep(0.05)
         return code
 
     @property
     def log(self) -> str:
-        """All that it has printed so far."""
+        """All output so far."""
         return self._log.read_text(encoding="utf-8", errors="replace")
 
     @property
     def warnings(self) -> list[str]:
-        """What it has warned of."""
+        """The warnings in the log."""
         marked = (line.partition("warning: ") for line in self.log.splitlines())
         return [text for before, mark, text in marked if mark and not before.strip()]
 
     @property
     def remaining(self) -> str:
-        """How long it says that it will still take, such as ``7 min``; empty where it has not said so yet."""
-        said = re.findall(r"% *, about (.+) left$", self.log, re.MULTILINE)
-        return said[-1] if said else ""
+        """The remaining time that the command printed last, such as ``7 min``; empty before the first."""
+        return (re.findall(r"% *, about (.+) left$", self.log, re.MULTILINE) or [""])[-1]
 
     @property
     def error(self) -> str:
-        """Why it has failed, in one line: its own, else the last that it has printed."""
+        """Why the command failed, in one line: its error message, else its last output."""
         # Usage errors are drawn in a frame: of box characters, or of + - | where the system has none.
         lines = [line.strip(" │╭╮╰╯─┌┐└┘|+") for line in self.log.splitlines()]
         lines = [line for line in lines if line.strip("-")]
@@ -192,14 +156,14 @@ class Run:
 
 
 def _windowless() -> dict[str, Any]:
-    """How a process is started that has no console of its own, nor Blender's."""
+    """Arguments that start a process without a console, its own or Blender's."""
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NO_WINDOW}
     return {"start_new_session": True}  # Ctrl-C in Blender's terminal is Blender's
 
 
 def _version(path: Path) -> tuple[int, int] | None:
-    """What tells one file from the next in its place; None where there is none."""
+    """Identify a file among others of its path; None if it is missing."""
     try:
         status = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""The denoised frames among the nodes of a scene's compositor."""
+"""Put the denoised frames into a scene's compositor."""
 
 from __future__ import annotations
 
@@ -6,20 +6,15 @@ import bpy
 
 from . import scenes
 
-# The one pass whose names differ: of a Render Layers node, and of an image.
+# Socket of a Render Layers node → socket of an Image node, where they differ.
 _NAMES = {"Image": "Combined"}
 
 
 def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
-    """Put the denoised frames in the place of the scene's Render Layers nodes, each for its view layer.
+    """Replace the scene's Render Layers nodes by the denoised frames; ValueError for a scene in stereo.
 
     A Render Layers node that has no links left is muted: Blender then composites without rendering the scene again.
-    Where there is none, the denoised frames become the output of an empty compositor.
-
-    Raises
-    ------
-    ValueError
-        If the scene is rendered in stereo.
+    Without such nodes, the denoised frames become the output of an empty compositor.
     """
     if scene.render.use_multiview:
         raise ValueError(scenes.STEREO)
@@ -43,7 +38,7 @@ def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
 
 
 def _node(tree: bpy.types.NodeTree, scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> bpy.types.Node:
-    """A new image node that shows the denoised frames."""
+    """Add an image node that shows the denoised frames."""
     node = tree.nodes.new("CompositorNodeImage")
     node.image, node.label = image, "Denoised"
     scenes.show_from(node, scene, count)
@@ -51,7 +46,7 @@ def _node(tree: bpy.types.NodeTree, scene: bpy.types.Scene, image: bpy.types.Ima
 
 
 def _tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The nodes of the scene's compositor, made where there are none."""
+    """The node tree of the scene's compositor, made if missing."""
     if not hasattr(scene, "compositing_node_group"):  # before Blender 5.0
         scene.use_nodes = True
         return scene.node_tree

@@ -1,4 +1,4 @@
-"""Rendered frames on disk: which numbers are there, and whether a file is a noisy render. Knows nothing of Blender."""
+"""Rendered frames on disk: ranges of numbers, and whether a file is a noisy render. Independent of Blender."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LARGEST = 1 << 24  # bytes of one header attribute; a broken file may claim any
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Write frame numbers as ``--frames`` takes them: ``4-6,9``, ``1-9x2``."""
+    """Format frame numbers as ``--frames`` takes them: ``4-6,9``, ``1-9x2``."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         run = runs[-1] if runs else []
@@ -27,7 +27,7 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 def _texts(run: list[int]) -> list[str]:
-    """One run of equal steps as text; two numbers that are no neighbours stay apart."""
+    """Format one run of equal steps; two numbers that are no neighbours stay apart."""
     if len(run) == 1:
         return [str(run[0])]
     step = run[1] - run[0]
@@ -37,15 +37,7 @@ def _texts(run: list[int]) -> list[str]:
 
 
 def refusal(path: Path, *, cycles: bool) -> str:
-    """Say why a file is not a noisy frame with the passes that ravg reads; empty where it is one.
-
-    Parameters
-    ----------
-    path : Path
-        An existing file.
-    cycles : bool
-        Whether Cycles should have rendered it.
-    """
+    """Return why a file is not a noisy frame with the passes that ravg reads, or ""; `cycles`: rendered by Cycles."""
     try:
         attributes, channels = read_header(path)
     except (OSError, ValueError) as error:
@@ -57,7 +49,7 @@ def refusal(path: Path, *, cycles: bool) -> str:
         return "it is the compositor's, not a noisy render"
     if not layers:
         return "it has no Combined pass: it is no OpenEXR MultiLayer file of Blender"
-    # The compositor, and files that Blender copies, leave black layers without these.
+    # Layers of the compositor and of copied files are black and lack these attributes.
     rendered = {found[1] for name in attributes if (found := re.fullmatch(r"cycles\.(.+)\.samples", name))}
     for layer in sorted(layers):
         if cycles and layer not in rendered:
@@ -71,12 +63,7 @@ def refusal(path: Path, *, cycles: bool) -> str:
 def read_header(path: Path) -> tuple[set[str], set[str]]:
     """Return the names of the attributes and of the channels of all parts of an OpenEXR file.
 
-    Raises
-    ------
-    OSError
-        If it cannot be opened.
-    ValueError
-        If it is no OpenEXR file, or ends within its header.
+    OSError if it cannot be opened; ValueError if it is no OpenEXR file, or ends within its header.
     """
     attributes: set[str] = set()
     channels: set[str] = set()
@@ -100,7 +87,7 @@ def read_header(path: Path) -> tuple[set[str], set[str]]:
 
 
 def _channels(value: bytes) -> set[str]:
-    """The names in a channel list: each ends with a zero byte, and 16 bytes follow it."""
+    """The names in a channel list: each ends with a zero byte and is followed by 16 bytes."""
     names = set()
     while (end := value.find(b"\0")) > 0:
         names.add(value[:end].decode("utf-8", "replace"))

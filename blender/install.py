@@ -1,4 +1,4 @@
-"""An environment of its own for ravg, made with Blender's Python and pip. Knows nothing of Blender."""
+"""A Python environment for ravg, made with Blender's Python and pip. Independent of Blender."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-_CURRENT = "current.txt"  # names the environment that is complete
-# What pip prints, after its retries, when it has reached no package index.
+_CURRENT = "current.txt"  # holds the name of the complete environment
+# pip's output, after its retries, when no package index was reached.
 _NO_NETWORK = re.compile(
     "NewConnectionError|ConnectTimeout|ReadTimeout|ProxyError|SSLError|Failed to establish a new connection"
     "|[Nn]ame resolution|getaddrinfo failed|Network is unreachable|Connection refused|No address associated"
@@ -19,32 +19,14 @@ _NO_NETWORK = re.compile(
 
 @dataclass(frozen=True)
 class Source:
-    """Where ravg is installed from.
+    """The source that ravg is installed from."""
 
-    Attributes
-    ----------
-    version : str
-        The version of this extension, such as ``0.2.0``.
-    wheel : Path or None
-        A wheel file of ravg; its requirements are taken from wheels beside it first. None: the package index.
-    online : bool
-        Whether the package index may be asked.
-    """
-
-    version: str
-    wheel: Path | None
-    online: bool
+    version: str  # of this extension, such as 0.2.0
+    wheel: Path | None  # requirements are taken from wheels in its folder first; None: the package index
+    online: bool  # whether the package index may be used
 
     def requirements(self) -> list[str]:
-        """Return pip's arguments: what to install, and where from.
-
-        Raises
-        ------
-        FileNotFoundError
-            If the wheel is not there.
-        ValueError
-            If it is no wheel of ravg, or if there is no source at all.
-        """
+        """Return pip's arguments. FileNotFoundError or ValueError for a wrong wheel or no source at all."""
         if self.wheel is None:
             if not self.online:
                 raise ValueError("allow Online Access in Preferences > System > Network, or choose a wheel file")
@@ -58,25 +40,19 @@ class Source:
 
 
 def series(version: str) -> str:
-    """The first two numbers of a version: those of the extension and of ravg are to be the same."""
+    """The first two numbers of a version, which extension and ravg must share."""
     return ".".join(version.split(".")[:2])
 
 
 def new_environment(home: Path) -> Path:
-    """A folder for a new environment: the one in use stays until the new one is complete."""
+    """A folder for a new environment; the current one stays until the new one is complete."""
     numbers = [int(name.rpartition("-")[2]) for name in _environments(home)]
     return home / f"environment-{max(numbers, default=0) + 1}"
 
 
 def steps(environment: Path, source: Source) -> list[list[str]]:
-    """The commands that make an environment, in their order.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `Source.requirements`.
-    """
-    # Isolated: a ravg in the folder or the path of Blender is not the one of the environment.
+    """The commands that make an environment, in their order; raises as `Source.requirements` does."""
+    # Isolated (-I): ignore any ravg in Blender's folder or path.
     pip = [_program(environment, "python"), "-I", "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
     pip += ["--progress-bar=off", "--retries=1", "--timeout=15", *source.requirements()]
     make = [sys.executable, "-I", "-m", "venv", os.fspath(environment)]
@@ -84,7 +60,7 @@ def steps(environment: Path, source: Source) -> list[list[str]]:
 
 
 def finish(home: Path, environment: Path) -> None:
-    """Use an environment from now on, and remove all others."""
+    """Make an environment the current one, and remove all others."""
     mark = home / f"{_CURRENT}.new"
     mark.write_text(environment.name, encoding="utf-8")
     os.replace(mark, home / _CURRENT)
@@ -94,12 +70,12 @@ def finish(home: Path, environment: Path) -> None:
 
 
 def remove(environment: Path) -> None:
-    """Remove an environment as far as the system lets go of it."""
+    """Remove an environment; files in use may stay."""
     shutil.rmtree(environment, ignore_errors=True)
 
 
 def installed(home: Path) -> str:
-    """The command ravg of the environment that is in use; empty where there is none."""
+    """The command ravg of the current environment; empty if there is none."""
     try:
         name = (home / _CURRENT).read_text(encoding="utf-8")
     except OSError:
@@ -109,7 +85,7 @@ def installed(home: Path) -> str:
 
 
 def explain(log: str, *, online: bool) -> str:
-    """Say in one line why pip has failed."""
+    """Return in one line why pip failed."""
     errors = re.findall(r"^ERROR: (.*)", log, re.MULTILINE)
     if online and _NO_NETWORK.search(log):
         return "the package index cannot be reached: check the network, or choose a wheel file"

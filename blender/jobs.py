@@ -1,6 +1,6 @@
-"""The one job at a time: wait for Blender to render where that was asked for, then follow `ravg` to its end.
+"""The current job: wait for Blender to render if requested, then follow `ravg` to its end.
 
-A timer follows it, and no modal operator: Blender does not save automatically while one of those runs.
+A timer follows the job, not a modal operator, which would block Blender's automatic saving.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import bpy
 
 from . import command, frames, install, scenes, settings
 
-INTERVAL = 0.25  # seconds between two looks
-LOG = "ravg.log"  # the text block that holds what ravg has printed
+INTERVAL = 0.25  # seconds between two updates
+LOG = "ravg.log"  # the text block that holds ravg's output
 
 
 class Job:
@@ -31,24 +31,18 @@ class Job:
         self.rendered = False
         self.cancelled = False
         self.error = ""
-        self.forget: Callable[[], None] = lambda: None  # removes the handlers that wait for the render
+        self.remove_handlers: Callable[[], None] = lambda: None  # removes the handlers that wait for the render
 
     @property
     def scene(self) -> bpy.types.Scene | None:
-        """The scene, unless it was removed meanwhile."""
+        """The scene; None if it was removed."""
         return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene), None)
 
     def start(self) -> None:
-        """Start `ravg` on the frames that are there.
+        """Start `ravg` on the existing frames.
 
-        Raises
-        ------
-        FileNotFoundError
-                If no frame of the scene is there, or the scene is not.
-        ValueError
-            If a frame is no noisy render with the passes that ravg reads, or the preset denoises no light passes.
-        OSError
-            If the command cannot be started.
+        FileNotFoundError without frames or scene; ValueError for a frame that is no noisy render, or a preset that
+        denoises no light passes; OSError if the command cannot be started.
         """
         scene = self.scene
         if scene is None:
@@ -62,9 +56,10 @@ class Job:
         if reason := scenes.refused(scene):
             raise ValueError(f"{reason} ({Path(pattern).parent})")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
-        network = ["denoise", f"--preset={chosen.preset}"]
-        how = ["denoise", "--method=classical", "--first-pass=auto"] if chosen.preset == "average" else network
-        arguments = [settings.executable(), *how, pattern, f"--output={folder}", f"--frames={frames.ranges(there)}"]
+        average = ["--method=classical", "--first-pass=auto"]
+        how = average if chosen.preset == "average" else [f"--preset={chosen.preset}"]
+        arguments = [settings.executable(), "denoise", *how, pattern]
+        arguments += [f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")
         if chosen.resume:
@@ -74,10 +69,10 @@ class Job:
         log = Path(bpy.app.tempdir) / "ravg.log"
         self.run = command.Run(arguments, [outputs[number] for number in there], log)
 
-    def go_on(self) -> None:
-        """Give the scene its own settings back once Blender has rendered, and start `ravg`."""
+    def advance(self) -> None:
+        """When Blender has rendered, restore the scene's settings and start `ravg`."""
         if self.run is None and (self.rendered or self.cancelled):
-            self._give_back()
+            self._restore()
             if not self.cancelled:
                 try:
                     self.start()
@@ -87,32 +82,32 @@ class Job:
 
     @property
     def factor(self) -> float:
-        """How much is done, from 0 to 1."""
+        """The progress, from 0 to 1."""
         return 0.0 if self.run is None else self.run.finished / self.run.total
 
     @property
     def text(self) -> str:
-        """What is being done, in a few words."""
+        """The progress in words."""
         if self.run is None:
             return "Rendering"
         text = f"Denoising: {self.run.finished} of {self.run.total} frames"
         return f"{text}, {self.run.remaining} left" if self.run.remaining else text
 
     def cancel(self) -> None:
-        """Ask `ravg` to stop, or do not start it."""
+        """Stop `ravg`, or do not start it."""
         self.cancelled = True
         if self.run is not None:
             self.run.stop()
 
     @property
     def ended(self) -> bool:
-        """Whether there is no more to wait for."""
+        """Whether the job has ended."""
         return self.cancelled if self.run is None else self.run.code is not None
 
     def conclude(self, report: Report) -> bool:
-        """Give the scene back what it has lent, and report how it has ended; return whether all frames are made."""
-        self.forget()
-        self._give_back()
+        """Restore the scene's settings and report the result; return whether all frames are made."""
+        self.remove_handlers()
+        self._restore()
         if self.run is None:
             if self.error:
                 report({"ERROR"}, self.error)
@@ -128,13 +123,13 @@ class Job:
         report({"INFO"}, f"Denoised {self.run.total} frames into {self._folder}")
         return True
 
-    def _give_back(self) -> None:
+    def _restore(self) -> None:
         if self.scene is not None:
-            scenes.give_back(self.scene)
+            scenes.restore(self.scene)
 
 
 class Install:
-    """ravg being installed into an environment of its own, step by step."""
+    """The installation of ravg into an environment of its own, step by step."""
 
     scene = None
 
@@ -151,11 +146,10 @@ class Install:
         self.run = self._start()
 
     def _start(self) -> command.Run:
-        log = Path(bpy.app.tempdir) / f"ravg-install-{self._step}.log"
-        return command.Run(self._steps[self._step], [], log)
+        return command.Run(self._steps[self._step], [], Path(bpy.app.tempdir) / f"ravg-install-{self._step}.log")
 
-    def go_on(self) -> None:
-        """Start the next step when one has succeeded."""
+    def advance(self) -> None:
+        """Start the next step after a successful one."""
         if self.run.code == 0 and not self.run.stopped and self._step < len(self._steps) - 1:
             self._step += 1
             try:
@@ -165,31 +159,30 @@ class Install:
 
     @property
     def factor(self) -> float:
-        """How much is done, from 0 to 1; how long a download takes is not known."""
+        """The share of finished steps; the time of a download is unknown."""
         return self._step / len(self._steps)
 
     @property
     def text(self) -> str:
-        """What is being done, in a few words: pip's last line."""
+        """The progress in words: pip's last line."""
         lines = [line.strip() for line in self.run.log.splitlines() if line.strip()]
         return f"Installing ravg: {lines[-1][:80]}" if lines else "Installing ravg"
 
     def cancel(self) -> None:
-        """Ask pip to stop; an earlier installation stays."""
+        """Stop pip; an earlier installation stays."""
         self.run.stop()
 
-    def forget(self) -> None:
-        """No handlers wait for it."""
+    def remove_handlers(self) -> None:
+        """An installation has no handlers."""
 
     @property
     def ended(self) -> bool:
-        """Whether there is no more to wait for."""
-        code = self.run.code
-        last = self._step == len(self._steps) - 1
-        return code is not None and (code != 0 or self.run.stopped or bool(self._error) or last)
+        """Whether the job has ended."""
+        last = self.run.stopped or bool(self._error) or self._step == len(self._steps) - 1
+        return self.run.code is not None and (self.run.code != 0 or last)
 
     def conclude(self, report: Report) -> bool:
-        """Use the new environment if it is complete, else remove it; return whether it is complete."""
+        """Make a complete environment the current one, or remove it; return whether it is complete."""
         if self.run.code == 0 and not self.run.stopped and not self._error:
             install.finish(self._home, self._environment)
             report({"INFO"}, f"Installed {self.run.log.strip()}")
@@ -209,13 +202,7 @@ _version: command.Version | None = None
 
 
 def ravg_problem(*, wait: bool) -> str:
-    """Say why ravg cannot be run, and what to do; empty where it can, or where that is not known yet.
-
-    Parameters
-    ----------
-    wait : bool
-        Whether to wait for its answer. A panel does not, and is drawn again.
-    """
+    """Return why ravg cannot be run, with the remedy; empty if it can, or, unless `wait`, if this is unknown yet."""
     global _version
     try:
         executable = settings.executable()
@@ -235,11 +222,11 @@ def _redraw_when_known() -> float | None:
 
 
 def follow() -> float | None:
-    """Look how far the job has come; a timer's function."""
+    """Update the current job; the function of a timer."""
     if current is None:
         return None
     _redraw()
-    current.go_on()
+    current.advance()
     if not current.ended:
         return INTERVAL
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
@@ -249,8 +236,8 @@ def follow() -> float | None:
 
 
 def wait() -> None:
-    """Follow the job to its end, and print what it prints."""
-    current.go_on()
+    """Follow the current job to its end, and print its output."""
+    current.advance()
     run, printed = None, 0
     while current.run is not None:
         if current.run is not run:
@@ -261,67 +248,53 @@ def wait() -> None:
         if ended:
             return
         time.sleep(INTERVAL)
-        current.go_on()
+        current.advance()
 
 
 def begin(scene: bpy.types.Scene) -> Job:
-    """Make the current job.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the command is not there, or the frames have no folder.
-    """
+    """Make the current job; FileNotFoundError if the command is missing, or the frames have no folder."""
     global current
     current = Job(scene)
     return current
 
 
 def begin_install(wheel: str) -> Install:
-    """Begin to install ravg.
-
-    Raises
-    ------
-    ValueError, OSError
-        If there is nothing to install it from, or no environment can be made.
-    """
+    """Begin to install ravg; ValueError or OSError without a source, or if no environment can be made."""
     global current, _version
     current, _version = Install(wheel), None
     return current
 
 
 def start_when_rendered(job: Job) -> None:
-    """Let the timer start `ravg` when Blender has rendered the animation; end the job if that is cancelled."""
+    """Let the timer start `ravg` when Blender has rendered the animation; end the job if the render is cancelled."""
 
-    # Handlers run beside the interface, while Blender still reads the scene: the timer does the rest.
+    # Handlers run in another thread while Blender still reads the scene, so they only set flags for the timer.
     def rendered(*_: Any) -> None:
-        forget()
+        remove_handlers()
         job.rendered = True
 
     def cancelled(*_: Any) -> None:
-        forget()
+        remove_handlers()
         job.cancel()
 
-    def forget() -> None:
-        for handlers, handler in (
-            (bpy.app.handlers.render_complete, rendered),
-            (bpy.app.handlers.render_cancel, cancelled),
-        ):
+    def remove_handlers() -> None:
+        for handlers, handler in pairs:
             if handler in handlers:
                 handlers.remove(handler)
 
-    job.forget = forget
-    bpy.app.handlers.render_complete.append(rendered)
-    bpy.app.handlers.render_cancel.append(cancelled)
+    pairs = ((bpy.app.handlers.render_complete, rendered), (bpy.app.handlers.render_cancel, cancelled))
+    job.remove_handlers = remove_handlers
+    for handlers, handler in pairs:
+        handlers.append(handler)
 
 
 @bpy.app.handlers.persistent
 def stop_current(*_: Any) -> None:
-    """End the job with the file, or the extension, that it belongs to."""
+    """End the current job, as its file or the extension is closed."""
     global current
     if current is not None:
         current.cancel()
-        current.forget()
+        current.remove_handlers()
         if current.run is not None:
             current.run.wait()
         current.conclude(lambda *_: None)
@@ -329,15 +302,15 @@ def stop_current(*_: Any) -> None:
 
 
 @bpy.app.handlers.persistent
-def give_back_all(*_: Any) -> None:
-    """Give all scenes their own settings back: of a file that was saved, or lost, while it was rendered."""
+def restore_all(*_: Any) -> None:
+    """Restore the settings of all scenes of a file that was saved during a render."""
     for scene in bpy.data.scenes:
-        scenes.give_back(scene)
+        scenes.restore(scene)
 
 
 @bpy.app.handlers.persistent
 def protect(scene: bpy.types.Scene, *_: Any) -> None:
-    """Keep the frames of ravg when a render that is not its own would write over them."""
+    """Keep ravg's frames when a render that is not its own would overwrite them."""
     if not scene.ravg.lent and (kept := scenes.would_be_written_over(scene)):
         scenes.keep_existing(scene)
         print(f"ravg: {len(kept)} of its frames in {kept[0].parent} are not written over: name another Output Path")
@@ -345,9 +318,9 @@ def protect(scene: bpy.types.Scene, *_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def protected(scene: bpy.types.Scene, *_: Any) -> None:
-    """Give a scene its own settings back after a render that `protect` has changed."""
+    """Restore the settings that `protect` has changed."""
     if current is None or current.scene != scene:
-        scenes.give_back(scene)
+        scenes.restore(scene)
 
 
 def _redraw() -> None:

@@ -1,4 +1,4 @@
-"""What the panel's buttons do."""
+"""The operators behind the panel's buttons."""
 
 from __future__ import annotations
 
@@ -26,14 +26,23 @@ class SetUp(bpy.types.Operator):
 
 
 EXISTING = (
-    ("ASK", "Ask", "Render nothing where noisy frames are there already"),
-    ("KEEP", "Render Missing Frames", "Leave the noisy frames that are there"),
-    ("REPLACE", "Render All Again", "Replace the noisy frames that are there"),
+    ("ASK", "Ask", "Render nothing if noisy frames exist"),
+    ("KEEP", "Render Missing Frames", "Keep the existing noisy frames"),
+    ("REPLACE", "Render All Again", "Replace the existing noisy frames"),
 )
 
 
-class Denoise(bpy.types.Operator):
-    """Denoise the rendered frames with the installed ravg, beside Blender, and load the result"""
+class _WhenIdle:
+    """An operator that is not available during a job."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("ravg is at work")
+        return jobs.current is None
+
+
+class Denoise(_WhenIdle, bpy.types.Operator):
+    """Denoise the rendered frames with the installed ravg, in the background, and load the result"""
 
     bl_idname = "ravg.denoise"
     bl_label = "Denoise Frames"
@@ -42,19 +51,14 @@ class Denoise(bpy.types.Operator):
         name="Render", description="Set up the passes and render the animation first", options={"SKIP_SAVE"}
     )
     existing: bpy.props.EnumProperty(
-        name="Noisy Frames", description="Those that are there already", items=EXISTING, options={"SKIP_SAVE"}
+        name="Noisy Frames", description="How to treat existing noisy frames", items=EXISTING, options={"SKIP_SAVE"}
     )
     wait: bpy.props.BoolProperty(
-        name="Wait", description="Return at the end, as scripts need it", default=True, options={"SKIP_SAVE", "HIDDEN"}
+        name="Wait", description="Return at the end, for scripts", default=True, options={"SKIP_SAVE", "HIDDEN"}
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("ravg is at work")
-        return jobs.current is None
-
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask about frames that are there; then return at once, and let a timer follow."""
+        """Ask about existing frames; then return at once, and let a timer follow."""
         self.wait = bpy.app.background
         if self.render and not self.wait and scenes.rendered_files(context.scene):
             self.existing = "KEEP"
@@ -65,7 +69,7 @@ class Denoise(bpy.types.Operator):
         self.layout.props_enum(self, "existing")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Denoise; with `wait` until the end, in scripts and where Blender has no window."""
+        """Denoise; with `wait`, as in scripts and without a window, until the end."""
         return _follow(self, context, lambda: self._begin(context.scene))
 
     def _begin(self, scene: bpy.types.Scene) -> None:
@@ -77,29 +81,24 @@ class Denoise(bpy.types.Operator):
             which = f"noisy frames {frames.ranges(there)} are there already"
             raise FileExistsError(f"{which}: render with existing='KEEP' or 'REPLACE', or denoise them")
         scenes.set_up(scene)
-        scenes.lend(scene, replace=self.existing == "REPLACE")
+        scenes.override(scene, replace=self.existing == "REPLACE")
         jobs.start_when_rendered(job)
         bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
 
 
-class Install(bpy.types.Operator):
-    """Install ravg for Blender alone, beside its configuration, from the package index or from a wheel file"""
+class Install(_WhenIdle, bpy.types.Operator):
+    """Install ravg for Blender alone, in its configuration folder, from the package index or from a wheel file"""
 
     bl_idname = "ravg.install"
     bl_label = "Install ravg"
 
     wheel: bpy.props.StringProperty(
         name="Wheel",
-        description="A wheel file of ravg, with those of its requirements beside it; without one, from the index",
+        description="A wheel file of ravg, with those of its requirements in its folder; default: the package index",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
     wait: bpy.props.BoolProperty(default=True, options={"SKIP_SAVE", "HIDDEN"})
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("ravg is at work")
-        return jobs.current is None
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask for the wheel; then return at once, and let a timer follow."""
@@ -135,7 +134,7 @@ class Cancel(bpy.types.Operator):
 
 
 class Conclude(bpy.types.Operator):
-    """Report how ravg has ended, and load what it has made"""
+    """Report the result of ravg, and load its frames"""
 
     bl_idname = "ravg.conclude"
     bl_label = "Conclude"
@@ -157,7 +156,7 @@ class Show(bpy.types.Operator):
 
 
 class AddToCompositor(bpy.types.Operator):
-    """Put the denoised frames in the place of the Render Layers nodes, so that the scene is not rendered again"""
+    """Replace the Render Layers nodes by the denoised frames, so that the scene is not rendered again"""
 
     bl_idname = "ravg.add_to_compositor"
     bl_label = "Add to Compositor"
@@ -169,14 +168,14 @@ class AddToCompositor(bpy.types.Operator):
 
 
 def _follow(operator: bpy.types.Operator, context: bpy.types.Context, begin: Callable[[], Any]) -> set[str]:
-    """Begin a job, and follow it to its end where the operator waits; else let a timer do so."""
+    """Begin a job; follow it to its end if the operator waits, else by a timer."""
     try:
         begin()
         if not operator.wait:
             bpy.app.timers.register(jobs.follow, first_interval=jobs.INTERVAL)
             return {"FINISHED"}
         jobs.wait()
-    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, of a render that fails
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: Blender's, of a failed render
         jobs.stop_current()
         operator.report({"ERROR"}, str(error).strip().removeprefix("Error: "))
         return {"CANCELLED"}
@@ -187,7 +186,7 @@ def _follow(operator: bpy.types.Operator, context: bpy.types.Context, begin: Cal
 
 
 def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
-    """Say in Blender's own places how the job has ended, and show its frames if it has made them all."""
+    """Report the result of the job, keep its log as a text, and show its frames if all are made."""
     job, jobs.current = jobs.current, None
     if job.run is not None:
         text = bpy.data.texts.get(jobs.LOG) or bpy.data.texts.new(jobs.LOG)
@@ -200,7 +199,7 @@ def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[st
 
 
 def show(context: bpy.types.Context, scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
-    """Show a sequence in the image editor that is open, or else in a new window."""
+    """Show a sequence in an open image editor, else in a new window."""
     areas = [area for window in context.window_manager.windows for area in window.screen.areas]
     editor = next((area for area in areas if area.type == "IMAGE_EDITOR"), None)
     if editor is None:
@@ -213,10 +212,11 @@ def show(context: bpy.types.Context, scene: bpy.types.Scene, image: bpy.types.Im
     scenes.show_from(editor.spaces.active.image_user, scene, count)
 
 
-def _load(operator: bpy.types.Operator, scene: bpy.types.Scene, use: Any) -> set[str]:
+def _load(operator: bpy.types.Operator, scene: bpy.types.Scene, use: Callable[..., None]) -> set[str]:
+    """Load the denoised frames and call `use(image, count)`."""
     try:
         use(*scenes.load_denoised(scene))
-    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError is Blender's, for a file that it cannot read
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: Blender's, of an unreadable file
         operator.report({"ERROR"}, str(error).strip())
         return {"CANCELLED"}
     return {"FINISHED"}

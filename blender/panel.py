@@ -56,8 +56,8 @@ class OutputPanel(bpy.types.Panel):
 
 
 def _warn(context: bpy.types.Context, column: bpy.types.UILayout, text: str) -> None:
-    """Draw a text in as many lines as the panel's width takes; Blender would cut it off."""
-    # A letter is about seven pixels wide; without a region nothing is cut.
+    """Draw a text, wrapped at the panel's width, where Blender would cut it off."""
+    # A letter is about seven pixels wide; without a region nothing is wrapped.
     width = 200
     if context.region is not None:
         width = max(20, int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6)

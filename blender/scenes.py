@@ -1,4 +1,4 @@
-"""What a scene renders, what ravg needs of it, and what would spoil the result."""
+"""A scene's noisy and denoised files, the passes that ravg needs, and settings that would spoil the result."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ STEREO = "Blender's compositor shows the left eye's image in both: composite the
 
 @dataclass(frozen=True)
 class Problem:
-    """What a scene lacks, in one line; `fixable` where `set_up` mends it."""
+    """A problem of a scene, in one line; `fixable` if `set_up` repairs it."""
 
     text: str
     fixable: bool
 
 
 def problems(scene: bpy.types.Scene) -> list[Problem]:
-    """Say what prevents denoising or makes the result worse, and what to do about it, the gravest first."""
+    """Return what prevents denoising or makes the result worse, with the remedy, the gravest first."""
     if not is_placed(scene):
         return [Problem("File is not saved: save it, or name a folder in Noisy Frames", False)]
     return [*_of_frames(scene), *_of_passes(scene)]
 
 
 def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
-    """Say what is wrong with the frames on disk, and with those that a render would replace."""
+    """Return the problems of the frames on disk, and of those that a render would replace."""
     found = []
     if reason := refused(scene):
         found.append(Problem(f"{reason} (Render and Denoise renders all again)", False))
@@ -44,17 +44,15 @@ def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
     if scene.render.use_multiview:
         found.append(Problem(f"Stereo: both eyes are denoised, but {STEREO}", False))
     if scene.render.use_sequencer and scene.sequence_editor is not None and _strips(scene):
-        text = (
-            "Sequencer has strips: Render Animation renders those, switch Post Processing > Sequencer off for the movie"
-        )
-        found.append(Problem(text, False))
+        remedy = "switch Post Processing > Sequencer off for the movie"
+        found.append(Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False))
     if would_be_written_over(scene):
         found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
     return found
 
 
 def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
-    """Say what a render of the scene as it is set lacks."""
+    """Return the problems of a render with the scene's current settings."""
     render, found = scene.render, []
     if render.engine != "CYCLES":
         return [Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)]
@@ -81,7 +79,7 @@ def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
 
 
 def set_up(scene: bpy.types.Scene) -> list[str]:
-    """Mend what is fixable among `problems`; return what was changed, in words."""
+    """Repair what is fixable among `problems`; return the names of the changed settings."""
     render, changed = scene.render, []
     if render.engine != "CYCLES":
         return changed
@@ -107,13 +105,13 @@ def frame_numbers(scene: bpy.types.Scene) -> range:
 
 
 def noisy_files(scene: bpy.types.Scene) -> dict[int, Path]:
-    """Frame number → the file of its noisy render, whether it is there or not."""
+    """Frame number → file of the noisy render, existing or not."""
     before, width, after = _name(scene)
     return {n: Path(f"{before}{n:0{width}d}{after}") for n in frame_numbers(scene)}
 
 
 def rendered_files(scene: bpy.types.Scene) -> dict[int, Path]:
-    """Frame number → the file of its noisy render, for those that are there: one listing of their folder."""
+    """Frame number → file of the noisy render, for existing files; lists their folder once."""
     files = noisy_files(scene) if is_placed(scene) else {}
     try:
         there = set(os.listdir(Path(noisy_pattern(scene)).parent))
@@ -123,13 +121,13 @@ def rendered_files(scene: bpy.types.Scene) -> dict[int, Path]:
 
 
 def noisy_pattern(scene: bpy.types.Scene) -> str:
-    """The files of all noisy frames as one pattern, ``shot_####.exr``."""
+    """The pattern of the noisy frames, ``shot_####.exr``."""
     before, width, after = _name(scene)
     return f"{before}{'#' * width}{after}"
 
 
 def output_folder(scene: bpy.types.Scene) -> Path:
-    """The folder of the denoised frames: the one that the scene names, or ``denoised`` beside its noisy ones."""
+    """The folder of the denoised frames: the scene's setting, or ``denoised`` beside the noisy frames."""
     if scene.ravg.folder:
         return _absolute(scene.ravg.folder)
     noisy = Path(noisy_pattern(scene)).parent
@@ -137,18 +135,18 @@ def output_folder(scene: bpy.types.Scene) -> Path:
 
 
 def denoised_files(scene: bpy.types.Scene) -> dict[int, Path]:
-    """Frame number → the denoised file, whether it is there or not."""
+    """Frame number → denoised file, existing or not."""
     folder = output_folder(scene)
     return {number: folder / path.name for number, path in noisy_files(scene).items()}
 
 
 def is_placed(scene: bpy.types.Scene) -> bool:
-    """Whether the folder of the noisy frames is known: a file that was never saved has none of its own."""
+    """Whether the folder of the noisy frames is known; without a setting it is that of the saved file."""
     return bool(bpy.data.filepath) or bool(scene.ravg.noisy and not scene.ravg.noisy.startswith("//"))
 
 
 def refused(scene: bpy.types.Scene) -> str:
-    """Say which of the noisy frames on disk is none, and why; empty where all are."""
+    """Return which file on disk is no noisy frame, and why; empty if all are."""
     cycles = scene.render.engine == "CYCLES"
     for path in rendered_files(scene).values():
         if reason := _refusal(path, path.stat().st_mtime_ns, cycles):
@@ -158,39 +156,30 @@ def refused(scene: bpy.types.Scene) -> str:
 
 @functools.lru_cache(maxsize=1 << 14)
 def _refusal(path: Path, changed: int, cycles: bool) -> str:
-    """`frames.refusal`, read once for each version of a file: the panel asks whenever it is drawn."""
+    """`frames.refusal`, cached for each version of a file: the panel calls it at each redraw."""
     return frames.refusal(path, cycles=cycles)
 
 
 def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
-    """The noisy and denoised frames that Blender's own Render Animation would replace, as the scene is set."""
+    """The noisy and denoised frames that Blender's own Render Animation would overwrite."""
     if not is_placed(scene):
         return []
     kept = {*noisy_files(scene).values(), *denoised_files(scene).values()}
     try:
         first = _absolute(scene.render.frame_path(frame=scene.frame_start))
-        if first.parent not in {path.parent for path in kept}:  # the common case, as often as a panel is drawn
+        if first.parent not in {path.parent for path in kept}:  # the common case, made fast for the panel
             return []
         written = {_absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
-    except RuntimeError:  # a path that Blender cannot read as a template: it does not render to it either
+    except RuntimeError:  # an invalid path template, to which Blender does not render either
         return []
     return sorted(path for path in kept & written if path.is_file())
 
 
-def lend(scene: bpy.types.Scene, *, replace: bool) -> None:
-    """Set the render settings for noisy frames until `give_back`: own files, every pass, nothing of the compositor.
+def override(scene: bpy.types.Scene, *, replace: bool) -> None:
+    """Set the render settings for noisy frames until `restore`; with `replace`, existing frames are rendered again.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its own settings are kept in ``scene.ravg.lent``, which a file keeps that is saved meanwhile.
-    replace : bool
-        Whether frames that are there are rendered again.
-
-    Raises
-    ------
-    OSError
-        If Blender would write other files than `noisy_files`.
+    The scene's own settings are kept in ``scene.ravg.lent``, also in a file that is saved meanwhile. OSError if Blender
+    would write other files than `noisy_files`.
     """
     settings: dict[str, object] = {
         "render.filepath": _literal(noisy_pattern(scene)),
@@ -208,47 +197,48 @@ def lend(scene: bpy.types.Scene, *, replace: bool) -> None:
     }
     if scene.render.use_multiview:  # both eyes in one file, which ravg denoises both
         settings["render.image_settings.views_format"] = "MULTIVIEW"
-    _lend(scene, settings)
+    _override(scene, settings)
     first = scene.frame_start
     written, expected = _absolute(scene.render.frame_path(frame=first)), noisy_files(scene)[first]
     if written != expected:
-        give_back(scene)
+        restore(scene)
         raise OSError(f"Blender would write {written}, expected {expected}: give Noisy Frames a plainer name")
 
 
 def keep_existing(scene: bpy.types.Scene) -> None:
-    """Have Blender's own render skip the frames that are there, until `give_back`."""
-    _lend(scene, {"render.use_overwrite": False})
+    """Let Blender's own render skip existing frames, until `restore`."""
+    _override(scene, {"render.use_overwrite": False})
 
 
-def give_back(scene: bpy.types.Scene) -> None:
-    """Give a scene its own render settings back."""
+def restore(scene: bpy.types.Scene) -> None:
+    """Restore the scene's own render settings."""
     if scene.ravg.lent:
         for path, value in json.loads(scene.ravg.lent).items():
             _set(scene, path, value)
         scene.ravg.lent = ""
 
 
-def _lend(scene: bpy.types.Scene, settings: dict[str, object]) -> None:
-    give_back(scene)
+def _override(scene: bpy.types.Scene, settings: dict[str, object]) -> None:
+    """Set the settings that this version of Blender has, and keep the scene's own."""
+    restore(scene)
     there = {path: value for path, value in settings.items() if hasattr(*_owner(scene, path))}
     scene.ravg.lent = json.dumps({path: getattr(*_owner(scene, path)) for path in there})
     try:
         for path, value in there.items():
             _set(scene, path, value)
     except BaseException:
-        give_back(scene)
+        restore(scene)
         raise
 
 
 def _owner(scene: bpy.types.Scene, path: str) -> tuple[object, str]:
-    """The object that has a property of the scene, and the property's own name."""
+    """The owner of a property of the scene, and the property's name."""
     owner, _, name = path.rpartition(".")
-    return (scene.path_resolve(owner), name)
+    return scene.path_resolve(owner), name
 
 
 def _literal(path: str) -> str:
-    """A path as Blender's Output Path: since 5.0 braces name a variable there, unless they are doubled."""
+    """Escape a path for Blender's Output Path, in which braces hold variables since 5.0."""
     return path.replace("{", "{{").replace("}", "}}") if bpy.app.version >= (5, 0, 0) else path
 
 
@@ -257,12 +247,12 @@ def _set(scene: bpy.types.Scene, path: str, value: object) -> None:
 
 
 def _name(scene: bpy.types.Scene) -> tuple[str, int, str]:
-    """The path of the noisy frames, as absolute text before and after the number, and the number's digits."""
+    """The absolute path of the noisy frames, before the number, the number's digits, and after the number."""
     stem = bpy.path.clean_name(Path(bpy.data.filepath).stem or "untitled")
     path = scene.ravg.noisy or f"//ravg/{stem}/noisy/{bpy.path.clean_name(scene.name)}_"
     folder, name = re.fullmatch(r"(.*[/\\])?(.*)", path, re.DOTALL).groups()
     name = re.sub(r"\.exr$", "", name, flags=re.IGNORECASE)
-    # As Blender: the last run of "#" in the name is the number, or four digits follow the name.
+    # Blender's rule: the last run of "#" in the name is the number, or four digits follow the name.
     before, width, after = re.fullmatch(r"(.*?)(#*)([^#]*)", name, re.DOTALL).groups()
     if not width:
         before, after = name, ""
@@ -270,13 +260,7 @@ def _name(scene: bpy.types.Scene) -> tuple[str, int, str]:
 
 
 def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
-    """Load the denoised frames as an image sequence; return it and its number of frames.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
-    """
+    """Load the denoised frames as an image sequence; return it and its length. FileNotFoundError without frames."""
     there = [path for path in denoised_files(scene).values() if path.is_file()]
     if not there:
         raise FileNotFoundError(f"no denoised frames in {output_folder(scene)}")
@@ -287,7 +271,7 @@ def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
 
 
 def show_from(user: bpy.types.ImageUser | bpy.types.Node, scene: bpy.types.Scene, count: int) -> None:
-    """Let an image editor, or a node, show at each frame of the scene the file of that number."""
+    """Let an image editor or a node show the file of each frame number of the scene."""
     user.frame_duration = count
     user.frame_start, user.frame_offset = scene.frame_start, scene.frame_start - 1
     user.use_auto_refresh = True
@@ -303,15 +287,13 @@ def _strips(scene: bpy.types.Scene) -> bool:
 
 
 def _light_passes(layer: bpy.types.ViewLayer) -> bool:
-    """Whether a view layer renders passes of parts of the light."""
-    named = [
-        name for name in dir(layer) if re.match(r"use_pass_(diffuse|glossy|transmission)_(direct|indirect)$", name)
-    ]
-    return any(getattr(layer, name) for name in [*named, "use_pass_emit", "use_pass_environment"])
+    """Whether a view layer renders light passes."""
+    named = "use_pass_((diffuse|glossy|transmission)_(direct|indirect)|emit|environment)"
+    return any(getattr(layer, name) for name in dir(layer) if re.fullmatch(named, name))
 
 
 def _is_animated(scene: bpy.types.Scene, path: str) -> bool:
-    """Whether a driver or keys change a property of the scene."""
+    """Whether a property of the scene has a driver or keys."""
     data = scene.animation_data
     if data is None:
         return False

@@ -1,4 +1,4 @@
-"""The command line ``blender --background FILE --command ravg``: for farms, with exit codes and without tracebacks."""
+"""The command line ``blender --background FILE --command ravg`` for render farms: exit codes, no tracebacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NAME = "ravg"
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Denoise the scene of the open file, and return an exit code: 0, 1 after an error, 2 for wrong arguments."""
+    """Denoise the scene of the open file; return 0, 1 after an error, or 2 for wrong arguments."""
     parser = argparse.ArgumentParser(prog=f"blender --background FILE --command {NAME}", description=__doc__)
     parser.add_argument("--render", action="store_true", help="set up the passes and render the animation first")
     existing = parser.add_mutually_exclusive_group()

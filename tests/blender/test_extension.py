@@ -151,9 +151,9 @@ def rendered(blender: Blender, untouched: Path, tmp_path_factory: pytest.TempPat
     from bl_ext.user_default.ravg import scenes
     scene.ravg.noisy = "//frames/shot_"
     bpy.ops.ravg.set_up()
-    scenes.lend(scene, replace=False)
+    scenes.override(scene, replace=False)
     bpy.ops.render.render(animation=True)
-    scenes.give_back(scene)
+    scenes.restore(scene)
     bpy.ops.wm.save_mainfile()
     """
     blender.run(code, blend=path)
@@ -261,7 +261,7 @@ def test_motion_blur_leaves_the_vectors_empty_as_the_panel_says(blender, shot):
     code = """
     from bl_ext.user_default.ravg import scenes
     scene.render.use_motion_blur, scene.frame_end, scene.ravg.noisy = True, 4, "//blurred/"
-    scenes.lend(scene, replace=False)
+    scenes.override(scene, replace=False)
     bpy.ops.render.render(animation=True)
     """
     blender.run(code, blend=shot)
@@ -291,7 +291,7 @@ def test_the_rendered_frames_hold_what_ravg_reads(rendered):
 def test_frames_are_looked_for_where_blender_writes_them(blender, rendered, filepath, pattern, fifth):
     code = f"""{PROBLEMS}
 scene.ravg.noisy = PATH
-scenes.lend(scene, replace=True)
+scenes.override(scene, replace=True)
 assert scene.render.frame_path(frame=5) == str(scenes.noisy_files(scene)[5])
 answer = [scenes.noisy_pattern(scene), scenes.noisy_files(scene)[5]]
 """
@@ -326,7 +326,7 @@ def test_the_script_of_the_documentation_renders_denoises_and_loads(blender, ble
     scene.cycles.samples, scene.ravg.noisy = 256, "//clean/"
     bpy.ops.ravg.set_up()
     scene.cycles.use_denoising = False
-    scenes.lend(scene, replace=False)
+    scenes.override(scene, replace=False)
     bpy.ops.render.render(animation=True)
     """
     blender.run(code, blend=blend)
@@ -396,7 +396,7 @@ def test_it_starts_when_blender_has_rendered(blender, shot):
     from bl_ext.user_default.ravg import jobs, scenes
     count = len(bpy.app.handlers.render_complete)
     job = jobs.begin(scene)
-    scenes.lend(scene, replace=True)
+    scenes.override(scene, replace=True)
     jobs.start_when_rendered(job)
     waiting = [job.text, job.ended, jobs.follow() is not None]
     bpy.ops.render.render(animation=True)
@@ -644,22 +644,22 @@ ENDS = {
     "failed": "scene.camera = None; bpy.ops.ravg.denoise(render=True, existing='REPLACE')",
     "cancelled": """
 job = jobs.begin(scene)
-scenes.lend(scene, replace=True)
+scenes.override(scene, replace=True)
 jobs.start_when_rendered(job)
 assert settings_of(scene) != before
 for handler in list(bpy.app.handlers.render_cancel): handler(scene)
-job.go_on()
+job.advance()
 bpy.ops.ravg.conclude()
 """,
     "reopened": """
-scenes.lend(scene, replace=True)
+scenes.override(scene, replace=True)
 bpy.ops.wm.save_mainfile()
 bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
 scene = bpy.context.scene
 """,
     "switched off": """
 jobs.begin(scene)
-scenes.lend(scene, replace=True)
+scenes.override(scene, replace=True)
 jobs.stop_current()
 """,
 }
