@@ -159,8 +159,8 @@ def _render(shots: Sequence[tuple[ShotSettings, Path]], jobs: int, threads: int 
     """Render shots, and show progress in samples, which predict the remaining time whatever the levels."""
     total = sum(samples_left(shot, out, frame) for shot, out in shots for frame in shot.frames)
     if total == 0:
-        renders = sum(len(shot.pictures(frame)) for shot, _ in shots for frame in shot.frames)
-        LOG.info(f"all {renders} pictures are there")
+        renders = sum(len(shot.renders(frame)) for shot, _ in shots for frame in shot.frames)
+        LOG.info(f"all {renders} renders exist")
         return
     bar = Progress("rendering", total, "spp·frames")
 

@@ -170,7 +170,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
         apply(scene, {name: value for name, value in settings.items() if name.startswith("camera.")})
         # Both ends, if something moves and there is much to render: what comes into view may need deeper paths.
         moves = facts.motion_pixels > 0 or facts.moving_lights
-        work = shot.size[0] * shot.size[1] * sum(sum(shot.pictures(frame).values()) for frame in shot.frames)
+        work = shot.size[0] * shot.size[1] * sum(sum(shot.renders(frame).values()) for frame in shot.frames)
         both_ends = moves and work > PILOT_BOTH_ENDS
         frames = sorted({shot.frames[0], shot.frames[-1]}) if both_ends else [shot.middle]
         cleanest = max([*shot.levels.values(), shot.reference])
@@ -220,7 +220,7 @@ def render_halves(scene: Any, path: Path, samples: int, seed: int) -> tuple[dict
     return header, channels
 
 
-def render_picture(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
+def render_level(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
     """Render the current frame to `path`, with half buffers and an unblurred guide pass where the shot needs them."""
     blur = scene.render.use_motion_blur
     with renamed_when_whole(path) as partial:
@@ -277,7 +277,7 @@ def main(job: dict[str, Any]) -> None:
     scene = bpy.context.scene
     for frame in job["frames"]:
         scene.frame_set(frame)
-        for name, samples in shot.pictures(frame).items():
+        for name, samples in shot.renders(frame).items():
             path = out / f"{name}.{frame:04d}.exr"
             if path.exists():
                 continue
@@ -285,7 +285,7 @@ def main(job: dict[str, Any]) -> None:
             if name == "reference":
                 render_reference(scene, shot, out, frame)
             else:
-                render_picture(scene, shot, path, samples, frame_seed(shot.seed, name, frame))
+                render_level(scene, shot, path, samples, frame_seed(shot.seed, name, frame))
             answer(file=path.name, samples=samples, seconds=round(time.perf_counter() - started, 3))
 
 

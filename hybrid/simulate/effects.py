@@ -1,4 +1,4 @@
-"""What a scene contains, and which of Cycles' effects it needs.
+"""The contents of a scene, and the effects of Cycles that it needs.
 
 `facts_of` reads a Blender scene into plain numbers, `effects_of` turns the numbers into decisions, each with its
 figure, threshold and reason, and `needed_bounces` measures with a few samples how deep light paths have to be. Only
@@ -44,7 +44,7 @@ BLOCK = 8  # pixels
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a scene contains, as seen by one camera over one range of frames.
+    """The contents of a scene, as seen by one camera over a range of frames.
 
     Each material that a rendered object uses is counted once. Motion and blur are in pixels of the rendered image.
     """

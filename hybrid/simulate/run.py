@@ -116,7 +116,7 @@ def simulate(
 
 def samples_left(shot: ShotSettings, out: Path, frame: int) -> int:
     """Return how many samples per pixel of a frame are still to be rendered, all levels together."""
-    return sum(spp for name, spp in shot.pictures(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
+    return sum(spp for name, spp in shot.renders(frame).items() if not (out / f"{name}.{frame:04d}.exr").exists())
 
 
 def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:

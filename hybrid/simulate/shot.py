@@ -76,7 +76,7 @@ class ShotSettings:
         """The frames that motion is keyed on: those of the shot and `MARGIN` on each side."""
         return range(self.frames[0] - MARGIN, self.frames[-1] + MARGIN + 1)
 
-    def pictures(self, frame: int) -> dict[str, int]:
+    def renders(self, frame: int) -> dict[str, int]:
         """Return the renders of a frame: name of the level, or `reference` → samples per pixel."""
         referenced = self.reference and (self.reference_frames is None or frame in self.reference_frames)
         return {**self.levels, **({"reference": self.reference} if referenced else {})}

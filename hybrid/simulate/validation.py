@@ -1,4 +1,4 @@
-"""Three fixed shots that together hold every effect: to validate with, and to look at.
+"""Three fixed shots that together hold every effect: to validate with, and to view.
 
 *table*: glass and its caustics, wax, hair, depth of field, indirect light. *night*: many small lights, fog, a mirror.
 *garden*: sky, leaves cut out by transparency, fast motion. Each holds something that moves. Lengths are metres, z is

@@ -265,7 +265,7 @@ def test_vectors_follow_what_moves_in_every_kind_of_scene(name, blur, scene, tmp
     cycles.build(shot, 0, 2)
     cycles.apply(bpy.context.scene, {"render.use_motion_blur": blur, "cycles.max_bounces": 1})
     bpy.context.scene.frame_set(4)
-    cycles.render_picture(bpy.context.scene, shot, tmp_path / "n.exr", 4, 1)
+    cycles.render_level(bpy.context.scene, shot, tmp_path / "n.exr", 4, 1)
     errors = errors_of_vectors(bpy.context.scene, read(tmp_path / "n.exr"))
     # Vectors are means over a pixel's samples, and a point is somewhere in its pixel: 0.007 at most were measured in
     # the middle, 0.05 in the upper fifth, on motion of up to 19 px. At edges vectors mix two motions.
@@ -300,7 +300,7 @@ def test_vectors_follow_what_bends_and_hair(blur, scene, tmp_path):
         fur.keyframe_insert("location", frame=frame)
     cycles.apply(bpy.context.scene, {"render.use_motion_blur": blur})
     bpy.context.scene.frame_set(1)
-    cycles.render_picture(bpy.context.scene, shot, tmp_path / "n.exr", 16, 1)
+    cycles.render_level(bpy.context.scene, shot, tmp_path / "n.exr", 16, 1)
     vector = layer(read(tmp_path / "n.exr"), "Vector", "XYZW")
     rows, columns = np.mgrid[6:30, 4:28]  # inside the sheet
     x, y = (columns + 0.5 - 32) / 10 + 1.6, (18 - rows - 0.5) / 10
@@ -326,7 +326,7 @@ def test_what_blender_keeps_between_frames_changes_no_picture(tmp_path):
         bpy.context.scene.render.use_persistent_data = keep
         for frame in shot.frames:
             bpy.context.scene.frame_set(frame)
-            cycles.render_picture(bpy.context.scene, shot, tmp_path / f"{keep}.{frame:04d}.exr", 2, 1)
+            cycles.render_level(bpy.context.scene, shot, tmp_path / f"{keep}.{frame:04d}.exr", 2, 1)
         pictures.append([read(tmp_path / f"{keep}.{frame:04d}.exr") for frame in shot.frames])
     for kept, fresh in zip(*pictures, strict=True):
         for name in kept:

@@ -132,9 +132,9 @@ def test_settings_survive_json():
 
 def test_only_the_frames_that_are_named_get_a_reference():
     some = replace(SHOT, reference=16, reference_frames=(2,))
-    assert ["reference" in some.pictures(frame) for frame in some.frames] == [False, True, False]
-    assert all("reference" in replace(SHOT, reference=16).pictures(frame) for frame in SHOT.frames)
-    assert SHOT.pictures(1) == SHOT.levels, "no reference was asked for"
+    assert ["reference" in some.renders(frame) for frame in some.frames] == [False, True, False]
+    assert all("reference" in replace(SHOT, reference=16).renders(frame) for frame in SHOT.frames)
+    assert SHOT.renders(1) == SHOT.levels, "no reference was asked for"
 
 
 def settings(spp, levels):
@@ -247,7 +247,7 @@ def test_finished_pictures_of_another_shot_are_not_those_asked_for(tmp_path, stu
     words = ["-o", str(tmp_path / "shot"), "--frames", "1-2", "--levels", "n", "--spp", "2", "--python", stub()]
     assert main(["simulate", "test:lens", *words]) == 0
     assert main(["simulate", "test:lens", *words]) == 0
-    assert "all 2 pictures are there" in capsys.readouterr().err
+    assert "all 2 renders exist" in capsys.readouterr().err
     assert main(["simulate", "test:shadow", *words]) == 1
     assert "holds a shot with scene 'test:lens', expected 'test:shadow'" in capsys.readouterr().err
 
