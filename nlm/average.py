@@ -1,4 +1,4 @@
-"""Averages over an aligned window, robust to outliers; removal of fireflies and of non-finite pixels."""
+"""Averages over an aligned window; replacement of outliers and of non-finite pixels."""
 
 from __future__ import annotations
 
@@ -20,24 +20,13 @@ _SPARK = np.float32(100)
 
 
 def average(window: Floats, weight: Floats) -> Floats:
-    """Average the frames of an aligned window by their weight.
+    """Average an aligned window (T, H, W, C) by weight; the centre's value (H, W, C) where all weights are 0.
 
     Parameters
     ----------
     window : (T, H, W, C) float32
-        Aligned frames, in any unit; the centre is ``T // 2``.
     weight : (T, H, W) float32
-        Trust in each pixel of each frame, at least 0.
-
-    Returns
-    -------
-    (H, W, C) float32
-        The average; the centre's value where all weights are 0.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other or T is even.
+        At least 0.
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
@@ -46,38 +35,28 @@ def average(window: Floats, weight: Floats) -> Floats:
 
 
 def robust_average(window: Floats, weight: Floats) -> Floats:
-    """Average the frames of an aligned window without each pixel's minimum and maximum.
+    """Average an aligned window without each pixel's minimum and maximum.
 
     Parameters
     ----------
     window : (T, H, W, C) float32
-        Aligned frames, in any unit; the centre is ``T // 2``.
     weight : (T, H, W) float32
-        Trust in each pixel of each frame, at least 0.
+        At least 0.
 
     Returns
     -------
     (H, W, C) float32
-        The robust average; the centre's value where all weights are 0.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other or T is even.
+        The centre's value where all weights are 0.
 
     Notes
     -----
-    For n ≥ 3 equal weights this is ravg(S) = (Σ S − min S − max S) / (n − 2). With unequal ones the minimum
-    and the maximum lose the share clamp(Σw / max w − 2, 0, 1) of their weight: as many frames as the
-    most trusted one is worth must be there before anything is discarded, so that a trusted centre is never
-    thrown away in favour of frames that hardly count.
+    For n ≥ 3 equal weights: ravg(S) = (Σ S − min S − max S) / (n − 2). With unequal weights the minimum and the maximum
+    lose the share clamp(Σw / max w − 2, 0, 1) of their weight, so that a trusted centre is never discarded in favour of
+    frames of little weight. Values are ordered channel by channel, as in the paper; ordering whole pixels by luminance
+    costs 0.02 dB on Cycles renders and biases the colour as much.
 
-    Values are ordered channel by channel, as in the paper. Ordering whole pixels by luminance neither
-    helps the error (0.02 dB worse on Cycles renders) nor the colour (the channels' biases differ as much).
-
-    The noise of path tracing is skewed, so the result is darker than the mean: by 1.5 to 7 % at 10 to 30
-    samples a pixel, and by a third where most samples are 0. Use `average` after `reject_outliers` where energy
-    matters more than robustness to misaligned frames.
+    The noise of path tracing is skewed, so the result is darker than the mean: by 1.5 to 7 % at 10 to 30 samples a
+    pixel, by a third where most samples are 0. `average` after `reject_outliers` keeps the energy.
 
     References
     ----------
@@ -90,44 +69,33 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
 
 
 def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
-    """Replace fireflies: values far above everything around them in space and time.
+    """Replace fireflies: values far above all neighbours in space and time.
 
     Parameters
     ----------
     window : (T, H, W, C) float32
-        Aligned frames, in any unit; the centre is ``T // 2``.
     weight : (T, H, W) float32
-        Trust in each pixel of each frame; where it is 0 the pixel is neither evidence nor replaced.
+        A pixel of weight 0 is neither evidence nor replaced.
 
     Returns
     -------
     cleaned : (T, H, W, C) float32
-        The window with its outliers replaced. A copy.
+        A copy of the window with outliers replaced.
     mask : (T, H, W) bool
-        Where values were replaced.
+        True where a value was replaced.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other, or T is even.
+    Notes ----- In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
+    largest value, n the number of frames trusted at that pixel (at least 2, one more than the firefly). A value is an
+    outlier where it exceeds m + 16 (u − m) and eight times the mean of the others. A light present in every frame, even
+    one pixel wide, is among the n largest and stays; a firefly is in one frame, and warping spreads it over at most
+    four pixels. The centre is not warped: there a value with two such neighbours is an object and stays, unless the
+    group is no larger than 2×2 pixels and a hundred times above the limit. The spread (u − m) widens with the skew of
+    the noise, which a median absolute deviation does not; the spread is divided by the share of values above 0. Where u
+    = 0 nothing is rejected: on black a spark may be all the light.
 
-    Notes
-    -----
-    In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
-    largest value, n the number of frames trusted at that pixel (at least 2, and beyond the firefly itself).
-    A value is an outlier where it exceeds m + 16 (u − m) and eight times the mean of the others.
-    A light that is there in every frame, even one pixel wide, is among the n largest and stays; a firefly is
-    in one frame, and warping spreads it over no more than four pixels. In the centre, which is not warped, it is
-    a single pixel: one with two such neighbours is an object, a moving highlight say, and stays too, unless it is no
-    larger than 2×2 pixels and a hundred times as bright as that. The spread
-    (u − m) widens with the skew of the noise, which a median absolute deviation does not; it is further divided by
-    the share of values above 0. On black, u = 0, nothing is rejected: there a spark may be all the light there is.
-
-    An outlier becomes the weighted mean of those neighbours that are none: no dark hole, for the mean keeps
-    the neighbours' energy, and no halo, for nothing else is touched. What a firefly carries is lost: in
-    expectation, it belongs to the picture. On Cycles renders without visible fireflies the window's mean fell
-    by less than 0.1 %; with them by 0.3 to 1.2 %; and by 2 % (the centre by 6 %) where two samples in three
-    are 0: there much of what is lost is ordinary noise.
+    An outlier becomes the weighted mean of the neighbours that are no outliers, which leaves neither a dark hole nor a
+    halo. The energy of the firefly is lost: on Cycles renders without visible fireflies the window's mean fell by less
+    than 0.1 %; with fireflies by 0.3 to 1.2 %; by 2 % (the centre by 6 %) where two samples in three are 0.
     """
     window, weight = check_window(window, weight)
     cleaned, mask, level = window.copy(), np.zeros(weight.shape, np.bool_), np.empty(weight.shape, np.float32)
@@ -137,28 +105,19 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
 
 
 def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
-    """Fill pixels that hold NaN or infinities from the nearest finite ones.
+    """Fill pixels that hold NaN or infinities from the nearest finite pixels.
 
     Parameters
     ----------
     image : (H, W, C) float32
-        Any unit. A pixel counts as non-finite if any of its channels is.
+        A pixel counts as non-finite if any of its channels is.
 
     Returns
     -------
     filled : (H, W, C) float32
-        A copy, finite everywhere; 0 if no pixel is finite.
+        A finite copy, filled by a normalised box filter whose radius doubles; 0 if no pixel is finite.
     mask : (H, W) bool
-        Where pixels were replaced.
-
-    Raises
-    ------
-    ValueError
-        If `image` does not have three axes.
-
-    Notes
-    -----
-    A normalised box filter whose radius doubles until it reaches a finite pixel everywhere.
+        True where a pixel was replaced.
     """
     if image.ndim != 3:
         raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
@@ -185,32 +144,26 @@ def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
 
 
 def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[Floats, Floats]:
-    """Check that an aligned window and its weights fit each other.
+    """Return window and weights as contiguous float32; ValueError if shapes do not fit or T is even.
 
     Parameters
     ----------
     window : (T, H, W, C) array
-        Aligned frames.
     weight : (T, H, W) array
-        One for each of their pixels.
     name : str
-        What an error calls the weights.
-
-    Returns
-    -------
-    window, weight : float32 array
-        Contiguous.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other, or T is even.
+        Name of the weights in the error.
     """
     if window.ndim != 4 or window.shape[0] % 2 == 0:
         raise ValueError(f"window: expected (frames, height, width, channels) with odd frames, got {window.shape}")
     if weight.shape != window.shape[:3]:
         raise ValueError(f"{name}: expected shape {window.shape[:3]} to fit the window, got {weight.shape}")
     return np.ascontiguousarray(window, np.float32), np.ascontiguousarray(weight, np.float32)
+
+
+def check_exposure(exposure: float) -> None:
+    """Raise ValueError unless the exposure is positive and finite."""
+    if not (exposure > 0 and np.isfinite(exposure)):
+        raise ValueError(f"exposure: expected a positive number, got {exposure}")
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,8 @@
-"""Isolated bright samples: fireflies are taken out of a frame before anything spreads them, lamps are put back."""
+"""Isolated bright samples: fireflies are removed before any filter spreads them; persistent highlights are added back.
+
+A persistent highlight is a light of one or two pixels that neighbouring frames show along the motion. K highlights have
+(K, 2) rows and columns.
+"""
 
 from __future__ import annotations
 
@@ -15,51 +19,39 @@ Mask = NDArray[np.bool_]
 Places = NDArray[np.intp]
 Points = NDArray[np.float64]
 
-# A firefly is so many times as bright as the brightest pixel of the ring around it, and as the ring's mean. Half of it
-# is two stops above what denoisers of single frames take for noise; below that they do without our help.
+# A firefly is so many times as bright as the brightest pixel of the ring around it, and as the ring's mean. Half of
+# this is two stops above what denoisers of single frames take for noise; below they remove it themselves.
 OVER_BRIGHTEST, OVER_MEAN = 16.0, 64.0
-# Another frame shows the same light where its centre is within so many pixels of where the motion leads, and its light
-# differs by no more than this share of the sum of both: a quarter is a factor of 0.6. In glass and caustics of 8
-# samples a pixel one of 344 bright samples had this in both neighbours.
+# Another frame shows the same highlight where the centre is within so many pixels of the moved position, and the light
+# differs by at most this share of the sum of both: a quarter is a factor of 0.6. In glass and caustics of 8 samples a
+# pixel one of 344 bright samples passed this test in both neighbours.
 NEAR = 0.75
 DIFFERENT = 0.25
-# A sample that another frame shows within 3 pixels at a quarter of its brightness is no firefly but what the noise is
-# like there: kitchens at 8 samples a pixel lose a tenth of their light, and 2 dB, without such.
+# A sample that another frame shows within 3 pixels at a quarter of its brightness is ordinary noise and no firefly:
+# kitchens at 8 samples a pixel lose a tenth of their light, and 2 dB, without such samples.
 SPREAD, RECURS = 7, 0.25
-# Of a pattern of 3×3 what is below this share of its brightest pixel is noise of the surroundings.
+# Pixels of a 3×3 pattern below this share of its brightest pixel are noise of the surroundings.
 DIM = 1 / 16
-# Where noise is so strong that another frame has more than 3 samples within 8 pixels that are as bright as a lamp's
-# quarter, and not in the frame, two may agree by chance: kitchens have 3 to 90 around such. Fireflies on a hundredth of
+# Two frames may agree by chance where noise is so strong that the other has more than 3 samples of a quarter of the
+# highlight's brightness within 8 pixels that the frame lacks: kitchens have 3 to 90 there. Fireflies on a hundredth of
 # the pixels are 2.
 STRANGER_WINDOW, STRANGERS = 17, 3
-# Patterns are averaged over frames where the light is within so many pixels of the same place in its pixel: farther
-# away it is spread over other pixels.
+# Patterns are averaged over frames where the highlight is within so many pixels of the same place in its pixel: farther
+# away the light spreads over other pixels.
 SAME_PHASE = 0.25
 
 
 @dataclass(frozen=True)
 class Highlights:
-    """Lights of one or two pixels, of one frame.
+    """K lights of one or two pixels in one frame."""
 
-    Attributes
-    ----------
-    pixels : (K, 2) intp
-        Row and column of the middle of 3×3 pixels that each is in.
-    points : (K, 2) float64
-        Centre of each, row and column; pixel centres are integers.
-    light : (K, C) float32
-        Radiance above the surroundings, summed over the 3×3 pixels. NaN outside the frame.
-    pattern : (K, 3, 3) float32
-        What these pixels show of it, in the mean over channels.
-    """
-
-    pixels: Places
-    points: Points
-    light: Floats
-    pattern: Floats
+    pixels: Places  # (K, 2) middle of the 3×3 pixels of each
+    points: Points  # (K, 2) centre of each; pixel centres are integers
+    light: Floats  # (K, C) radiance above the surroundings, summed over the 3×3 pixels; NaN outside the frame
+    pattern: Floats  # (K, 3, 3) distribution over these pixels, in the mean over channels
 
     def __getitem__(self, chosen: Mask) -> Highlights:
-        """Some of them."""
+        """Select some highlights by a mask (K,)."""
         return Highlights(self.pixels[chosen], self.points[chosen], self.light[chosen], self.pattern[chosen])
 
 
@@ -67,79 +59,54 @@ _PAIRED, _ISOLATED = 1, 2
 
 
 def nearest_pixel(points: Points) -> Places:
-    """Return the pixels that points are in, (K, 2): halves go to the later one."""
+    """Return the pixels (K, 2) that contain points; halves round up."""
     return np.floor(points + 0.5).astype(np.intp)
 
 
-def find_fireflies(color: Floats) -> Places:
-    """Find single pixels, or blots of up to 3×3, far above everything around them.
-
-    Parameters
-    ----------
-    color : (H, W, C) float32
-        Linear radiance or irradiance, finite.
-
-    Returns
-    -------
-    (K, 2) intp
-        Row and column of the brightest pixel of each.
-
-    Raises
-    ------
-    ValueError
-        If `color` is not (H, W, C).
-
-    Notes
-    -----
-    In the mean over channels, a pixel that no other of its 3×3 exceeds is a firefly where it is above
-    16 times the brightest and 64 times the mean of the 5×5 ring around these. A renderer's pixel filter may spread a
-    sample over 3×3 pixels. Where the ring is black nothing is found: there a spark may be all the light there is.
-    """
-    if color.ndim != 3:
-        raise ValueError(f"color: expected (height, width, channels), got {color.shape}")
-    return np.argwhere(_find(_level(color), OVER_BRIGHTEST, OVER_MEAN) == _ISOLATED)
-
-
 def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
-    """Find what may be a lamp of a pixel: fireflies, and what would be one but for one pixel of the ring.
+    """Find fireflies, and pixels that would be fireflies but for one pixel of the ring: candidates for highlights.
 
     Parameters
     ----------
     color : (H, W, C) float32
-        Linear radiance or irradiance, finite.
+        Radiance or irradiance, finite.
 
     Returns
     -------
     places : (K, 2) intp
         Row and column of the brightest pixel of each.
     isolated : (K,) bool
-        Which `find_fireflies` finds.
+        True for a firefly.
+
+    Notes
+    -----
+    In the mean over channels, a pixel that no other of its 3×3 exceeds is a firefly where it is above 16 times the
+    brightest and 64 times the mean of the 5×5 ring around these: a renderer's pixel filter may spread a sample over 3×3
+    pixels. Where the ring is black nothing is found: there a spark may be all the light.
     """
+    if color.ndim != 3:
+        raise ValueError(f"color: expected (height, width, channels), got {color.shape}")
     found = _find(_level(color), OVER_BRIGHTEST, OVER_MEAN)
     places = np.argwhere(found)
     return places, found[places[:, 0], places[:, 1]] == _ISOLATED
 
 
 def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = None) -> Highlights:
-    """Measure what pixels and those around them show above their surroundings.
+    """Measure position, light and pattern of bright pixels above their surroundings.
 
     Parameters
     ----------
     color : (H, W, C) float32
-        Irradiance or radiance, finite.
+        Radiance or irradiance, finite.
     pixels : (K, 2) intp
-        Rows and columns, anywhere.
+        Anywhere, also outside the frame.
     factor : (H, W, C) float32, optional
-        What `color` is multiplied by to give radiance.
-
-    Returns
-    -------
-    Lights
+        Factor from `color` to radiance.
 
     Notes
     -----
-    The light is Σ f (c − r) over the 3×3 around a pixel, r the mean of the 5×5 ring around them without its brightest
-    pixel: a small lamp under a pixel filter of up to 1.5 pixels is in it, wherever in the pixel it is.
+    The light is Σ f (c − r) over the 3×3 around a pixel, r the mean of the 5×5 ring around these without its brightest
+    pixel: this holds all of a small lamp under a pixel filter of up to 1.5 pixels, wherever in the pixel the lamp is.
     """
     rows, columns, inside = _blocks(pixels, color.shape)
     block = color[rows, columns].astype(np.float64)
@@ -157,153 +124,136 @@ def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = No
 
 
 def follow_motion(lights: Highlights, moved: Points) -> Places:
-    """Return the pixels in which lights are once they have moved, (K, 2).
+    """Return the pixels (K, 2) that highlights reach with the motion.
 
     Parameters
     ----------
-    lights : Lights
-        K.
+    lights : Highlights
     moved : (K, 2) float64
-        By so many rows and columns.
+        Rows and columns.
     """
     straight = lights.pixels + nearest_pixel(moved)
     return np.where(_same_phase(moved)[:, None], straight, nearest_pixel(lights.points + moved))
 
 
 def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask:
-    """Tell which lights of a frame another frame shows as well.
+    """Return where a neighbouring frame shows the same highlight (K,).
 
     Parameters
     ----------
-    first : Lights
-        Of the frame, K.
+    first : Highlights
+        Of the frame.
     moved : (K, 2) float64
-        Where the motion leads from there, rows and columns.
-    second : Lights
-        What the other frame shows there.
+        Motion to the neighbour, rows and columns.
+    second : Highlights
+        Measured in the neighbour at the moved position.
 
-    Returns
-    -------
-    (K,) bool
-        Where the second is within 0.75 pixels of there, and its light is 0.6 to 1.7 times the first's, in all channels
-        together: Σ |a − b| ≤ Σ (a + b) / 4.
+    Notes
+    -----
+    Within 0.75 pixels of the moved position, with 0.6 to 1.7 times the light: Σ |a − b| ≤ Σ (a + b) / 4 over channels.
     """
     far = np.hypot(*(second.points - first.points - moved).T)
     difference, total = np.abs(first.light - second.light).sum(axis=1), (first.light + second.light).sum(axis=1)
     return np.asarray((far <= NEAR) & (difference <= DIFFERENT * total))
 
 
-def without_strangers(own: Highlights, color: Floats, pixels: Places, other: Floats) -> Mask:
-    """Tell around which lights of a frame another one has no bright samples of its own.
+def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: Floats) -> Mask:
+    """Return around which highlights (K,) the neighbouring frame has no bright samples of its lights.
 
     Parameters
     ----------
-    own : Lights
-        Of the frame, K, within it.
-    color : (H, W, C) float32
-        The frame, finite.
+    lights : Highlights
+        Of the frame, within it.
+    color, other : (H, W, C) float32
+        Frame and neighbour, finite.
     pixels : (K, 2) intp
-        Where the motion leads in the other.
-    other : (H, W, C) float32
-        The other frame, finite.
+        Moved positions in the neighbour.
 
-    Returns
-    -------
-    (K,) bool
-        True where of the 17×17 pixels around there no more than 3 are above a quarter of the light's brightest pixel
-        where the frame has none within a pixel that is above an eighth.
+    Notes ----- At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
+    frame has no pixel above an eighth within a pixel's distance.
     """
     first, second = cv2.dilate(_level(color), np.ones((3, 3), np.uint8)), _level(other)
-    peak = first[own.pixels[:, 0], own.pixels[:, 1], None, None]
+    peak = first[lights.pixels[:, 0], lights.pixels[:, 1], None, None]
     (rows, columns, inside), (y, x, seen) = (
-        _blocks(middle, color.shape, STRANGER_WINDOW) for middle in (own.pixels, pixels)
+        _blocks(middle, color.shape, STRANGER_WINDOW) for middle in (lights.pixels, pixels)
     )
     strange = (second[y, x] > peak / 4) & (first[rows, columns] < peak / 8) & inside & seen
     return np.asarray(strange.sum(axis=(1, 2)) <= STRANGERS)
 
 
 def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
-    """Tell which bright samples of a frame are like others that another frame has near there.
+    """Return which bright samples (K,) recur: the neighbour has a quarter of the brightness within 3 pixels.
 
     Parameters
     ----------
     places : (K, 2) intp
-        From `find_fireflies` on `color`.
-    color : (H, W, C) float32
-        The frame, finite.
+        From `find_bright_samples` on `color`.
+    color, other : (H, W, C) float32
+        Frame and neighbour, finite.
     pixels : (K, 2) intp
-        Where the motion leads in the other.
-    other : (H, W, C) float32
-        The other frame, finite.
-
-    Returns
-    -------
-    (K,) bool
-        True where the other frame holds a quarter of the place's brightness within 3 pixels of there.
+        Moved positions in the neighbour.
     """
-    rows, columns = pixels.T
-    inside = (rows >= 0) & (rows < color.shape[0]) & (columns >= 0) & (columns < color.shape[1])
+    rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
     brightest = cv2.dilate(_level(other), np.ones((SPREAD, SPREAD), np.uint8))
-    near = brightest[rows * inside, columns * inside]
+    near = brightest[rows, columns]
     return np.asarray(inside & (near >= RECURS * _level(color)[places[:, 0], places[:, 1]]))
 
 
-def average_highlights(own: Highlights, others: Sequence[tuple[Highlights, Points, Mask]]) -> Highlights:
-    """Average lights over the frames that show them.
+def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Points, Mask]]) -> Highlights:
+    """Average the light of highlights over the frames that show them, with equal weights.
 
     Parameters
     ----------
-    own : Lights
-        Of the frame, K.
-    others : sequence of (Lights, (K, 2) float64, (K,) bool)
-        What other frames show, where the motion has led, and which of it is the same light.
+    lights : Highlights
+        Of the frame.
+    others : sequence of (Highlights, (K, 2) float64, (K,) bool)
+        Measured in other frames, the motion there, and where the other frame shows the same highlight.
 
     Returns
     -------
-    Lights
-        Where `own` are. All frames have the same weight, as samples of one render have the same noise. Patterns of
-        frames in which a light lies elsewhere in its pixel are left out; they sum to 1.
+    Highlights
+        Positions of `lights`. Patterns of frames with another place in the pixel are left out; a pattern sums to 1.
     """
-    light, count, pattern = own.light.astype(np.float64), np.ones(len(own.light)), own.pattern.astype(np.float64)
-    for lights, moved, shown in others:
-        light[shown] += lights.light[shown]
+    light, count, pattern = (
+        lights.light.astype(np.float64),
+        np.ones(len(lights.light)),
+        lights.pattern.astype(np.float64),
+    )
+    for other, moved, shown in others:
+        light[shown] += other.light[shown]
         count += shown
         alike = shown & _same_phase(moved)
-        pattern[alike] += lights.pattern[alike]
+        pattern[alike] += other.pattern[alike]
     pattern = _significant(pattern)
     pattern /= pattern.sum(axis=(1, 2), keepdims=True)  # a light that was found has some
     mean = (light / count[:, None]).astype(np.float32)
-    return Highlights(own.pixels, own.points, mean, pattern.astype(np.float32))
+    return Highlights(lights.pixels, lights.points, mean, pattern.astype(np.float32))
 
 
 def add_highlights(picture: Floats, lights: Highlights) -> Floats:
-    """Return a picture (H, W, C) with lights added to it, each in its pattern, which sums to 1.
+    """Return radiance (H, W, C) with highlights added by their patterns.
 
     Parameters
     ----------
     picture : (H, W, C) float32
-        Radiance.
-    lights : Lights
-        Of its frame.
+    lights : Highlights
+        From `average_highlights`.
     """
-    made = picture.copy()
-    height, width = picture.shape[:2]
-    for (y, x), light, pattern in zip(lights.pixels, lights.light, lights.pattern, strict=True):
-        rows, columns = np.mgrid[y - 1 : y + 2, x - 1 : x + 2]
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        made[rows[inside], columns[inside]] += pattern[inside][:, None] * light
-    return made
+    brighter = picture.copy()
+    blocks = _blocks(lights.pixels, picture.shape, 3)
+    for rows, columns, inside, light, pattern in zip(*blocks, lights.light, lights.pattern, strict=True):
+        brighter[rows[inside], columns[inside]] += pattern[inside][:, None] * light
+    return brighter
 
 
 def remove_highlights(color: Floats, pixels: Places) -> Floats:
-    """Return a frame (H, W, C) without what `measure_highlights` finds at these pixels, (K, 2).
+    """Return radiance or irradiance (H, W, C) with the 3×3 pixels of each highlight replaced by its surroundings.
 
     Parameters
     ----------
     color : (H, W, C) float32
-        Radiance or irradiance, finite.
+        Finite.
     pixels : (K, 2) intp
-        Rows and columns of the lights.
     """
     rows, columns, inside = _blocks(pixels, color.shape)
     around, core = _around(color[rows, columns].astype(np.float64), inside), inside[:, 1:4, 1:4]
@@ -313,33 +263,22 @@ def remove_highlights(color: Floats, pixels: Places) -> Floats:
 
 
 def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
-    """Hold a denoised picture around lights to the brightest of what is around them.
+    """Clamp a denoised picture (H, W, C) around highlights to the brightest pixel of the surrounding ring.
 
     Parameters
     ----------
     picture : (H, W, C) float32
-        A denoised picture, in which a light may have a halo.
     places : (K, 2) intp
-        Rows and columns.
     radius : int
-        Of the halo, pixels.
-
-    Returns
-    -------
-    (H, W, C) float32
-        Of (2 radius + 1)² pixels around each place none is above the brightest of the ring around them that is not as
-        near to another place.
+        Of the halo, pixels; ring pixels as near to another place do not count.
     """
     held = picture.copy()
-    height, width = picture.shape[:2]
-    middles = np.zeros((height, width), np.uint8)
+    middles = np.zeros(picture.shape[:2], np.uint8)
     middles[places[:, 0], places[:, 1]] = 1
     near = cv2.dilate(middles, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
-    for y, x in places:
-        top, left = max(y - radius - 1, 0), max(x - radius - 1, 0)
-        block = slice(top, min(y + radius + 2, height)), slice(left, min(x + radius + 2, width))
-        rows, columns = np.mgrid[block]
-        halo = np.maximum(np.abs(rows - y), np.abs(columns - x)) <= radius
+    for place in places:
+        block, distance = _neighbourhood(place, radius + 1, picture.shape)
+        halo = distance <= radius
         ring = ~halo & (near[block] == 0)
         if ring.any():
             held[block][halo] = np.minimum(held[block][halo], picture[block][ring].max(axis=0))
@@ -347,37 +286,26 @@ def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
 
 
 def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, float]:
-    """Replace fireflies by the mean of the ring around them.
+    """Replace fireflies by the mean of the ring around them, which leaves neither a dark hole nor a halo.
 
     Parameters
     ----------
     color : (H, W, C) float32
-        The frame.
     places : (K, 2) intp
-        Rows and columns.
 
     Returns
     -------
     cleaned : (H, W, C) float32
-        A copy.
+        A copy; of the 3×3 around a place those pixels are replaced that are above four times the brightest of the ring.
     replaced : (H, W) bool
-        Which pixels were.
     removed : float
-        Share of the frame's light that is gone, in [0, 1]: what fireflies carry belongs to the picture in expectation.
-
-    Notes
-    -----
-    Of the 3×3 around a place those pixels are replaced that are above four times the brightest of the ring. The ring's
-    mean leaves neither a dark hole nor a halo.
+        Removed share of the frame's light, in [0, 1]; in expectation this light belongs to the picture.
     """
     cleaned, replaced = color.copy(), np.zeros(color.shape[:2], bool)
-    height, width = color.shape[:2]
     level = _level(color)
-    for y, x in places:
-        top, left = max(y - 2, 0), max(x - 2, 0)
-        block = slice(top, min(y + 3, height)), slice(left, min(x + 3, width))
-        rows, columns = np.mgrid[block]
-        core = (np.abs(rows - y) <= 1) & (np.abs(columns - x) <= 1)
+    for place in places:
+        block, distance = _neighbourhood(place, 2, color.shape)
+        core = distance <= 1
         ring = ~core
         bright = core & (level[block] > 4 * level[block][ring].max())
         cleaned[block][bright] = color[block][ring].mean(axis=0)
@@ -387,8 +315,18 @@ def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, floa
     return cleaned, replaced, max(removed, 0.0)
 
 
+def _neighbourhood(place: Places, radius: int, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], Places]:
+    """Block of `radius` pixels around a place, cut at the frame, and each pixel's distance from the place."""
+    top, left = np.maximum(place - radius, 0)
+    block = slice(top, min(place[0] + radius + 1, shape[0])), slice(left, min(place[1] + radius + 1, shape[1]))
+    rows, columns = np.mgrid[block]
+    return block, np.maximum(np.abs(rows - place[0]), np.abs(columns - place[1]))
+
+
 def _blocks(pixels: Places, shape: tuple[int, ...], side: int = 5) -> tuple[Places, Places, Mask]:
-    """Rows and columns of the 5×5 or so around each pixel, (K, 5, 5), held to the frame, and which are inside it."""
+    """Rows and columns of `side`² pixels around each pixel (K, side, side), clamped to the frame; True inside the
+    frame.
+    """
     step = np.arange(side) - side // 2
     rows = pixels[:, 0, None, None] + step[:, None] + 0 * step
     columns = pixels[:, 1, None, None] + step + 0 * step[:, None]
@@ -397,7 +335,7 @@ def _blocks(pixels: Places, shape: tuple[int, ...], side: int = 5) -> tuple[Plac
 
 
 def _around(block: NDArray[np.float64], inside: Mask) -> NDArray[np.float64]:
-    """The mean of the ring of 5×5 pixels (K, 5, 5, C) without its brightest pixel, (K, C); 0 where there is no ring."""
+    """Mean (K, C) of the rings of 5×5 pixels (K, 5, 5, C) without their brightest pixel; 0 without a ring."""
     ring = inside.copy()
     ring[:, 1:4, 1:4] = False
     level = np.where(ring, block.sum(axis=-1), -np.inf).reshape(len(block), 25)
@@ -407,28 +345,29 @@ def _around(block: NDArray[np.float64], inside: Mask) -> NDArray[np.float64]:
 
 
 def _level(color: Floats) -> Floats:
-    """The mean over channels."""
+    """Mean over channels."""
     return np.ascontiguousarray(np.einsum("hwc->hw", color, dtype=np.float32) / np.float32(color.shape[-1]))
 
 
 def _significant(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What of patterns (K, 3, 3) is not noise of the surroundings."""
+    """Zero the part of patterns (K, 3, 3) that is noise of the surroundings."""
     return np.where(pattern > DIM * pattern.max(axis=(1, 2), keepdims=True), pattern, 0)
 
 
 def _same_phase(moved: Points) -> Mask:
-    """Whether what has moved so far is at the same place in its pixel."""
+    """Return where a motion (K, 2) ends at the same place in a pixel."""
     return np.asarray(np.abs(moved - nearest_pixel(moved)).max(axis=1) <= SAME_PHASE)
 
 
 @njit(cache=True)
 def _find(level, over_brightest, over_mean):  # type: ignore[no-untyped-def]
+    """Mark pixels as 0, `_PAIRED` or `_ISOLATED`."""
     height, width = level.shape
     found = np.zeros((height, width), np.uint8)
     for y in range(height):
         for x in range(width):
             value = level[y, x]
-            # Nearly all pixels end here: a firefly towers over the pixels two to its left and right, or over one.
+            # Skips nearly all pixels: a firefly exceeds the pixels two to its left and right, or one of these.
             left, right = level[y, max(x - 2, 0)], level[y, min(x + 2, width - 1)]
             if not value > over_brightest * (right if x < 2 else left if x >= width - 2 else min(left, right)):
                 continue

@@ -1,4 +1,4 @@
-"""A colour gate: which aligned frames show the same light as the centre."""
+"""Colour gate: weights of aligned frames by whether they show the same light as the centre."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
+from nlm.average import check_exposure
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -23,56 +24,36 @@ SHARE, _FLOOR = 0.3, 0.004
 
 
 def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
-    """Weigh aligned frames by how well their denoised colours agree with the centre's: `color_gates` of one share.
+    """Return the weights (T, H, W) of `color_gates` for the share 0.3.
 
     Parameters
     ----------
     estimates : (T, H, W, 3) float32
-        Denoised, aligned frames, linear, at least 0; the centre is ``T // 2``.
     noisy : (H, W, 3) float32
-        The centre frame as it was rendered, in the same unit.
     exposure : float
-        The radiance that is mapped to one half.
-
-    Returns
-    -------
-    (T, H, W) float32
-        Weights in [0, 1] of the share 0.3; 1 at the centre.
-
-    Raises
-    ------
-    ValueError
-        As `color_gates` does.
     """
     return color_gates(estimates, noisy, exposure, (SHARE,))[0]
 
 
 def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Sequence[float]) -> list[Floats]:
-    """Weigh aligned frames by how well their denoised colours agree with the centre's, more or less strictly.
+    """Weigh aligned frames by how well their denoised colours agree with the centre's, for several strictnesses.
 
-    Geometry cannot see a moving shadow, highlight or reflection; the colour of a clean enough estimate can.
+    Geometry does not show a moving shadow, highlight or reflection; the colour of a clean enough estimate does.
 
     Parameters
     ----------
     estimates : (T, H, W, 3) float32
-        Denoised, aligned frames, linear, at least 0; the centre is ``T // 2``.
+        Denoised, aligned, at least 0.
     noisy : (H, W, 3) float32
-        The centre frame as it was rendered, in the same unit.
+        The centre frame as rendered, in the same unit.
     exposure : float
-        The radiance that is mapped to one half; it scales with the frames, so that the gate does not
-        depend on their scale.
     shares : sequence of float
-        How much of the centre's noise two estimates may differ by, at least 0: what they have left of it.
+        Tolerated difference of two estimates as a share of the centre's noise, at least 0.
 
     Returns
     -------
     list of (T, H, W) float32
-        For each share weights in [0, 1]; 1 at the centre. Those of a greater share are nowhere less.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other, T is even, or `exposure` is not a positive number.
+        For each share weights in [0, 1], 1 at the centre; a greater share gives nowhere less.
 
     Notes
     -----
@@ -80,19 +61,17 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
     difference from the centre, or the 15×15 RMS of that, whichever is greater; s the 15×15 RMS of noisy − centre.
     Non-finite values get weight 0 and do not spread.
 
-    Between a shadow that has come and one that has gone there is a line on which the mean difference is 0. Without the
-    RMS of what is around, averages ran along such lines: 4 dB on a shot of moving shadows, nothing elsewhere.
+    Between a shadow that has come and one that has gone lies a line of mean difference 0. Without the 15×15 RMS
+    averages ran along such lines: 4 dB on a shot of moving shadows, nothing elsewhere.
 
-    A pixel's own difference says nothing beside: it is the error of the two estimates, and to weigh by it is to choose
-    the frames whose errors are the centre's. Without it averages are up to 2 dB steadier, and gathered frames
-    (`nlm.pooling`) 0.5 dB better.
+    The difference of a single pixel is the error of the two estimates; weights by it choose the frames whose errors are
+    the centre's. Without it averages are up to 2 dB steadier, and pooled samples (`nlm.pooling`) 0.5 dB better.
     """
     if estimates.ndim != 4 or estimates.shape[0] % 2 == 0:
         raise ValueError(f"estimates: expected (odd frames, height, width, channels), got {estimates.shape}")
     if noisy.shape != estimates.shape[1:]:
         raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
-    if not (exposure > 0 and np.isfinite(exposure)):
-        raise ValueError(f"exposure: expected a positive number, got {exposure}")
+    check_exposure(exposure)
     centre_index = estimates.shape[0] // 2
     shape = noisy.shape
     estimates, noisy = (np.ascontiguousarray(images, np.float32) for images in (estimates, noisy))
@@ -135,6 +114,7 @@ def _compare(
 
 
 def _mean_square(x: Floats) -> Floats:
+    """Mean (H, W) over channels of x²."""
     mean = np.empty(x.shape[:2], np.float32)
     run_bands(_square, len(x), x, mean)
     return mean
@@ -153,6 +133,7 @@ def _square(first: int, last: int, x: Floats, mean: Floats) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(first: int, last: int, mean: Floats, around: Floats, rate: Floats, both: Mask, weight: Floats) -> None:
+    """Write exp(−rate · max(mean, around)), 0 where a pixel is not finite."""
     for y in range(first, last):
         for x in range(mean.shape[1]):
             weight[y, x] = np.exp(-rate[y, x] * max(mean[y, x], around[y, x])) if both[y, x] else np.float32(0)

@@ -31,38 +31,27 @@ def guided_filter(
     Parameters
     ----------
     image : (H, W, C) float32
-        What is filtered, in any unit. Non-finite pixels are left out and filled.
+        Non-finite pixels are left out and filled.
     guide : (H, W, G) float32
-        What steers it: albedo, normal, depth … in any units: each channel is brought to mean 0 and
-        variance 1 over the image first, or by `moments`.
+        Albedo, normal, depth … in any units: each channel is normalised to mean 0 and variance 1 first.
     radius : int
         Of the boxes, in pixels of the image.
     eps : float
         Regularisation ε as a share of each guide's variance: structure fainter than its root is smoothed.
     subsample : int
-        1, 2 or 4: the coefficients are found on an image so many times smaller.
+        1, 2 or 4: coefficients are fitted on an image so many times smaller.
     moments : (2, G) float64, optional
-        Means and standard deviations to take for the guide's own, from `measure_guide`: those of the whole frame,
-        where image and guide are a part of it.
+        Means and deviations of the guide in the whole frame, from `measure_guide`, where the arrays are a part of it.
 
     Returns
     -------
     (H, W, C) float32
-        The filtered image, within the range of the input in the (4·radius + 1)² box that it depends on,
-        so not negative where that is not.
+        Within the range of the input in the (4·radius + 1)² box that a pixel depends on.
 
-    Raises
-    ------
-    ValueError
-        If a shape does not fit, or a parameter is out of its range.
-
-    Notes
-    -----
-    In each box a = (Σ_I + ε·1)⁻¹ cov(I, p) and b = mean(p) − a · mean(I), Σ_I the covariance of the guide;
-    the output is mean(a) · I + mean(b), the means over all boxes that cover the pixel. Boxes are cut at
-    the frame's edge.
-    G × G systems are solved by Cholesky, in float64, as are the running sums: a firefly of 1e6 would leave its
-    rounding in float32 ones.
+    Notes ----- In each box a = (Σ_I + ε·1)⁻¹ cov(I, p) and b = mean(p) − a · mean(I), Σ_I the covariance of the guide;
+    the output is mean(a) · I + mean(b), the means over all boxes that cover the pixel. Boxes are cut at the frame's
+    edge. G × G systems are solved by Cholesky in float64, as are the running sums: a firefly of 1e6 would leave its
+    rounding in float32 sums.
 
     References
     ----------
@@ -105,18 +94,7 @@ def guided_filter(
 
 
 def measure_guide(guide: Floats) -> Doubles:
-    """Measure what a guide is brought to a common scale by.
-
-    Parameters
-    ----------
-    guide : (H, W, G) float32
-        Finite, in any units.
-
-    Returns
-    -------
-    (2, G) float64
-        Mean and standard deviation of each channel.
-    """
+    """Return mean and standard deviation (2, G) float64 of the channels of a finite guide (H, W, G)."""
     pixels = guide.shape[0] * guide.shape[1]
     rows = np.zeros((guide.shape[0], 2, guide.shape[2]))
     run_bands(_row_moments, len(rows), np.ascontiguousarray(guide, np.float32), rows)
@@ -125,7 +103,7 @@ def measure_guide(guide: Floats) -> Doubles:
 
 
 def _standardise(guide: Floats, moments: Doubles) -> Floats:
-    """Bring each channel to mean 0 and variance 1; a constant channel becomes 0."""
+    """Normalise each channel to mean 0 and variance 1; a constant channel becomes 0."""
     mean, deviation = moments
     # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
     constant = deviation <= 1e-6 * np.abs(mean)
@@ -136,7 +114,7 @@ def _standardise(guide: Floats, moments: Doubles) -> Floats:
 
 
 def _shrink(image: Floats, step: int) -> Floats:
-    """Mean of each step × step block, of what there is of it at the lower and right edge."""
+    """Mean of each step × step block, cut at the lower and right edge."""
     height, width, channels = image.shape
     out = np.zeros((-(-height // step), -(-width // step), channels), np.float32)
     run_bands(_mean_blocks, len(out), image, step, out)
@@ -182,7 +160,7 @@ def _mean_blocks(first: int, last: int, image: Floats, step: int, out: Floats) -
 
 @njit(cache=True, nogil=True, boundscheck=False, inline="always")
 def _add_moments(sums: Doubles, image: Floats, guide: Floats, weight: float) -> None:
-    """Add (or with a negative weight take away) Σ w, w I, w I Iᵀ, w p, w I pᵀ of one pixel."""
+    """Add (or with a negative weight subtract) Σ w, w I, w I Iᵀ, w p, w I pᵀ of one pixel."""
     G, C = guide.size, image.size
     sums[0] += weight
     n = 1
@@ -247,7 +225,7 @@ def _solve_box(out: Floats, sums: Doubles, matrix: Doubles, right: Doubles, G: i
 def _solve(
     first: int, last: int, image: Floats, guide: Floats, weight: Floats, radius: int, eps: float, out: Floats
 ) -> None:
-    """Coefficients of the box around each pixel, (H, W, C·G + C + 1), in some strips."""
+    """Coefficients of the box around each pixel, (H, W, C·G + C + 1), for strips of rows."""
     H, W, C = image.shape
     G = guide.shape[2]
     for strip in range(first, last):
@@ -281,7 +259,7 @@ def _solve(
 
 @njit(cache=True, nogil=True, boundscheck=False)
 def _box_sum(first: int, last: int, values: Floats, radius: int, out: Floats) -> None:
-    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, in some strips."""
+    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, for strips of rows."""
     H, W, M = values.shape
     for strip in range(first, last):
         top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
@@ -316,7 +294,7 @@ def _box_sum(first: int, last: int, values: Floats, radius: int, out: Floats) ->
 
 @njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 def _apply(first: int, last: int, coefficients: Floats, guide: Floats, image: Floats, step: int, out: Floats) -> None:
-    """Apply coefficients, enlarged bilinearly, to the guide; keep the image where there are none."""
+    """Apply coefficients, upsampled bilinearly, to the guide; copy the image where no box has coefficients."""
     _, W, G = guide.shape
     C = image.shape[2]
     h, w, M = coefficients.shape

@@ -1,4 +1,4 @@
-"""Bright pixels that move together, such as snow, rain and sparks: content that no motion vector describes."""
+"""Bright pixels that move together without motion vectors: snow, rain, sparks."""
 
 from __future__ import annotations
 
@@ -24,17 +24,9 @@ _ALIKE = 2.0
 
 
 def find_bright(excess: Floats) -> Mask:
-    """Find the bright pixels of a frame.
+    """Find the bright pixels (H, W) of a frame; none where too few or too many are bright to detect a motion.
 
-    Parameters
-    ----------
-    excess : (H, W) float32
-        What the frame shows beyond its denoised picture, relative to the light.
-
-    Returns
-    -------
-    (H, W) bool
-        All False where there are too few to tell a motion, or too many.
+    `excess` (H, W) is what the frame shows beyond its denoised picture, relative to the light.
     """
     bulk = 1.4826 * float(np.median(np.abs(excess)))
     bright = excess > max(_ABOVE, _DEVIATIONS * bulk)
@@ -43,22 +35,17 @@ def find_bright(excess: Floats) -> Mask:
 
 
 def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
-    """Find by how many rows and columns the bright pixels of a frame move together to those of another.
+    """Find the motions, rows and columns, that many bright pixels of one frame share on the way to another.
 
     Parameters
     ----------
     here, there : (H, W) bool
         From `find_bright`.
 
-    Returns
-    -------
-    list of (int, int)
-        Motions of more pixels than chance explains; none of at most one pixel, which noise of one seed has as well.
-
     Notes
     -----
-    The cross-correlation of both masks counts for each motion the pixels that have it. Independent bright pixels, N
-    and M of A, give N M / A, with Poisson's deviation.
+    The cross-correlation of both masks counts the pixels of each motion. Independent bright pixels, N and M of A, give
+    N M / A with Poisson's deviation. Motions of at most one pixel are left out: noise of one seed has these too.
     """
     rows, columns = (_busiest(here.sum(axis=1 - axis)) for axis in (0, 1))
     a, b = (mask[rows, columns].astype(np.float64) for mask in (here, there))
@@ -77,23 +64,16 @@ def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
 def confirmed_by_neighbour(
     excess: Floats, bright: Mask, other_excess: Floats, other_bright: Mask, flow: Floats | None
 ) -> Mask:
-    """Tell which bright pixels of a frame another frame shows where their shared motion leads.
+    """Return the bright pixels (H, W) that another frame shows at the end of a shared motion other than the surfaces'.
 
     Parameters
     ----------
-    excess : (H, W) float32
-        As for `find_bright`, of the frame.
-    bright : (H, W) bool
-        From `find_bright`.
+    excess, bright : (H, W) array
+        Of the frame, as for `find_bright` and from `find_bright`.
     other_excess, other_bright : (H, W) array
-        The same of the other frame.
+        Of the other frame.
     flow : (H, W, 2) float32 or None
-        Where surfaces move to in the other frame, pixels, x first; None where nothing moves.
-
-    Returns
-    -------
-    (H, W) bool
-        None that move as the surfaces do.
+        Motion of surfaces to the other frame, pixels, x first; None: nothing moves.
     """
     found = np.zeros_like(bright)
     height, width = bright.shape
@@ -114,7 +94,7 @@ def confirmed_by_neighbour(
 
 
 def _busiest(counts: NDArray[np.intp]) -> slice:
-    """The stretch of at most `_BLOCK` rows or columns that holds most bright pixels."""
+    """Return the `_BLOCK` rows or columns with the most bright pixels."""
     length = min(_BLOCK, len(counts))
     sums = np.convolve(counts, np.ones(length), "valid")
     first = int(np.argmax(sums))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -34,6 +36,23 @@ _FAR = 400.0
 _NEVER = 16.0
 
 
+class _Inputs(NamedTuple):
+    window: Floats
+    variance: Floats
+    features: Floats
+    confidence: Floats
+    where: Mask
+
+
+class _Tile(NamedTuple):
+    """Planes of one frame around a tile: values (C, h, w), their noise term, features (F, h, w), weight of each tap."""
+
+    values: Floats
+    noise: Floats
+    features: Floats
+    trust: Floats
+
+
 def joint_nlm(
     window: Floats,
     variance: Floats,
@@ -50,32 +69,26 @@ def joint_nlm(
     Parameters
     ----------
     window : (T, H, W, C) float32
-        Aligned frames, linear irradiance (or radiance), in any unit; the centre is ``T // 2``. Non-finite values are
-        left out.
+        Irradiance or radiance. Non-finite values are left out.
     variance : (H, W, C) float32
-        Variance of the centre's values, in squared units, smoothed. It serves all frames.
+        Variance of the centre's values, smoothed; used for all frames.
     features : (H, W, F) float32, optional
-        The centre's albedo, normal, depth …, of about unit range and prefiltered: see `prefilter_guide`. The frames are
-        aligned, so they serve all of them.
+        The centre's albedo, normal, depth …, of about unit range and prefiltered (`nlm.variance.prefilter_guide`); used
+        for all frames, as these are aligned.
     confidence : (T, H, W) float32, optional
-        Trust in each pixel of each frame, in [0, 1]; 1 if not given.
+        In [0, 1]; default 1.
     radius, patch_radius : int
-        Of the search, and of the patches that are compared, in pixels.
+        Of the search and of the compared patches, pixels.
     k : float
         Strength of the colour distance: more smooths more.
     where : (H, W) bool, optional
-        Pixels that call for it; a tile without any stays as the centre is.
+        A tile without a True pixel is copied from the centre.
 
     Returns
     -------
     (H, W, C) float32
-        The filtered centre frame: at every pixel a convex combination of values of the window. Where no value
-        is trusted, the centre's own, or 0 where it is not finite.
-
-    Raises
-    ------
-    ValueError
-        If a shape does not fit, or a parameter is out of its range.
+        Convex combinations of values of the window; the centre's value where no value is trusted, 0 where this is not
+        finite.
 
     Notes
     -----
@@ -85,10 +98,9 @@ def joint_nlm(
         f(p, q) = max over features (f_p − f_q)² / max(|∇f_p|², 1e-3)
         w(p, q) = confidence_q · exp(−max(d, f, 0))
 
-    A share of u² (1e-6 / k²) is added to V: no division by 0, and the filter stays scale equivariant. In a
-    patch a pixel adds at most 25 to the distance; a value 28 deviations from the centre's gets no weight.
-    So a firefly leaks nowhere, but stays: `reject_outliers` first. e^-d is (1 - d/16)^16, which vectorises.
-    The sums down the columns of a patch are running ones, so its height costs nothing.
+    A share of u² (1e-6 / k²) is added to V: no division by 0, and the filter stays scale equivariant. A pixel adds at
+    most 25 to the distance of a patch; a value 28 deviations from the centre's gets no weight. A firefly therefore
+    spreads nowhere, but stays: run `reject_outliers` first. e^-d is (1 - d/16)^16, which vectorises.
 
     References
     ----------
@@ -124,8 +136,8 @@ def joint_nlm(
     )
     out = np.empty(window.shape[1:], np.float32)
     tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
-    given = window, variance, features, confidence, where, radius, patch_radius, np.float32(k)
-    run_bands(_filter, tiles, *given, out)
+    given = _Inputs(window, variance, features, confidence, where)
+    run_bands(_filter, tiles, given, radius, patch_radius, np.float32(k), out)
     return out
 
 
@@ -163,7 +175,7 @@ def _accumulate(total: Floats, w: Floats, values: Floats, centre: Floats) -> Non
 
 @njit(cache=True, nogil=True, boundscheck=False)
 def _load(target: Floats, source: Floats, top: int, left: int) -> None:
-    """Copy a tile of (H, W, C) into planes (C, h, w); beyond the frame the edge is repeated."""
+    """Copy a tile of (H, W, C) into planes (C, h, w), with the edge repeated beyond the frame."""
     planes, h, w = target.shape
     height, width = source.shape[:2]
     first, last = max(-left, 0), min(width - left, w)
@@ -181,39 +193,31 @@ def _load(target: Floats, source: Floats, top: int, left: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _load_frame(
-    u: Floats,
-    a: Floats,
-    trust: Floats,
-    frame: Floats,
-    variance: Floats,
-    confidence: Floats,
-    k: np.float32,
-    top: int,
-    left: int,
+    tile: _Tile, frame: Floats, variance: Floats, confidence: Floats, k: np.float32, top: int, left: int
 ) -> None:
-    """Load values `u`, their noise term `a` and the weight `trust` of each tap, 0 outside the frame."""
-    channels, h, w = u.shape
+    """Load values, their noise term and the weight of each tap, 0 outside the frame."""
+    channels, h, w = tile.values.shape
     height, width = confidence.shape
-    _load(u, frame, top, left)
-    _load(a, variance, top, left)
-    trust[:] = 0
+    _load(tile.values, frame, top, left)
+    _load(tile.noise, variance, top, left)
+    tile.trust[:] = 0
     for y in range(max(-top, 0), min(height - top, h)):
         for x in range(max(-left, 0), min(width - left, w)):
-            trust[y, x] = confidence[top + y, left + x]
+            tile.trust[y, x] = confidence[top + y, left + x]
     for c in range(channels):
         for y in range(h):
             for x in range(w):
-                value = u[c, y, x]
+                value = tile.values[c, y, x]
                 if not abs(value) < _HUGE:
-                    u[c, y, x] = value = np.float32(0)
-                    trust[y, x] = np.float32(0)
-                noise = k * k * a[c, y, x] + np.float32(_RELATIVE_VARIANCE) * value * value
-                a[c, y, x] = noise if noise > np.float32(_TINY) else np.float32(_TINY)
+                    tile.values[c, y, x] = value = np.float32(0)
+                    tile.trust[y, x] = np.float32(0)
+                noise = k * k * tile.noise[c, y, x] + np.float32(_RELATIVE_VARIANCE) * value * value
+                tile.noise[c, y, x] = noise if noise > np.float32(_TINY) else np.float32(_TINY)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: int) -> None:
-    """Load the centre's features `f`, and what turns a squared difference into a distance."""
+    """Load the centre's features `f`, and the factor from squared difference to distance."""
     planes, h, w = f.shape
     height, width = features.shape[:2]
     _load(f, features, top, left)
@@ -230,101 +234,110 @@ def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _filter(
-    first: int, last: int, window: Floats, variance: Floats, features: Floats, confidence: Floats, where: Mask,
-    radius: int, patch: int, k: np.float32, out: Floats,
+def _add_patch_row(
+    column: Floats, row: Floats, centre: _Tile, frame: _Tile, corner: tuple[int, int], step: tuple[int, int],
+    cancel: np.float32,
 ) -> None:  # fmt: skip
+    """Replace one row of colour distances, `row`, in the running sums over the columns of patches."""
+    w = column.size
+    for x in range(w):
+        column[x] -= row[x]
+        row[x] = 0
+    py, qy = corner[0], corner[0] + step[0]
+    p, q = slice(corner[1], corner[1] + w), slice(corner[1] + step[1], corner[1] + step[1] + w)
+    for c in range(len(centre.values)):
+        taps = frame.values[c, qy, q], frame.noise[c, qy, q]
+        _add_color_distance(row, centre.values[c, py, p], centre.noise[c, py, p], *taps, cancel)
+    for x in range(w):
+        column[x] += row[x]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _weigh(weight: Floats, column: Floats, feature: Floats, trust: Floats, patch: int, norm: np.float32) -> None:
+    """Write the weights of a row of taps: patch distance from the column sums, at least the distance of features."""
+    weight[:] = 0
+    for n in range(2 * patch + 1):
+        for x in range(weight.size):
+            weight[x] += column[x + n]
+    for x in range(weight.size):
+        d = weight[x] * norm
+        d = d if d > feature[x] else feature[x]
+        # (1 - d/16)^16 is e^-d to the precision needed, and vectorises
+        e = np.float32(1) - d * np.float32(1 / _NEVER)
+        e = e if e > np.float32(0) else np.float32(0)
+        e *= e
+        e *= e
+        e *= e
+        weight[x] = e * e * trust[x]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _filter(first: int, last: int, given: _Inputs, radius: int, patch: int, k: np.float32, out: Floats) -> None:
     """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
-    T, H, W, C = window.shape
-    F = features.shape[2]
-    centre = T // 2
+    H, W, _ = out.shape
     columns = -(-W // _TILE_WIDTH)
-    cancel, far = np.float32(1 / (k * k)), np.float32(_FAR / (k * k))
-    norm = np.float32(1 / (C * (2 * patch + 1) ** 2))
     for tile in range(first, last):
-        y0, x0 = tile // columns * _TILE_HEIGHT, tile % columns * _TILE_WIDTH
-        th, tw = min(_TILE_HEIGHT, H - y0), min(_TILE_WIDTH, W - x0)
-        if not where[y0 : y0 + th, x0 : x0 + tw].any():
-            out[y0 : y0 + th, x0 : x0 + tw] = window[centre, y0 : y0 + th, x0 : x0 + tw]
+        top, left = tile // columns * _TILE_HEIGHT, tile % columns * _TILE_WIDTH
+        rows, cols = slice(top, min(top + _TILE_HEIGHT, H)), slice(left, min(left + _TILE_WIDTH, W))
+        if given.where[rows, cols].any():
+            _filter_tile(given, radius, patch, k, (top, left), out[rows, cols])
+        else:
+            out[rows, cols] = given.window[len(given.window) // 2, rows, cols]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner: tuple[int, int], out: Floats) -> None:
+    """Average all taps of the tile at `corner`."""
+    T, F, (th, tw, C), margin = len(given.window), given.features.shape[2], out.shape, radius + patch
+    h, w, top, left = th + 2 * margin, tw + 2 * margin, corner[0] - margin, corner[1] - margin
+    trust = np.empty((h, w), np.float32)
+    features, scale = np.empty((F, th, tw), np.float32), np.empty((F, th, tw), np.float32)
+    centre = _Tile(np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32), features, trust)
+    padded = np.empty((F, h, w), np.float32)
+    frame = _Tile(np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32), padded, trust)
+    total, weight = np.zeros((C, th, tw), np.float32), np.zeros((th, tw), np.float32)
+    _load_frame(centre, given.window[T // 2], given.variance, given.confidence[T // 2], k, top, left)
+    _load_features(features, scale, given.features, corner[0], corner[1])
+    _load(padded, given.features, top, left)
+    for t in range(T):
+        _load_frame(frame, given.window[t], given.variance, given.confidence[t], k, top, left)
+        for dy in range(-radius, radius + 1):
+            for dx in range(-radius, radius + 1):
+                _add_taps(centre, frame, scale, patch, (dy, dx), k, total, weight)
+    for y in range(th):
+        for x in range(tw):
+            for c in range(C):
+                mean = total[c, y, x] / weight[y, x] if weight[y, x] > 0 else np.float32(0)
+                out[y, x, c] = centre.values[c, y + margin, x + margin] + mean
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _add_taps(
+    centre: _Tile, frame: _Tile, scale: Floats, patch: int, step: tuple[int, int], k: np.float32, total: Floats,
+    weight: Floats,
+) -> None:  # fmt: skip
+    """Add the taps of one frame at the offset `step` to all pixels of a tile."""
+    C, th, tw = total.shape
+    margin, size = (frame.trust.shape[0] - th) // 2, 2 * patch + 1
+    cancel, far, norm = np.float32(1 / (k * k)), np.float32(_FAR / (k * k)), np.float32(1 / (C * size**2))
+    ring, column = np.zeros((size, tw + 2 * patch), np.float32), np.zeros(tw + 2 * patch, np.float32)
+    tap, distance = np.empty(tw, np.float32), np.empty(tw, np.float32)
+    p, q = slice(margin, margin + tw), slice(margin + step[1], margin + step[1] + tw)
+    for y in range(-patch, th + patch):
+        corner = y + margin, margin - patch
+        _add_patch_row(column, ring[(y + patch) % size], centre, frame, corner, step, cancel)
+        oy = y - patch
+        if oy < 0:
             continue
-        pw = tw + 2 * patch
-        margin = radius + patch
-        h, w = th + 2 * margin, tw + 2 * margin
-        top, left = y0 - margin, x0 - margin
-        pu, pa = np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32)
-        qu, qa = np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32)
-        trust = np.empty((h, w), np.float32)
-        pf, qf = np.empty((F, th, tw), np.float32), np.empty((F, h, w), np.float32)
-        fs = np.empty((F, th, tw), np.float32)
-        total, weight = np.zeros((C, th, tw), np.float32), np.zeros((th, tw), np.float32)
-        ring = np.empty((2 * patch + 1, pw), np.float32)
-        column, wrow, frow = np.empty(pw, np.float32), np.empty(tw, np.float32), np.empty(tw, np.float32)
-        _load_frame(pu, pa, trust, window[centre], variance, confidence[centre], k, top, left)
-        _load_features(pf, fs, features, y0, x0)
-        _load(qf, features, top, left)
-        for t in range(T):
-            _load_frame(qu, qa, trust, window[t], variance, confidence[t], k, top, left)
-            for dy in range(-radius, radius + 1):
-                for dx in range(-radius, radius + 1):
-                    column[:] = 0
-                    ring[:] = 0
-                    for y in range(-patch, th + patch):
-                        row = ring[(y + patch) % (2 * patch + 1)]
-                        for x in range(pw):
-                            column[x] -= row[x]
-                            row[x] = 0
-                        py, qy, qx = y + margin, y + margin + dy, radius + dx
-                        for c in range(C):
-                            _add_color_distance(
-                                row,
-                                pu[c, py, radius : radius + pw],
-                                pa[c, py, radius : radius + pw],
-                                qu[c, qy, qx : qx + pw],
-                                qa[c, qy, qx : qx + pw],
-                                cancel,
-                            )
-                        for x in range(pw):
-                            column[x] += row[x]
-                        oy = y - patch
-                        if oy < 0:
-                            continue
-                        qy, qx = oy + margin + dy, margin + dx
-                        wrow[:] = 0
-                        for n in range(2 * patch + 1):
-                            for x in range(tw):
-                                wrow[x] += column[x + n]
-                        frow[:] = 0
-                        for f in range(F):
-                            _max_feature_distance(frow, pf[f, oy], qf[f, qy, qx : qx + tw], fs[f, oy])
-                        for c in range(C):
-                            _reject_far(
-                                frow,
-                                pu[c, oy + margin, margin : margin + tw],
-                                pa[c, oy + margin, margin : margin + tw],
-                                qu[c, qy, qx : qx + tw],
-                                qa[c, qy, qx : qx + tw],
-                                far,
-                            )
-                        trow = trust[qy, qx : qx + tw]
-                        for x in range(tw):
-                            d = wrow[x] * norm
-                            d = d if d > frow[x] else frow[x]
-                            # (1 - d/16)^16 is e^-d for all that matters, and vectorises
-                            e = np.float32(1) - d * np.float32(1 / _NEVER)
-                            e = e if e > np.float32(0) else np.float32(0)
-                            e *= e
-                            e *= e
-                            e *= e
-                            wrow[x] = e * e * trow[x]
-                        for x in range(tw):
-                            weight[oy, x] += wrow[x]
-                        for c in range(C):
-                            middle = pu[c, oy + margin, margin : margin + tw]
-                            _accumulate(total[c, oy], wrow, qu[c, qy, qx : qx + tw], middle)
-        for y in range(th):
-            for x in range(tw):
-                for c in range(C):
-                    if weight[y, x] > 0:
-                        out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin] + total[c, y, x] / weight[y, x]
-                    else:
-                        out[y0 + y, x0 + x, c] = pu[c, y + margin, x + margin]
+        py, qy = oy + margin, oy + margin + step[0]
+        distance[:] = 0
+        for f in range(len(scale)):
+            _max_feature_distance(distance, centre.features[f, oy], frame.features[f, qy, q], scale[f, oy])
+        for c in range(C):
+            taps = frame.values[c, qy, q], frame.noise[c, qy, q]
+            _reject_far(distance, centre.values[c, py, p], centre.noise[c, py, p], *taps, far)
+        _weigh(tap, column, distance, frame.trust[qy, q], patch, norm)
+        for x in range(tw):
+            weight[oy, x] += tap[x]
+        for c in range(C):
+            _accumulate(total[c, oy], tap, frame.values[c, qy, q], centre.values[c, py, p])

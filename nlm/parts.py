@@ -1,4 +1,4 @@
-"""Layers that are parts of a picture: found by adding up the noisy pixels, and denoised so that they still add up."""
+"""Layers that are parts of a picture: found by adding up noisy pixels, denoised so that their sum is kept."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlm.guided import guided_filter
+from nlm.variance import second_differences
 
 Floats = NDArray[np.float32]
 
@@ -31,21 +32,14 @@ _ROUNDS = 3
 
 
 def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
-    """Tell whether layers add up to a picture, pixel by pixel.
+    """Return whether layers add up to a picture: 95 % of all values within 0.5 %.
 
     Parameters
     ----------
     parts : sequence of (..., C) float32
-        Layers as rendered, each multiplied by its color where it is written without.
+        As rendered, times albedo for a layer that is rendered without.
     whole : (..., C) float32
-        The picture as rendered.
     exposure : float
-        Radiance of middle brightness.
-
-    Returns
-    -------
-    bool
-        Whether 95 % of all values are within 0.5 % of each other.
     """
     total = np.zeros_like(whole)
     for part in parts:
@@ -56,41 +50,33 @@ def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
 
 
 def few_differ(share: float) -> bool:
-    """Tell whether so few values differ, as a share in [0, 1], that a sum is still one: saturated halves, fireflies."""
+    """Return whether a share in [0, 1] of differing values is small enough for a sum: saturated halves, fireflies."""
     return share <= _MOST
 
 
 def share_outside(part: Floats, whole: Floats, exposure: float) -> float:
-    """Give the share of values in which a layer is negative or above the picture.
+    """Return the share of values, in [0, 1], in which a layer is negative or above the picture.
 
     Parameters
     ----------
     part, whole : (..., C) float32
         As rendered.
     exposure : float
-        Radiance of middle brightness.
-
-    Returns
-    -------
-    float
-        In [0, 1].
     """
     slack = np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
     return float(1 - ((part <= whole + slack) & (part >= -slack)).mean())
 
 
 def shares_noise(part: Floats, whole: Floats) -> bool:
-    """Tell whether a layer's noise is in a picture: its second differences are found in the picture's as they are.
+    """Return whether a picture contains a layer's noise: the regression of second differences has a slope of a half or
+    more.
+
+    The slope is 1 for a part and 0 for other light.
 
     Parameters
     ----------
     part, whole : (H, W, 3) float32
         As rendered, finite.
-
-    Returns
-    -------
-    bool
-        Whether the slope of the regression is a half or more: it is 1 for a part, and 0 for other light.
     """
     of_part, of_whole = (_second_differences(layer).astype(np.float64) for layer in (part, whole))
     # Of the median's order alone: one bright sample has no vote of its own.
@@ -101,12 +87,8 @@ def shares_noise(part: Floats, whole: Floats) -> bool:
 
 
 def is_noisy(layer: Floats) -> bool:
-    """Tell whether a layer has noise anywhere: textures count as noise, edges do not.
-
-    Parameters
-    ----------
-    layer : (H, W, C) float32
-        As rendered, finite.
+    """Return whether a layer (H, W, C), as rendered and finite, has noise anywhere; texture counts as noise, edges do
+    not.
     """
     level = float(np.abs(layer).mean(dtype=np.float64))
     response = np.abs(_second_differences(layer)).max(axis=-1)
@@ -121,7 +103,9 @@ def is_noisy(layer: Floats) -> bool:
 
 
 def is_textured(layer: Floats, albedo: Floats) -> bool:
-    """Tell whether a layer was multiplied by the surfaces' color: its detail is that of the color.
+    """Return whether a layer includes the albedo: the slope of layer/mean on albedo/mean is a half or more.
+
+    Means are over 9×9 pixels; the slope is 1 for albedo times light, and 0 for light alone.
 
     Parameters
     ----------
@@ -129,12 +113,6 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
         As rendered, finite.
     albedo : (H, W, 3) float32
         In [0, 1].
-
-    Returns
-    -------
-    bool
-        Whether the slope of layer/mean(layer) on albedo/mean(albedo), means of 9×9 pixels, is a half or more: it is 1
-        for albedo times light, and 0 for light alone.
     """
     color = albedo if layer.shape[-1] == albedo.shape[-1] else albedo.mean(axis=-1, keepdims=True)
     light, level = np.abs(_blur(layer)), _blur(color)
@@ -149,27 +127,23 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
 
 
 def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[tuple[int, ...]]:
-    """Find layers that add up to a picture; sets of them that share none, those of the fewest layers first.
+    """Find disjoint sets of layers that add up to a picture, those of the fewest layers first.
 
     Parameters
     ----------
     layers : sequence of (..., C) float32
         As for `sums_to`; negative light is allowed.
     whole : (..., C) float32
-        The picture.
     exposure : float
-        Radiance of middle brightness.
 
     Returns
     -------
     list of tuple of int
         Indices of layers.
 
-    Notes
-    -----
-    A depth-first search. Of a set that is begun, all sums lie between that with all negative and that with all positive
-    values of the layers not yet decided: where the whole is outside of this in too many values, nothing can follow.
-    A layer of less light than the bound allows to be missing is taken in where that brings the sum nearer.
+    Notes ----- A depth-first search. All sums that continue a partial set lie between its sum with all negative and its
+    sum with all positive values of the undecided layers: the branch is cut where too many values of the picture lie
+    outside. A layer with less light than the tolerance is added where that brings the sum nearer.
     """
     flat = np.asarray(whole, np.float32).ravel()
     step = max(1, flat.size // _VALUES)
@@ -193,7 +167,7 @@ def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[
 
 
 def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tuple[int, ...]]:
-    """All sets of vectors that add up to a target, of the first `_SUBSETS` that are begun; the brightest first."""
+    """All sets of vectors that add up to a target, of the first `_SUBSETS` partial sets; the brightest first."""
     if not values:
         return []
     nothing = np.zeros_like(target)
@@ -222,21 +196,16 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
 def filter_layers(
     layers: Sequence[Floats], guide: Floats, *, moments: NDArray[np.float64] | None = None
 ) -> list[Floats]:
-    """Denoise layers each by its own light, steered by what is known of the picture's edges.
+    """Denoise layers, each within its own range and with its own mean, by the guided filter.
 
     Parameters
     ----------
     layers : sequence of (H, W, C) float32
         Averaged over time.
     guide : (H, W, G) float32
-        What steers the filter: the denoised light and more.
+        The denoised light and more.
     moments : (2, G) float64, optional
         As for `nlm.guided.guided_filter`.
-
-    Returns
-    -------
-    list of (H, W, C) float32
-        Each within its own range; none of its mean is lost.
     """
     if not layers:
         return []
@@ -253,39 +222,33 @@ def split_light(
     factors: Sequence[Floats | None] | None = None,
     bounds: Sequence[Floats | None] | None = None,
 ) -> list[Floats]:
-    """Share a denoised picture out to the parts that it is the sum of.
+    """Distribute a denoised picture over the parts that add up to it.
 
     Parameters
     ----------
     filtered : sequence of (H, W, 3) float32
         The parts, from `filter_layers`; negative light is allowed.
     denoised : (H, W, 3) float32
-        The picture, denoised.
+        The picture.
     exposure : float
-        Radiance of middle brightness.
     factors : sequence of (H, W, 3) float32 or None, optional
-        What each part is multiplied by before they are added, at least 0; None: 1.
+        Factor of each part in the sum, at least 0; None: 1.
     bounds : sequence of (H, W, 3) float32 or None, optional
-        A layer within whose range, over 17×17 pixels, a part stays; None: without bounds.
+        Layers whose range over 17×17 pixels bounds a part; None: no bounds.
 
     Returns
     -------
     list of (H, W, 3) float32
-        The parts, denoised; they add up to `denoised` where the bounds leave it possible.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ.
+        Parts that add up to `denoised` where the bounds allow this.
 
     Notes
     -----
-    With F the filtered parts, c the factors, g = denoised − Σ c F what they lack:
+    With F the filtered parts, c the factors and g = denoised − Σ c F:
 
         o_k = F_k + g · (|F_k| + ε) / Σ_j c_j (|F_j| + ε) ,
 
-    which is denoised · F_k / Σ c F for light that is not negative. A share of light is smoother than light, and what
-    the denoiser knows of the picture's detail is in `denoised`. What a bound cuts off is shared out to the others.
+    which is denoised · F_k / Σ c F for light that is not negative: a share of light is smoother than light, and the
+    detail is in `denoised`. Light beyond a bound is distributed over the other parts.
     """
     if not filtered:
         return []
@@ -313,18 +276,14 @@ def split_light(
 
 
 def add_light(parts: Sequence[Floats], factors: Sequence[Floats | np.float32 | None]) -> Floats:
-    """Add parts up, each multiplied by its factor.
+    """Return Σ factor · part, (H, W, C).
 
     Parameters
     ----------
     parts : sequence of (H, W, C) float32
         At least one.
     factors : sequence of (H, W, C) float32 or None
-        As many; None: 1.
-
-    Returns
-    -------
-    (H, W, C) float32
+        None: 1.
     """
     total = np.zeros_like(parts[0])
     for part, factor in zip(parts, factors, strict=True):
@@ -333,7 +292,7 @@ def add_light(parts: Sequence[Floats], factors: Sequence[Floats | np.float32 | N
 
 
 def _range(layer: Floats) -> tuple[Floats, Floats]:
-    """Least and greatest of what the filter has seen around each pixel."""
+    """Least and greatest value within the filter's support of each pixel."""
     box = np.ones((4 * _RADIUS + 1, 4 * _RADIUS + 1), np.uint8)
     return np.asarray(cv2.erode(layer, box), np.float32), np.asarray(cv2.dilate(layer, box), np.float32)
 
@@ -344,6 +303,5 @@ def _blur(layer: Floats) -> Floats:
 
 def _second_differences(layer: Floats) -> Floats:
     """[1 −2 1]ᵀ [1 −2 1] / 6, which has the variance of white noise (Immerkær 1996), without the outermost pixels."""
-    kernel = np.array([1, -2, 1], np.float32)
-    found = np.asarray(cv2.sepFilter2D(layer, -1, kernel, kernel) / 6, np.float32).reshape(layer.shape)
+    found = np.asarray(second_differences(layer) / 6, np.float32)
     return found[1:-1, 1:-1] if min(layer.shape[:2]) > 2 else found

@@ -1,4 +1,4 @@
-"""The samples of a window of frames, gathered at the centre before anything denoises them."""
+"""Samples of all frames of a window, pooled at the centre before denoising."""
 
 from __future__ import annotations
 
@@ -10,60 +10,42 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_window
+from nlm.average import check_exposure, check_window
 
 Floats = NDArray[np.float32]
 
-# What a pixel shows beyond its estimate counts up to so many times its light and the exposure. Noise of a few samples
-# seldom goes so far; a firefly goes hundreds of times as far, and no denoiser forgives it: at 15 to 30 samples a
-# picture made without this limit lost up to 10 dB. Limits of 4 to 8 differ by less than 0.1 dB.
+# A residual counts up to so many times the pixel's light and the exposure. Noise of a few samples seldom exceeds this
+# limit; a firefly exceeds it hundreds of times, and no denoiser removes such a value: at 15 to 30 samples pictures
+# without this limit lost up to 10 dB. Limits of 4 to 8 differ by less than 0.1 dB.
 RESIDUAL_LIMIT = np.float32(6)
 
 
 @dataclass(frozen=True)
 class PooledSamples:
-    """A frame with the samples of its neighbours.
+    """A frame with the samples of its neighbours."""
 
-    Attributes
-    ----------
-    average : (H, W, 3) float32
-        Of the estimates, weighted by confidence.
-    image : (H, W, 3) float32
-        The same and the average of what the noisy frames show beyond their estimates: as unbiased as they are, with the
-        noise of `samples` frames.
-    samples : (H, W) float32
-        Frames' worth of samples at each pixel, (Σ c)² / Σ c², between 1 and T; 0 where no frame is trusted.
-    """
-
-    average: Floats
-    image: Floats
-    samples: Floats
+    average: Floats  # (H, W, 3) estimates weighted by confidence
+    image: Floats  # (H, W, 3) average + averaged residuals: unbiased, with the noise of `samples` frames
+    samples: Floats  # (H, W) frames' worth of samples, (Σ c)² / Σ c², 1 to T; 0 where no frame is trusted
 
 
 def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, exposure: float) -> PooledSamples:
-    """Gather the samples of aligned frames at the centre.
+    """Pool the samples of aligned frames at the centre.
 
     Parameters
     ----------
     estimates : (T, H, W, 3) float32
-        Denoised frames, aligned by an interpolation that keeps detail; the centre is ``T // 2``.
+        Denoised, aligned by an interpolation that keeps detail.
     residuals : (T, H, W, 3) float32
-        Noisy frame minus estimate, each taken in its own place and aligned to the nearest pixel: noise that is
-        interpolated is no longer white, and a denoiser takes it for texture.
+        Noisy frame minus estimate, subtracted before alignment and aligned to the nearest pixel: interpolated noise is
+        no longer white, and a denoiser takes such noise for texture.
     confidence : (T, H, W) float32
-        Trust in each pixel of each frame, at least 0.
     exposure : float
-        Radiance of middle brightness; it scales with the frames.
 
     Returns
     -------
-    Gathered
-        Where no frame is trusted, the centre's estimate. Pixels that are not finite in a frame count for nothing there.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit each other, T is even, or `exposure` is not a positive number.
+    PooledSamples
+        The centre's estimate where no frame is trusted. Non-finite pixels of a frame are skipped.
 
     Notes
     -----
@@ -72,36 +54,29 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
         G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,    N = (Σ c)² / Σ c²,
 
     where r' is r scaled down to |r'| ≤ 6 (e + exposure), in the mean over channels, so that fireflies keep their hue
-    and lose their power. What that takes from the light is for the denoised picture's mean to bring back.
+    and lose their power. `nlm.samples.restore_mean` adds the lost light to the denoised picture.
     """
     if residuals.shape != estimates.shape:
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
-    if not (exposure > 0 and np.isfinite(exposure)):
-        raise ValueError(f"exposure: expected a positive number, got {exposure}")
+    check_exposure(exposure)
     estimates, confidence = check_window(estimates, confidence, "confidence")
     residuals = np.ascontiguousarray(residuals, np.float32)
     average, image = np.empty(estimates.shape[1:], np.float32), np.empty(estimates.shape[1:], np.float32)
     samples = np.empty(estimates.shape[1:3], np.float32)
     given = estimates, residuals, confidence, np.float32(exposure)
-    run_bands(_gather, len(samples), *given, average, image, samples)
+    run_bands(_pool, len(samples), *given, average, image, samples)
     return PooledSamples(average, image, samples)
 
 
 def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
-    """Hold a picture to the range of what it was made from.
+    """Clamp each channel of a picture (H, W, 3) to the range of estimates and samples within 3×3 pixels of any frame.
 
     Parameters
     ----------
     picture : (H, W, 3) float32
         Finite.
     estimates, residuals : (T, H, W, 3) float32
-        As for `pool_samples`, in the unit of the picture.
-
-    Returns
-    -------
-    (H, W, 3) float32
-        Each channel within the least and the greatest value that the estimates and the samples (estimate + residual)
-        of any frame have within 3×3 pixels. Values that are not finite do not count.
+        As for `pool_samples`, in the unit of the picture. Non-finite values do not count.
     """
     low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
     run_bands(_range, len(picture), estimates, residuals, low, high)
@@ -110,10 +85,11 @@ def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Fl
 
 
 @njit(cache=True, nogil=True)
-def _gather(
+def _pool(
     first: int, last: int, estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32,
     average: Floats, image: Floats, samples: Floats,
 ) -> None:  # fmt: skip
+    """Write average, image and number of samples."""
     T, _, W, C = estimates.shape
     for y in range(first, last):
         light, noise = np.empty(C, np.float32), np.empty(C, np.float32)

@@ -1,4 +1,4 @@
-"""Light that has changed evenly: pictures of other frames, in the light of the centre."""
+"""Neighbours in the light of the centre: the smooth difference in light is subtracted, detail is kept."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_window
-from nlm.variance import gaussian_mean
+from nlm.average import check_exposure, check_window
+from nlm.variance import gaussian_mean, ratio
 
 Floats = NDArray[np.float32]
 
@@ -18,61 +18,47 @@ _CELL, _SIGMA = 4, 1.5
 
 
 def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, first_row: int = 0) -> None:
-    """Take from aligned pictures by what their light differs from the centre's in the mean.
+    """Subtract from aligned pictures, in place, their mean difference in light from the centre.
 
-    Where pictures differ by more than their errors, light has changed; where it has changed evenly, as under a shadow's
-    soft edge or a lamp that grows, their detail is the centre's nevertheless.
+    Light that changes evenly (a shadow's soft edge, a growing lamp) leaves the detail of a neighbour usable.
 
     Parameters
     ----------
     window : (T, H, W, 3) float32
-        Pictures, aligned, linear, finite; the centre is ``T // 2``. Is changed.
+        Aligned pictures, contiguous, finite.
     alike : (T, H, W) float32
-        Trust in each pixel as it is, at least 0.
+        Confidence of each pixel as is.
     trusted : (T, H, W) float32
-        Trust in it but for its light, at least `alike`.
+        Confidence without regard to light, at least `alike`.
     exposure : float
-        Radiance of what is neither dark nor bright; it scales with the pictures.
     first_row : int
-        Which row of the frame the first one is: means are of the same pixels as in the whole frame.
+        The frame's row that the first row belongs to: cells lie as in the whole frame.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other, T is even, or `exposure` is not a positive number.
-
-    Notes
-    -----
-    With a and c the two kinds of trust, d_s becomes d_s − (1 − a/c) · l · K[c (d_s − d_t) / l] / K[c], K a Gaussian
-    mean over σ = 6 pixels, and not less than 0. The light l is the mean of both pictures in this channel, and the
-    exposure: a pixel counts by its relative difference, 2 at most, so that a firefly leaves no ring.
+    Notes ----- With a and c the two confidences, d_s becomes max(0, d_s − (1 − a/c) · l · K[c (d_s − d_t) / l] / K[c]),
+    K a Gaussian mean over σ = 6 pixels. The light l is the mean of both pictures in this channel plus the exposure: a
+    pixel counts by its relative difference, at most 2, so that a firefly leaves no ring.
     """
     checked, trusted = check_window(window, trusted, "trusted")
     if checked is not window:
         raise ValueError(f"window: expected contiguous float32, got {window.dtype}")
     if alike.shape != trusted.shape:
         raise ValueError(f"alike: expected shape {trusted.shape} to fit the window, got {alike.shape}")
-    if not (exposure > 0 and np.isfinite(exposure)):
-        raise ValueError(f"exposure: expected a positive number, got {exposure}")
+    check_exposure(exposure)
     frames, height, width, channels = window.shape
     alike = np.ascontiguousarray(alike, np.float32)
-    above = first_row % _CELL
-    rows, columns = -(-(above + height) // _CELL), -(-width // _CELL)
+    offset = first_row % _CELL
+    rows, columns = -(-(offset + height) // _CELL), -(-width // _CELL)
     for t in range(frames):
         if t == frames // 2:
             continue
         sums = np.zeros((channels + 1, rows, columns), np.float32)
         pair = window[t], window[frames // 2], trusted[t], np.float32(exposure)
-        run_bands(_sum_cells, rows, *pair, above, sums)
+        run_bands(_sum_cells, rows, *pair, offset, sums)
         means = [gaussian_mean(part, _SIGMA) for part in sums]
-        change = np.stack([_ratio(part, means[-1]) for part in means[:-1]], axis=-1)
+        change = np.stack([ratio(part, means[-1]) for part in means[:-1]], axis=-1)
         whole = (columns * _CELL, rows * _CELL)
         change = np.asarray(cv2.resize(change, whole, interpolation=cv2.INTER_LINEAR), np.float32)
-        run_bands(_take, height, *pair, alike[t], change[above : above + height, :width])
-
-
-def _ratio(a: Floats, b: Floats) -> Floats:
-    return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
+        run_bands(_subtract, height, *pair, alike[t], change[offset : offset + height, :width])
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -82,24 +68,24 @@ def _light(there: np.float32, here: np.float32, exposure: np.float32) -> np.floa
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_cells(
-    first: int, last: int, there: Floats, here: Floats, trusted: Floats, exposure: np.float32, above: int, sums: Floats
+    first: int, last: int, there: Floats, here: Floats, trusted: Floats, exposure: np.float32, offset: int, sums: Floats
 ) -> None:
-    """Sum over cells the relative difference of each channel, weighed by trust, and the trust."""
+    """Sum over cells the relative difference of each channel, weighted by confidence, and the confidence."""
     H, W, C = there.shape
     for row in range(first, last):
-        for y in range(max(row * _CELL - above, 0), min((row + 1) * _CELL - above, H)):
+        for y in range(max(row * _CELL - offset, 0), min((row + 1) * _CELL - offset, H)):
             for x in range(W):
                 weight = trusted[y, x]
                 if not weight > 0:
                     continue
                 for c in range(C):
-                    own, other = here[y, x, c], there[y, x, c]
-                    sums[c, row, x // _CELL] += weight * ((other - own) / _light(other, own, exposure))
+                    centre, other = here[y, x, c], there[y, x, c]
+                    sums[c, row, x // _CELL] += weight * ((other - centre) / _light(other, centre, exposure))
                 sums[C, row, x // _CELL] += weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _take(
+def _subtract(
     first: int, last: int, there: Floats, here: Floats, trusted: Floats, exposure: np.float32, alike: Floats,
     change: Floats,
 ) -> None:  # fmt: skip
@@ -109,6 +95,6 @@ def _take(
                 continue
             share = np.float32(1) - alike[y, x] / trusted[y, x]
             for c in range(there.shape[2]):
-                own, other = here[y, x, c], there[y, x, c]
-                taken = share * change[y, x, c] * _light(other, own, exposure)
-                there[y, x, c] = max(other - taken, min(other, np.float32(0)))  # not below 0, but for what was
+                centre, other = here[y, x, c], there[y, x, c]
+                taken = share * change[y, x, c] * _light(other, centre, exposure)
+                there[y, x, c] = max(other - taken, min(other, np.float32(0)))  # below 0 only where it was

@@ -1,7 +1,7 @@
-"""The samples of a frame against a denoised picture of it: where their noise is small, the samples win.
+"""Corrections of a denoised picture by samples, where the noise of samples is smaller than the denoiser's error.
 
-A denoiser errs by more than the noise where there is next to none, or where it mistakes detail for noise. The samples
-of a window tell where: those of one frame are independent of those of another.
+A denoiser errs by more than the noise where there is next to no noise, or where it takes detail for noise. The samples
+of a window show where, as samples of one frame are independent of those of another.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from loops.parallel import run_bands
 from nlm.average import check_window
-from nlm.variance import gaussian_mean
+from nlm.variance import gaussian_mean, ratio, second_differences
 
 Floats = NDArray[np.float32]
 
@@ -29,7 +29,7 @@ _VARIANCES = 2.5
 _SPREAD = 300.0
 # Deviations of the Gaussians that errors are averaged with, pixels: over 200 pixels for what frames have in common, and
 # over 50 for what one frame shows alone.
-_SIGMA_SHARED, _SIGMA_OWN = 4.0, 2.0
+_SIGMA_SHARED, _SIGMA_CENTRE = 4.0, 2.0
 # Errors are relative to the light, which is the picture's mean over σ = 2 pixels plus this share of the exposure: in
 # the dark an error is seen by its size, and not by its ratio.
 _DARK = 0.3
@@ -56,48 +56,28 @@ _WARPED = np.float32(0.7)
 
 @dataclass(frozen=True)
 class SampleMean:
-    """The samples of the frames beside one, averaged at its pixels.
+    """Samples of neighbouring frames, averaged at the pixels of a frame."""
 
-    Attributes
-    ----------
-    mean : (H, W, 3) float32
-        Radiance; 0 where no frame is trusted.
-    frames : (H, W) float32
-        How many frames it is worth, (Σ c)² / Σ c², c the confidence; 0 where no frame is trusted.
-    trust : (H, W) float32
-        In [0, 1]: whether frames of a confidence of 1 together were averaged.
-    """
-
-    mean: Floats
-    frames: Floats
-    trust: Floats
+    mean: Floats  # (H, W, 3) radiance; 0 where no frame is trusted
+    frames: Floats  # (H, W) frames' worth of samples, (Σ c)² / Σ c², c the confidence; 0 where no frame is trusted
+    trust: Floats  # (H, W) in [0, 1]: 1 where the confidence of all frames adds up to 1
 
 
 def average_neighbours(
     estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats
 ) -> SampleMean:
-    """Average the samples of all frames of a window but its centre.
+    """Average the samples of all frames of a window except the centre.
 
     Parameters
     ----------
     estimates : (T, H, W, 3) float32
-        Denoised frames, aligned; with `residuals` None the noisy frames themselves. The centre is ``T // 2``.
+        Denoised, aligned; with `residuals` None the noisy frames.
     residuals : (T, H, W, 3) float32, optional
         Noisy frame minus estimate, aligned.
     confidence, geometry : (T, H, W) float32
-        At least 0: trust in each pixel of each frame, and what geometry alone trusts. Where only the light differs, a
-        frame tells the noise nevertheless.
+        Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
     modulation : (H, W, 3) float32
         Factor from the unit of the window to radiance.
-
-    Returns
-    -------
-    SampleMean
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other, or T is even.
     """
     weight = np.maximum(confidence, np.float32(_OTHER_LIGHT) * geometry)
     estimates, weight = check_window(estimates, weight, "confidence")
@@ -112,107 +92,92 @@ def average_neighbours(
 
 
 def blend_samples(
-    picture: Floats, noisy: Floats, sides: SampleMean, exposure: float, variance: Floats | None = None
+    picture: Floats, noisy: Floats, neighbours: SampleMean, exposure: float, variance: Floats | None = None
 ) -> Floats:
-    """Blend samples into a denoised picture, as far as they are certain that it is wrong.
+    """Blend samples into a denoised picture where the picture is wrong beyond doubt.
 
     Parameters
     ----------
     picture : (H, W, 3) float32
-        Denoised, linear, finite.
+        Denoised, finite.
     noisy : (H, W, 3) float32
         The frame as rendered, finite.
-    sides : SampleMean
-        The samples of the frames beside it.
+    neighbours : SampleMean
     exposure : float
-        Radiance of middle brightness; it scales with the picture.
     variance : (H, W, 3) float32, optional
-        Of `noisy`, where the renderer gives it; it is used where no frame beside is trusted.
+        Variance of `noisy` from the renderer, used where no neighbour is trusted.
 
     Returns
     -------
     (H, W, 3) float32
-        `noisy` where it has no noise, `picture` where the noise exceeds what both differ by.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other.
+        `noisy` where it has no noise, `picture` where the noise exceeds the difference of both.
 
     Notes
     -----
-    With p the picture, n the noisy frame and m the mean of the frames beside it, times K[n m] / K[m²] where the light
-    has changed, all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
+    With p the picture, n the noisy frame and m the mean of the neighbours, times K[n m] / K[m²] where the light has
+    changed, all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
 
         β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = K[((n − m)(m − p))²] / 4πσ²,
 
-    held to [0, 1]: the noise of n and that of m are independent, so that only what both show beyond p counts. Then p
-    becomes p + w (n − p), w = max(0, 1 − 2.5 K v / K (n − p)²): the shrinkage of James and Stein, with 2.5 times the
-    variance v = (n − m)² / (1 + 0.7 / frames). Where frames beside are not trusted v is the renderer's, or else 300
-    times what `spatial_variance` finds.
+    clamped to [0, 1]: the noise of n and that of m are independent, so that only differences from p that both show
+    count. Then p becomes p + w (n − p), w = max(0, 1 − 2.5 K v / K (n − p)²), the shrinkage of James and Stein, with v
+    = (n − m)² / (1 + 0.7 / frames). Where neighbours are not trusted v is the renderer's variance, or else 300 times
+    `spatial_variance`.
 
     References
     ----------
     Firmino, Frisvad and Jensen, Progressive Denoising of Monte Carlo Rendered Images, 2022, doi:10.1111/cgf.14454
     """
-    if not picture.shape == noisy.shape == sides.mean.shape:
+    if not picture.shape == noisy.shape == neighbours.mean.shape:
         raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
     # Radiance per unit of relative error.
     light = gaussian_mean(_gray(picture), 2.0) + np.float32(_DARK * exposure)
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
-    mean = sides.mean * _relative_light(noisy, sides, rate)[..., None]
+    mean = neighbours.mean * _relative_light(noisy, neighbours, rate)[..., None]
     sums = np.zeros((4, *light.shape), np.float32)
-    run_bands(_compare, len(light), picture, noisy, mean, sides.frames, sides.trust, rate, sums)
+    run_bands(_compare, len(light), picture, noisy, mean, neighbours.frames, neighbours.trust, rate, sums)
     together, squares, products, temporal = sums
     # Over as many pixels as a Gaussian averages, 1 / Σ weight².
     noise = gaussian_mean(products, _SIGMA_SHARED) / np.float32(4 * np.pi * _SIGMA_SHARED**2)
     found = gaussian_mean(together, _SIGMA_SHARED) - np.float32(_DEVIATIONS) * np.sqrt(noise)
-    shared = np.clip(_ratio(found, gaussian_mean(squares, _SIGMA_SHARED)), 0, 1) * sides.trust
+    shared = np.clip(ratio(found, gaussian_mean(squares, _SIGMA_SHARED)), 0, 1) * neighbours.trust
     blended = picture + shared[..., None] * (mean - picture)
     if variance is None:
         alone = np.float32(_SPREAD) * spatial_variance(noisy, blended, rate)
     else:
         alone = np.asarray(variance.sum(axis=-1) * np.square(rate), np.float32)
-    own = np.where(sides.trust >= 1, temporal, alone + sides.trust * (temporal - alone))
-    apart = np.square(np.clip((noisy - blended) * rate[..., None], -_LIMIT, _LIMIT)).sum(axis=-1)
-    apart, own = gaussian_mean(apart, _SIGMA_OWN), gaussian_mean(np.minimum(own, 3 * _LIMIT**2), _SIGMA_OWN)
-    share = np.clip(_ratio(apart - np.float32(_VARIANCES) * own, apart), 0, 1)
+    alone = np.where(neighbours.trust >= 1, temporal, alone + neighbours.trust * (temporal - alone))
+    error = np.square(np.clip((noisy - blended) * rate[..., None], -_LIMIT, _LIMIT)).sum(axis=-1)
+    error, noise = (gaussian_mean(x, _SIGMA_CENTRE) for x in (error, np.minimum(alone, 3 * _LIMIT**2)))
+    share = np.clip(ratio(error - np.float32(_VARIANCES) * noise, error), 0, 1)
     return np.asarray(blended + share[..., None] * (noisy - blended), np.float32)
 
 
-def _relative_light(noisy: Floats, sides: SampleMean, rate: Floats) -> Floats:
-    """The light of a frame over that of the frames beside it, (H, W): by least squares around each pixel."""
-    weight = np.square(rate) * sides.trust
+def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> Floats:
+    """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel."""
+    weight = np.square(rate) * neighbours.trust
     together, alone = (
-        gaussian_mean(np.einsum("yxc,yxc->yx", image, sides.mean) * weight, _SIGMA_SHARED)
-        for image in (noisy, sides.mean)
+        gaussian_mean(np.einsum("yxc,yxc->yx", image, neighbours.mean) * weight, _SIGMA_SHARED)
+        for image in (noisy, neighbours.mean)
     )
     return np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2)
 
 
 def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
-    """Variance of the noise of one frame, relative to the light, summed over channels.
+    """Variance (H, W) of a frame's noise, relative to the light, summed over channels.
+
+    The lesser of the high-pass energies of ``noisy`` and ``noisy − picture``: detail of the frame adds to the first,
+    detail that the picture has lost or invented to the second (Immerkær, as `nlm.variance.variance_from_residual`).
 
     Parameters
     ----------
     noisy, picture : (H, W, 3) float32
-        The frame as rendered, and a denoised picture of it.
     rate : (H, W) float32
         One over the light.
-
-    Returns
-    -------
-    (H, W) float32
-        The lesser of what `noisy` and ``noisy − picture`` have after a high-pass filter: detail of the frame adds to
-        the first, and detail that the picture has lost or invented to the second (Immerkær, as
-        `nlm.variance.variance_from_residual`).
     """
-    kernel = np.array([1, -2, 1], np.float32)
-    found = []
-    for image in (noisy, noisy - picture):
-        left = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101).reshape(image.shape)
-        found.append(gaussian_mean(np.square(left * rate[..., None]).sum(axis=-1) / np.float32(36), _SIGMA_SHARED))
-    return np.minimum(*found)
+    residuals = (second_differences(image) * rate[..., None] for image in (noisy, noisy - picture))
+    energies = (np.square(residual).sum(axis=-1) / np.float32(36) for residual in residuals)
+    return np.minimum(*(gaussian_mean(energy, _SIGMA_SHARED) for energy in energies))
 
 
 def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
@@ -221,28 +186,25 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     Parameters
     ----------
     picture : (H, W, 3) float32
-        Denoised, linear, finite.
+        Denoised, finite.
     noisy : (H, W, 3) float32
         The frame as rendered, fireflies included, finite: right in the mean.
     exposure : float
-        Radiance of middle brightness; it scales with the picture.
 
     Returns
     -------
     (H, W, 3) float32
-        The corrected picture; nowhere below 0 where the picture is not.
+        Nowhere below 0 where the picture is not.
 
-    Notes
-    -----
-    With K a Gaussian mean, a that of the picture in the mean over channels (of lamps four exposures count), l the
-    picture plus 5 % of a and 0.1 % of the exposure, u = 1 / max(l, a) and d = u (noisy − picture), of noisy − picture
-    at most 20 l, the picture becomes picture + s l K d / K(u l),
+    Notes ----- With K a Gaussian mean, a that of the picture in the mean over channels (highlights count as at most
+    four exposures), l the picture plus 5 % of a and 0.1 % of the exposure, u = 1 / max(l, a) and d = u (noisy −
+    picture), of noisy − picture at most 20 l, the picture becomes picture + s l K d / K(u l),
 
         s = max(0, 1 − k (1 + f / N) v / (K d)²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
 
     in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make the
-    noise: five fireflies tell neither a mean nor its variance. The weight u keeps the light of all pixels but those
-    much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
+    noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels but
+    those much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
     nothing around it. The means over σ = 48 pixels come first (k = 1, f = 3000), then those over 12 (8, 300).
     """
     for sigma, certain, few in _MEANS:
@@ -258,15 +220,15 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
         pixels = np.float32(min(4 * np.pi * sigma**2, square.size))
         noise, fourth = (_mean(power, sigma) for power in (square, np.square(square)))
-        unsure = np.float32(certain) * (1 + _ratio(np.float32(few) * fourth, pixels * np.square(noise)))
+        unsure = np.float32(certain) * (1 + ratio(np.float32(few) * fourth, pixels * np.square(noise)))
         known = np.square(mean).mean(axis=-1)
-        share = np.clip(_ratio(known - unsure * noise / pixels, known), 0, 1)
+        share = np.clip(ratio(known - unsure * noise / pixels, known), 0, 1)
         picture = np.maximum(picture + mean * (share * light / lit)[..., None], np.minimum(picture, 0))
     return np.asarray(picture, np.float32)
 
 
 def _mean(image: Floats, sigma: float) -> Floats:
-    """Gaussian mean around each pixel, of cells of σ / 6 pixels: nothing in it is smaller than a cell."""
+    """Gaussian mean around each pixel, on cells of σ / 6 pixels, which blur nothing that the mean keeps."""
     side, (height, width) = max(int(sigma / _CELLS), 1), image.shape
     whole = cv2.copyMakeBorder(image, 0, -height % side, 0, -width % side, cv2.BORDER_REFLECT)
     rows, columns = whole.shape[0] // side, whole.shape[1] // side
@@ -274,10 +236,6 @@ def _mean(image: Floats, sigma: float) -> Floats:
     mean = gaussian_mean(cells, sigma / side)
     spread = cv2.resize(mean, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
     return np.asarray(spread[:height, :width], np.float32)
-
-
-def _ratio(a: Floats, b: Floats) -> Floats:
-    return np.divide(a, b, out=np.zeros_like(b), where=b > 0)
 
 
 def _gray(image: Floats) -> Floats:
@@ -315,10 +273,10 @@ def _average(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
-    first: int, last: int, picture: Floats, noisy: Floats, sides: Floats, frames: Floats, trust: Floats, rate: Floats,
-    sums: Floats,
+    first: int, last: int, picture: Floats, noisy: Floats, neighbours: Floats, frames: Floats, trust: Floats,
+    rate: Floats, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum over channels, where sides are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
+    """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
     _, W, C = picture.shape
     for y in range(first, last):
         for x in range(W):
@@ -326,11 +284,11 @@ def _compare(
                 continue
             scale, product = rate[y, x], np.float32(0)
             for c in range(C):
-                own = min(max(scale * (noisy[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                side = min(max(scale * (sides[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                apart = min(max(scale * (noisy[y, x, c] - sides[y, x, c]), -_LIMIT), _LIMIT)
-                sums[0, y, x] += own * side
-                sums[1, y, x] += side * side
-                product += apart * side
-                sums[3, y, x] += apart * apart / (1 + _WARPED / frames[y, x])
+                n_p = min(max(scale * (noisy[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
+                m_p = min(max(scale * (neighbours[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
+                n_m = min(max(scale * (noisy[y, x, c] - neighbours[y, x, c]), -_LIMIT), _LIMIT)
+                sums[0, y, x] += n_p * m_p
+                sums[1, y, x] += m_p * m_p
+                product += n_m * m_p
+                sums[3, y, x] += n_m * n_m / (1 + _WARPED / frames[y, x])
             sums[2, y, x] = product * product

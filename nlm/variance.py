@@ -27,22 +27,12 @@ _RADIUS = 2
 
 
 def variance_from_halves(a: Floats, b: Floats) -> Floats:
-    """Variance of the mean of two independent half buffers.
+    """Variance (a − b)² / 4 of the mean of two independent half buffers: one degree of freedom, so smooth before use.
 
     Parameters
     ----------
     a, b : (H, W, C) float32
         The same picture twice, each with half of the samples.
-
-    Returns
-    -------
-    (H, W, C) float32
-        (a − b)² / 4: one degree of freedom per pixel, so smooth it before use.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ.
     """
     if a.shape != b.shape:
         raise ValueError(f"b: expected shape {a.shape} like a, got {b.shape}")
@@ -50,32 +40,25 @@ def variance_from_halves(a: Floats, b: Floats) -> Floats:
 
 
 def variance_from_window(window: Floats, confidence: Floats) -> Floats:
-    """Variance of the centre frame's pixels, from how much the aligned frames differ.
+    """Variance of the centre frame's pixels, smoothed, from the differences between aligned frames.
 
     Parameters
     ----------
     window : (T, H, W, C) float32
-        Aligned frames, finite, in any unit; the centre is ``T // 2``.
+        Finite.
     confidence : (T, H, W) float32
         In [0, 1].
 
     Returns
     -------
     (H, W, C) float32
-        Smoothed variance, in squared units.
+        In squared units.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other or T is even.
-
-    Notes
-    -----
-    (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the side frames;
-    then `smooth_variance`, which bounds what a single outlier contributes. Unlike the sample variance of
-    all frames this hardly depends on how much of their noise warping has taken from the side frames (which
-    halves the sample variance at half a pixel). With fewer than two side frames' worth of trust it
-    fades into `variance_from_residual`. Light that moves looks like noise; texture does, where the flow is wrong.
+    Notes ----- (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the neighbours; then
+    `smooth_variance`, which bounds the contribution of an outlier. Unlike the sample variance of all frames this hardly
+    depends on how much noise warping has removed from the neighbours (which halves the sample variance at half a
+    pixel). With fewer than two neighbours' worth of confidence the result fades into `variance_from_residual`. Moving
+    light counts as noise; so does texture where the flow is wrong.
     """
     window, confidence = check_window(window, confidence, "confidence")
     temporal, trust = _temporal_variance(window, confidence)
@@ -85,61 +68,49 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
 
 
 def _temporal_variance(window: Floats, confidence: Floats) -> tuple[Floats, Floats]:
-    """The variance that side frames tell, and in [0, 1] whether two of those are trusted."""
+    """Variance from the neighbours, and whether two of these are trusted, in [0, 1]."""
     deviation, trust = np.zeros(window.shape[1:], np.float32), np.zeros(window.shape[1:3], np.float32)
     run_bands(_centre_deviation, len(trust), window, confidence, deviation, trust)
     return smooth_variance(deviation), trust
 
 
 def _fade(temporal: Floats, spatial: Floats, trust: Floats) -> Floats:
+    """Blend from spatial to temporal variance by `trust`."""
     # Not the sum where trust is 1: it would round otherwise in a part of a frame than in the whole.
     return np.where(trust[..., None] >= 1, temporal, spatial + trust[..., None] * (temporal - spatial))
 
 
 def variance_from_residual(image: Floats) -> Floats:
-    """Variance of the noise in a single image, from what is left of it after a high-pass filter.
+    """Variance (H, W, C) of the noise in a single finite image, smoothed; fine texture counts as noise.
+
+    The square of the second difference in x and y, blind to planes and to straight edges along an axis, over the sum of
+    its squared coefficients, 36 (Immerkær, Fast noise variance estimation, 1996, doi:10.1006/cviu.1996.0060).
+    """
+    return smooth_variance(np.square(second_differences(image)) * np.float32(1 / 36))
+
+
+def second_differences(image: Floats) -> Floats:
+    """Filter (H, W, C) by [1 −2 1]ᵀ [1 −2 1], which multiplies the variance of white noise by 36."""
+    kernel = np.array([1, -2, 1], np.float32)
+    found = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(found, np.float32).reshape(image.shape)
+
+
+def ratio(a: Floats, b: Floats) -> Floats:
+    """Return a / b, 0 where b is not positive.
 
     Parameters
     ----------
-    image : (H, W, C) float32
-        Finite, in any unit.
-
-    Returns
-    -------
-    (H, W, C) float32
-        Smoothed variance, in squared units. Fine texture counts as noise.
-
-    Notes
-    -----
-    The square of the difference of two Laplacians, which no plane and no straight edge along an axis passes, over
-    the sum of the squares of its coefficients, 36.
-
-    References
-    ----------
-    Immerkær, Fast noise variance estimation, 1996, doi:10.1006/cviu.1996.0060
+    a, b : (H, W) float32
     """
-    kernel = np.array([1, -2, 1], np.float32)
-    residual = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-    return smooth_variance(np.square(residual.reshape(image.shape)) * np.float32(1 / 36))
+    return np.divide(a, b, out=np.zeros_like(b), where=b > 0)
 
 
 def smooth_variance(variance: Floats) -> Floats:
-    """Box-filter a variance of few degrees of freedom, bounding what a single pixel contributes.
+    """Means over 5×5 pixels of a finite variance (H, W, C) of few degrees of freedom, with outliers cut.
 
-    Parameters
-    ----------
-    variance : (H, W, C) float32
-        At least 0, finite.
-
-    Returns
-    -------
-    (H, W, C) float32
-        Means of 5×5 pixels.
-
-    Notes
-    -----
-    A pixel is cut at 16 times the 5×5 median of the 3×3 means. These keep the level of noise where most
-    pixels happen to be 0, and an isolated outlier touches fewer than half of them.
+    A pixel is cut at 16 times the 5×5 median of the 3×3 means. These means keep the level of noise where most pixels
+    happen to be 0, and an isolated outlier touches fewer than half of them.
     """
     # Squares of more than 1e18 overflow, and an infinity would spoil the filters' running sums.
     variance = np.minimum(variance, np.float32(1e36))
@@ -153,31 +124,24 @@ def smooth_variance(variance: Floats) -> Floats:
 
 
 def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
-    """Take the noise out of the centre frame's guides: albedo and normals under depth of field or behind glass.
+    """Denoise the centre frame's guides: albedo and normals under depth of field or behind glass.
 
     Parameters
     ----------
     guides : (T, H, W, F) float32
-        Aligned guides, finite, of about unit range.
+        Aligned, finite, of about unit range.
     confidence : (T, H, W) float32
         In [0, 1].
 
     Returns
     -------
     (H, W, F) float32
-        The centre's guides. Where they hold no noise they are what they were, to about 1e-3.
+        Guides without noise come back as they are, to about 1e-3.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit each other or T is even.
-
-    Notes
-    -----
-    Non-local means over 3×3 pixels and all frames, steered by the guides' own variance: the lesser of that between
-    frames and that of the spatial residual, for noise shows in both, while texture shows only in the
-    second, and texture resampled by warping mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles
-    of the picture without noise are left out.
+    Notes ----- Non-local means over 3×3 pixels and all frames. The variance is the lesser of that between frames and
+    that of the spatial residual: noise shows in both, texture only in the second, and texture resampled by warping
+    mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles of the picture without noise are left
+    out.
     """
     guides, confidence = check_window(guides, confidence, "confidence")
     temporal, trust = _temporal_variance(guides, confidence)
@@ -189,19 +153,16 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
 
 
 def gaussian_mean(image: Floats, sigma: float) -> Floats:
-    """Average around each pixel, weighed by a Gaussian that ends at three deviations.
+    """Mean (H, W) with Gaussian weights, which end at three deviations; the image is mirrored at its borders.
+
+    The squares of the weights are those of a Gaussian narrower by √2, over 4πσ².
 
     Parameters
     ----------
     image : (H, W) float32
-        In any unit, finite; mirrored beyond its borders.
+        Finite.
     sigma : float
         Pixels.
-
-    Returns
-    -------
-    (H, W) float32
-        The mean. The squares of its weights are those of a Gaussian narrower by √2, over 4πσ².
     """
     side = 2 * int(3 * sigma) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
@@ -211,7 +172,7 @@ def gaussian_mean(image: Floats, sigma: float) -> Floats:
 def _centre_deviation(
     first: int, last: int, window: Floats, confidence: Floats, deviation: Floats, trust: Floats
 ) -> None:
-    """Squared deviation of the centre from the side frames, and in [0, 1] whether two of those are trusted."""
+    """Squared deviation of the centre from the neighbours, and in [0, 1] whether two of these are trusted."""
     T, _, W, C = window.shape
     centre = T // 2
     for y in range(first, last):
