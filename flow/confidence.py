@@ -1,4 +1,4 @@
-"""How far a warped pixel may be trusted, and what stands in for it where it may not."""
+"""Confidence of warped pixels, and the mix with the centre where confidence is low."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def estimate_confidence(
     warped_normal: np.ndarray | None = None,
     first_row: int = 0,
 ) -> np.ndarray:
-    """Estimate how far each pixel of a warped neighbour shows what the centre shows.
+    """Estimate how far each pixel of a warped neighbour shows the same as the centre.
 
     Parameters
     ----------
     flow : (H, W, 2) float array
         Pixels, finite, centre to neighbour.
     inside : (H, W) bool array
-        As `flow.warp.warp` gives it; false also where the vector, or a pixel it leads to, is no good.
+        From `flow.warp.warp`; False also where the vector, or a pixel it leads to, is invalid.
     reverse : (H, W, 2) float array, optional
-        Pixels, neighbour to centre. Of the whole frame, also where all else is of some of its rows.
+        Pixels, neighbour to centre; always of the whole frame, also where the other arrays are a part of its rows.
     albedo, warped_albedo : (H, W) or (H, W, C) float array, optional
-        Of the centre and of the warped neighbour. One may come with the other only; so for the normals.
+        Of the centre and the warped neighbour, both or none; likewise the normals.
     normal, warped_normal : (H, W, 3) float array, optional
         In any one space, of any length, 0 where there is no surface.
     first_row : int
@@ -44,18 +44,11 @@ def estimate_confidence(
     Returns
     -------
     (H, W) float32 array
-        In [0, 1]. Guides that are not finite give 0.
+        In [0, 1]. Non-finite guides give 0.
 
-    Raises
-    ------
-    ValueError
-        If half a pair is given, or shapes do not agree.
-
-    Notes
-    -----
-    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2),
-    then the minimum of 3 x 3 pixels, because what surrounds an occlusion is mixed into its border. Δa is divided by
-    the albedo where that is above 1. What moves without the geometry (shadows, reflections) is invisible here.
+    Notes ----- inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2), then
+    the minimum of 3 x 3 pixels, because the border of an occlusion holds a mix. Δa is divided by the albedo where that
+    is above 1. Shadows and reflections, which move without the geometry, are not detected.
 
     References
     ----------
@@ -89,7 +82,7 @@ def _agree(
     first: int, last: int, inside: np.ndarray, flow: np.ndarray, reverse: np.ndarray, albedo: np.ndarray,
     warped_albedo: np.ndarray, normal: np.ndarray, warped_normal: np.ndarray, first_row: int, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Multiply how far motion, albedo and normal agree; layers of no size are left out."""
+    """Multiply the agreement of motion, albedo and normal; layers of size 0 are left out."""
     one = np.float32(1)
     for y in range(first, last):
         for x in range(out.shape[1]):
@@ -139,27 +132,15 @@ def _agree(
 def mix_centre(
     warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray | None = None
 ) -> np.ndarray:
-    """Put the centre in the place of a warped neighbour where that cannot be trusted.
+    """Return c · warped + (1 − c) · centre as float32: exactly the centre where c is 0, whatever `warped` holds there.
 
     Parameters
     ----------
     warped, centre : (H, W) or (H, W, C) float array
-        In any unit.
     confidence : (H, W) float array
         In [0, 1].
     out : float32 array, optional
-        Contiguous, of the shape of `centre`: where the result is written. Without: a new one.
-
-    Returns
-    -------
-    float32 array
-        Of the shape of `centre`: ``c · warped + (1 − c) · centre``, exactly the centre where c is 0, whatever `warped`
-        holds there.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not agree.
+        Contiguous, for the result.
     """
     if warped.shape != centre.shape or confidence.shape != centre.shape[:2]:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The pictures that flows are refined on: comparable between frames, and little disturbed by noise."""
+"""Guides for optical flow: planes comparable between frames, and little disturbed by noise."""
 
 from __future__ import annotations
 
@@ -21,17 +21,8 @@ def _luminance(image: np.ndarray) -> np.ndarray:
 
 
 def median_luminance(color: np.ndarray) -> float:
-    """Median of the positive luminances of a picture.
-
-    Parameters
-    ----------
-    color : (H, W, 3) float array
-        Linear radiance; what is not finite counts as 0, or as very bright.
-
-    Returns
-    -------
-    float
-        Positive; 1 where no luminance is.
+    """Median of the positive luminances of linear radiance (H, W, 3); 1 without any. NaN counts as 0, Inf as very
+    bright.
     """
     luminance = _luminance(color)
     positive = luminance[luminance > 0]
@@ -39,24 +30,14 @@ def median_luminance(color: np.ndarray) -> float:
 
 
 def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Luminance of a picture on Reinhard's curve, ``L / (L + exposure)``.
+    """Luminance on Reinhard's curve, L / (L + exposure), (H, W) float32 in [0, 1].
 
     Parameters
     ----------
     color : (H, W, 3) float array
         Linear radiance. Negative and NaN count as 0, Inf as white.
     exposure : float
-        The radiance that maps to 0.5.
-
-    Returns
-    -------
-    (H, W) float32 array
-        In [0, 1].
-
-    Raises
-    ------
-    ValueError
-        If `exposure` is not positive.
+        The radiance that maps to 0.5, positive.
     """
     if not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a positive number")
@@ -65,31 +46,18 @@ def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
 
 
 def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
-    """Estimate the local noise of an image from the image alone.
+    """Estimate the local noise of an image from the image alone: standard deviation, float32, of its shape and unit.
 
     Parameters
     ----------
     image : (H, W) or (H, W, C) float array
-        Finite, in any unit.
+        Finite.
     spacing : int
-        Distance, pixels, at which the noise is independent: 1, or the diameter of the filter it went through.
+        Distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter.
 
-    Returns
-    -------
-    float32 array
-        Standard deviation, of the shape and unit of `image`.
-
-    Raises
-    ------
-    ValueError
-        If `image` has another number of axes, or no pixel.
-
-    Notes
-    -----
-    The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, is blind to slopes and to
-    straight edges and has the noise's own deviation. Its magnitude is averaged over 15 x 15 pixels by the square
-    of the mean root, to which outliers (corners, fireflies) add little. Texture of the size of a pixel counts as
-    noise.
+    Notes ----- The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, is blind to slopes and
+    to straight edges and has the noise's own deviation. Its magnitude is averaged over 15 x 15 pixels by the square of
+    the mean root, to which outliers (corners, fireflies) add little. Texture of the size of a pixel counts as noise.
 
     References
     ----------
@@ -106,53 +74,27 @@ def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
 
 
 class Guide(NamedTuple):
-    """What flows are refined on, of one frame.
+    """Guide planes of one frame."""
 
-    Attributes
-    ----------
-    planes : (H, W, G) float array
-        In [0, 1], and little disturbed by noise.
-    noise : (H, W, G) float array
-        The standard deviation of what noise is left in each.
-    """
-
-    planes: np.ndarray
-    noise: np.ndarray
+    planes: np.ndarray  # (H, W, G) in [0, 1]
+    noise: np.ndarray  # (H, W, G) standard deviation of the remaining noise
 
 
 class GuidePair(NamedTuple):
-    """The guides of two frames, of equal exposure, and their noise; see `pair_guides`.
+    """Guides of two frames of equal exposure, finite, from `pair_guides`."""
 
-    Attributes
-    ----------
-    centre, neighbour : (H, W, G) float32 array
-        In [0, 1], finite.
-    noise : (H, W, G) float32 array
-        The greater standard deviation of the two.
-    """
-
-    centre: np.ndarray
+    centre: np.ndarray  # (H, W, G) float32 in [0, 1]
     neighbour: np.ndarray
-    noise: np.ndarray
+    noise: np.ndarray  # the greater standard deviation of the two
 
 
 def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
-    """Put the guides of two frames together.
+    """Combine the guides of two frames for `flow.tvl1` and `flow.selection`; the greater noise counts.
 
     Parameters
     ----------
     centre, neighbour : Guide
-        Of one shape. Planes that are not finite are 0 (+Inf: 1).
-
-    Returns
-    -------
-    GuidePair
-        For `flow.tvl1` and `flow.selection`.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not agree, or are none of (H, W, G).
+        Of one shape. Non-finite values become 0 (+Inf: 1).
     """
     shape = centre.planes.shape
     if centre.planes.ndim != 3 or centre.planes.size == 0:
@@ -169,36 +111,25 @@ def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
 
 
 def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure: float) -> Guide:
-    """Make what flows are refined on: tone-mapped luminance, smoothed within its surfaces, and albedo.
+    """Make the guide of a frame: tone-mapped luminance, smoothed within its surfaces, and albedo.
 
     Parameters
     ----------
     color : (H, W, 3) float array
         Linear radiance. Negative and NaN count as 0, Inf as white.
     albedo : (H, W, 3) float array, optional
-        At least 0. It steers the smoothing, and is a guide of its own. Without one the luminance steers itself.
+        At least 0. It steers the smoothing, and is a guide plane of its own; without albedo the luminance steers
+        itself.
     exposure : float
-        The radiance that maps to 0.5, positive: one value for both frames of a pair, or their guides differ in
-        brightness.
+        The radiance that maps to 0.5, positive: one value for both frames of a pair.
 
     Returns
     -------
     Guide
-        Luminance, and the albedo's where there is an albedo. The same for ``a * color`` and ``a * exposure``.
+        One plane, or two with albedo. The same for ``a * color`` and ``a * exposure``.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not agree, or the exposure is not positive.
-
-    Notes
-    -----
-    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided filter over
-    5 x 5 pixels.
-
-    References
-    ----------
-    He, Sun, Tang: Guided image filtering. 2013. doi:10.1109/TPAMI.2012.213
+    Notes ----- Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided
+    filter over 5 x 5 pixels (He, Sun, Tang: Guided image filtering. 2013. doi:10.1109/TPAMI.2012.213).
     """
     if color.ndim != 3 or color.shape[2] != 3:
         raise ValueError(f"color has shape {color.shape}, expected (H, W, 3)")
@@ -215,7 +146,7 @@ def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure:
 
 
 def smooth_tones(tone: np.ndarray, steer: np.ndarray | None = None) -> Guide:
-    """Smooth tone-mapped luminance within the surfaces of an image that steers, or of itself.
+    """Smooth tone-mapped luminance within the surfaces of a steering image, or of itself: a guide of one plane.
 
     Parameters
     ----------
@@ -223,11 +154,6 @@ def smooth_tones(tone: np.ndarray, steer: np.ndarray | None = None) -> Guide:
         In [0, 1].
     steer : (H, W, up to 3) float32 array, optional
         Of a range of about 1.
-
-    Returns
-    -------
-    Guide
-        Of one plane.
     """
     # Contrasts of the steering image below the root of this are smoothed over. A picture's own noise is strong.
     tolerance = 1e-2 if steer is None else 1e-3

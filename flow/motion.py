@@ -1,4 +1,4 @@
-"""The renderer's motion vectors: into one convention, composed, inverted, checked."""
+"""Renderers' motion vectors: converted into one convention, composed, inverted, checked."""
 
 from __future__ import annotations
 
@@ -36,43 +36,21 @@ ENCODINGS = {
 
 @dataclass(frozen=True)
 class MotionConvention:
-    """What a renderer means by its motion vectors.
-
-    Attributes
-    ----------
-    direction : str
-        A key of `DIRECTIONS`.
-    unit : str
-        A key of `UNITS`.
-    y : str
-        A key of `VERTICAL`.
-    scale : float
-        What vectors are multiplied by, not 0: -1 where they point the other way, 2 where they span half a frame (a
-        shutter of 180 degrees).
-    offset : float
-        What is added to each decoded component before that, where the still is not 0.
-    encoding : str
-        A key of `ENCODINGS`.
-    premultiplied : bool
-        Whether they are multiplied by alpha, by which whoever has both divides them before anything else.
+    """The meaning of a renderer's motion vectors: v = scale · unit · (decode(c) + offset), y turned to point down.
 
     Raises
     ------
     ValueError
         If a word is unknown or a number is not finite.
-
-    Notes
-    -----
-    v = scale · unit · (decode(c) + offset), y turned to point down.
     """
 
-    direction: str = "previous"
-    unit: str = "pixels"
-    y: str = "down"
-    scale: float = 1.0
-    offset: float = 0.0
-    encoding: str = "plain"
-    premultiplied: bool = False
+    direction: str = "previous"  # a key of `DIRECTIONS`
+    unit: str = "pixels"  # a key of `UNITS`
+    y: str = "down"  # a key of `VERTICAL`
+    scale: float = 1.0  # not 0: -1 where vectors point the other way, 2 where they span half a frame (180° shutter)
+    offset: float = 0.0  # added to each decoded component, where no motion is not 0
+    encoding: str = "plain"  # a key of `ENCODINGS`
+    premultiplied: bool = False  # by alpha; a caller that has both divides before anything else
 
     def __post_init__(self) -> None:
         words = {"direction": DIRECTIONS, "unit": UNITS, "y": VERTICAL, "encoding": ENCODINGS}
@@ -95,18 +73,18 @@ class MotionConvention:
 
     @property
     def channels(self) -> int:
-        """How many channels the vectors have at least."""
+        """Least number of channels of the vectors."""
         return (3 if self.encoding == "magnitude" else 2) * (2 if self.pair else 1)
 
     def factors(self, resolution: tuple[int, int]) -> tuple[float, float]:
-        """What decoded vectors are multiplied by to be pixels, x right and y down, in a picture of height and width."""
+        """Factors from decoded vectors to pixels, x right and y down, in a picture of height and width."""
         height, width = resolution
         x, y = {"pixels": (1, 1), "screen": (width, width)}.get(self.unit, (width, height))
         scale = self.scale / 2 if self.unit == "half-ndc" else self.scale
         return scale * x, scale * (y if self.y == "down" else -y)
 
     def __str__(self) -> str:
-        """Say it in the words of `--motion`, without what is as always."""
+        """Format in the words of `--motion`, without default values."""
         said = [self.direction, self.unit, f"y-{self.y}"]
         said += [] if self.encoding == "plain" else [self.encoding]
         said += [f"{name}={getattr(self, name):.6g}" for name in ("scale", "offset") if self._differs(name)]
@@ -122,7 +100,7 @@ CYCLES = MotionConvention("cycles", y="up")
 
 
 class Vectors(NamedTuple):
-    """A flow (H, W, 2), pixels, and where it is known (H, W); it is 0 where it is not."""
+    """A flow (H, W, 2), pixels, and its validity (H, W); the flow is 0 where it is invalid."""
 
     flow: np.ndarray
     valid: np.ndarray
@@ -138,22 +116,21 @@ class Motion(NamedTuple):
 def normalize_motion(
     vectors: np.ndarray, convention: MotionConvention, *, resolution: tuple[int, int] | None = None
 ) -> Motion:
-    """Turn a renderer's motion vectors into flows to the previous and to the next frame.
+    """Convert a renderer's motion vectors into flows to the previous and to the next frame.
 
     Parameters
     ----------
     vectors : (H, W, C) array of float
-        As the renderer wrote them, C at least `convention.channels`; what is beyond is not looked at.
+        As rendered, C at least `convention.channels`; further channels are ignored.
     convention : MotionConvention
-        What they mean.
     resolution : (int, int), optional
-        Height and width, pixels, of the whole picture, which NDC units are fractions of. Missing: those of `vectors`.
+        Height and width, pixels, of the whole picture, the base of NDC units; default: those of `vectors`.
 
     Returns
     -------
     Motion
-        Flows (H, W, 2) float32, pixels, x right then y down, and masks (H, W) bool, one of them at least. Vectors that
-        are NaN, infinite, or longer than `ABSURD_LENGTH` in a component are 0 in the flow and False in the mask.
+        At least one flow (H, W, 2) float32, pixels, x right then y down. Vectors that are NaN, infinite, or longer than
+        `ABSURD_LENGTH` in a component are invalid.
 
     Raises
     ------
@@ -168,19 +145,14 @@ def normalize_motion(
 
 
 def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Take a renderer's motion vectors apart, in the unit, the scale and with the y that they have.
+    """Decode motion vectors into two-channel flows to the previous and the next frame, without unit, scale and y.
 
     Parameters
     ----------
     vectors : (H, W, C) array of float
-        As the renderer wrote them, C at least `convention.channels`.
+        As rendered, C at least `convention.channels`.
     convention : MotionConvention
-        What they mean; its unit, y and scale are not applied.
-
-    Returns
-    -------
-    to_previous, to_next : (H, W, 2) array of float32 or None
-        `MotionConvention.factors` makes pixels of both.
+        `MotionConvention.factors` makes pixels of the result.
     """
     size = convention.channels // (2 if convention.pair else 1)
     first = _decode(vectors[..., :size], convention)
@@ -205,7 +177,7 @@ def _decode(vectors: np.ndarray, convention: MotionConvention) -> np.ndarray:
 
 
 def _to_pixels(flow: np.ndarray, unit: np.ndarray) -> Vectors:
-    """Vectors in pixels, in place; 0 and False where they are not finite or absurdly long."""
+    """Convert to pixels, in place; 0 and False where a vector is not finite or absurdly long."""
     with np.errstate(over="ignore", invalid="ignore"):
         flow *= unit
     # Written so that NaN compares false; by planes, which is faster than over so short an axis.
@@ -221,29 +193,21 @@ def compose_flow(
     first_valid: np.ndarray | None = None,
     second_valid: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chain the flow from t to t' with that from t' to t'', giving the flow from t to t''.
+    """Chain the flow from t to t' with that from t' to t'': flow and validity from t to t''.
 
     Parameters
     ----------
     first, second : (H, W, 2) array of float
         Finite, pixels; `second` belongs to the frame that `first` points to.
     first_valid, second_valid : (H, W) array of bool, optional
-        Missing: all True.
+        Default: all True.
 
     Returns
     -------
     flow : (H, W, 2) array of float32
+        f₂(x) = f₁(x) + f₁'(x + f₁(x)), f₁' sampled bilinearly, with its edge value outside the frame.
     valid : (H, W) array of bool
-        `first` is valid, lands in the frame, and every vector of `second` it mixes is valid.
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree.
-
-    Notes
-    -----
-    f₂(x) = f₁(x) + f₁'(x + f₁(x)), f₁' sampled bilinearly, with its edge value outside the frame.
+        `first` is valid, lands in the frame, and every sampled vector of `second` is valid.
     """
     if first.shape != second.shape:
         raise ValueError(f"first has shape {first.shape}, expected that of second, {second.shape}")
@@ -260,6 +224,9 @@ def compose_flow(
 def _splat(
     flow: np.ndarray, valid: np.ndarray, depth: np.ndarray, nearest: np.ndarray, out: np.ndarray, weight: np.ndarray
 ) -> None:
+    """Splat the reversed vectors: first the nearest depth of each pixel, then the mean of the vectors at about that
+    depth.
+    """
     height, width = valid.shape
     # First the nearest depth that reaches each pixel, then the mean of what lies at about that depth.
     for accumulate in (False, True):
@@ -289,10 +256,10 @@ def _splat(
 def invert_flow(
     flow: np.ndarray, *, valid: np.ndarray | None = None, depth: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn the flow from frame b to frame a into that from a to b, by splatting.
+    """Invert the flow from frame b to frame a by splatting: flow and validity from a to b.
 
-    The vectors to the next frame, where a renderer gives only those to the previous one, are
-    `invert_flow(the next frame's to_previous)`: it alone knows where each of its pixels came from.
+    Where a renderer gives only vectors to the previous frame, those to the next frame are `invert_flow(the next frame's
+    to_previous)`.
 
     Parameters
     ----------
@@ -301,16 +268,15 @@ def invert_flow(
     valid : (H, W) array of bool, optional
         Of frame b; invalid vectors are left out.
     depth : (H, W) array of float, optional
-        Above 0, of frame b, smaller is nearer. Where several pixels arrive at one place the nearest
-        wins. Without it the fastest does: what moves most in the picture tends to be in front.
+        Above 0, of frame b, smaller is nearer. Of several pixels that arrive at one place the nearest wins; without
+        depth the fastest, as fast objects tend to be in front.
 
     Returns
     -------
     inverse : (H, W, 2) array of float32
-        Of frame a. Where nothing arrives (hidden in b), the mean of the neighbours where
-        there are some within two pixels, else 0.
+        Of frame a. Where nothing arrives (hidden in b), the mean of the neighbours within two pixels, else 0.
     valid : (H, W) array of bool
-        Something arrived.
+        True where a vector arrived.
     """
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
@@ -338,20 +304,15 @@ def invert_flow(
 
 
 def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: int = 0) -> np.ndarray:
-    """Measure how far from its start a pixel ends when it goes there and back.
+    """Measure the distance from start to end of a round trip, (H, W) float32, pixels: |f(x) + r(x + f(x))|.
 
     Parameters
     ----------
     flow, reverse : (H, W, 2) array of float
-        Pixels, finite: centre to neighbour, and neighbour to centre. `flow` may be of some of the
-        rows only.
+        Pixels, finite: centre to neighbour, possibly of some rows only, and back. Outside the frame r has its edge
+        value.
     first_row : int
         The frame's row that the first row of `flow` belongs to.
-
-    Returns
-    -------
-    (H, W) array of float32
-        Pixels: |f(x) + r(x + f(x))|; outside the frame r has its edge value.
     """
     loop, _ = warp(reverse, flow, first_row=first_row)
     loop += flow

@@ -1,4 +1,4 @@
-"""The choice, pixel by pixel, of the flow that explains the pictures."""
+"""Choice, pixel by pixel, of the flow that explains the pictures."""
 
 from __future__ import annotations
 
@@ -21,42 +21,34 @@ _BOX, _WIDE_BOX = 9, 37
 def select_flow(
     candidates: Sequence[np.ndarray], guides: GuidePair, *, visible: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Take for each pixel the flow that explains the guides best, the first unless another is clearly better.
+    """Select for each pixel the flow that explains the guides best: the first unless another is clearly better.
 
     Parameters
     ----------
     candidates : sequence of (H, W, 2) float array
         Flows, pixels, finite; the renderer's vectors first.
     guides : GuidePair
-        From `flow.guide.pair_guides`.
     visible : (H, W) bool array, optional
-        False where a pixel is known to be hidden in the neighbour (a forward-backward error of several pixels), so
-        that no match there means anything.
+        False where a pixel is hidden in the neighbour (a forward-backward error of several pixels): no match counts
+        there.
 
     Returns
     -------
     flow : (H, W, 2) float32 array
         Pixels.
     choice : (H, W) uint8 array
-        Index of the candidate taken.
+        Index of the selected candidate.
 
-    Raises
-    ------
-    ValueError
-        If there is no candidate, or shapes do not agree.
-
-    Notes
-    -----
-    Error: e = min(5, Σ_g |I₁(x + f) − I₀(x)| / (σ_g + 1/255)), mean over boxes of 9 x 9 pixels. A noisy guide counts
-    for little, a difference that 8 bits would not show for nothing, and one pixel (an edge, something uncovered) for no
-    more than five deviations. Candidate i beats j where e_i < 0.85 e_j − 3 s / 9, with s = Σ_g σ_g / (σ_g + 1/255):
+    Notes ----- Error: e = min(5, Σ_g |I₁(x + f) − I₀(x)| / (σ_g + 1/255)), mean over boxes of 9 x 9 pixels. A noisy
+    guide counts for little, a difference below one step of 8 bits for nothing, and one pixel (an edge, a disocclusion)
+    for at most five deviations. Candidate i beats j where e_i < 0.85 e_j − 3 s / 9, with s = Σ_g σ_g / (σ_g + 1/255):
     means over 81 noisy pixels differ by about s / 9 by chance. Where a candidate leaves the frame there is no evidence.
 
-    The incumbent is the first candidate, and keeps every pixel where nothing beats it. Only if another one, over
-    boxes of four times the size, beats it on two fifths of the frame, and three times as often as it is beaten,
-    are the given vectors wrong as such (noisy, say), and that one is the incumbent. With an albedo among the
-    guides, the refined flow beat exact vectors on 0 to 3 % of the pixels of three rendered shots, vectors
-    perturbed by 1.2 px on 47 to 88 %. (On noisy luminance alone it was 8 to 70 %: there it may not be enough.)
+    The incumbent is the first candidate, and keeps every pixel where nothing beats it. Another candidate becomes the
+    incumbent if, over boxes of 37 x 37 pixels, it beats the first on two fifths of the frame, and three times as often
+    as it is beaten: then the given vectors are wrong as such. With an albedo among the guides, the refined flow beat
+    exact vectors on 0 to 3 % of the pixels of three rendered shots, vectors perturbed by 1.2 px on 47 to 88 %; on noisy
+    luminance alone on 8 to 70 %, where this rule may not be enough.
     """
     if not candidates:
         raise ValueError("candidates is empty, expected at least one flow")

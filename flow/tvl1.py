@@ -1,4 +1,4 @@
-"""TV-L1 optical flow: the refinement of a given flow, and a flow from the pictures alone."""
+"""TV-L1 optical flow: refinement of a given flow, and a flow from the pictures alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from flow.guide import GuidePair
+from flow.guide import GuidePair, pair_guides, smooth_tones
 from flow.selection import select_flow
 from flow.warp import interpolate, locate, weigh
 
@@ -25,17 +25,19 @@ _BLUR = 0.8
 # it 99 of 100 vectors are within 0.04 px of those of a whole frame, with half of it within 0.4. Where more than this
 # share is called for, rims would cost what the tiles save.
 _TILE, _RIM, _MOST_TILES = 128, 32, 0.5
+# `rough_flow` works on pictures of at most so many pixels.
+_ROUGH_PIXELS = 2**17
 
 
 def refine_flow(
     guides: GuidePair, start: np.ndarray, *, scales: int = 3, warps: int = 3, iterations: int = 30
 ) -> np.ndarray:
-    """Refine a flow by TV-L1 from coarse to fine, where it then explains better what the guides show.
+    """Refine a flow by TV-L1 from coarse to fine, where the result explains the guides better.
 
     Parameters
     ----------
     guides : GuidePair
-        From `flow.guide.pair_guides`. Their noise weakens the data term where a gradient is no stronger than it.
+        Their noise weakens the data term where a gradient is no stronger than the noise.
     start : (H, W, 2) float array
         Pixels; vectors that are not finite, or longer than the frame, start from 0.
     scales : int
@@ -48,24 +50,16 @@ def refine_flow(
     (H, W, 2) float32 array
         Finite, pixels.
 
-    Raises
-    ------
-    ValueError
-        If shapes do not agree, or a count is below 1.
+    Notes ----- f = b + d, where b is `start` smoothed within the edges of the guides, and d minimises λ Σ_g w_g |I₁(x +
+    b + d) − I₀(x)| + |∇d₁| + |∇d₂| by alternating a thresholding and a dual step; the thresholding steps of several
+    guides follow one another. Areas without structure (flat walls, the direction along an edge) keep the renderer's
+    motion, which plain TV-L1, smoothing f, would flatten: from exact vectors, 0.47 px of error against 1.5 on a
+    rendered shot with a turning object. w_g = |∇I|² / (|∇I|² + σ_g²). Detail of `start` finer than b is lost: run
+    `flow.selection.select_flow` afterwards.
 
-    Notes
-    -----
-    The finest scale, three quarters of the work, is solved on tiles of 128 x 128 pixels: those in which the next
-    coarser one has found a pixel that `flow.selection.select_flow` takes from it. The others keep the start. With more
-    than half of them called for, or one scale, all of the frame is solved.
-
-    f = b + d, where b is `start` smoothed within the edges of the guides, and d minimises
-    λ Σ_g w_g |I₁(x + b + d) − I₀(x)| + |∇d₁| + |∇d₂| by alternating a thresholding and a dual step; with several
-    guides their thresholding steps are taken one after the other. So what the guides do not show (flat walls, the
-    direction along an edge) keeps the motion that the renderer gave it, which plain TV-L1, smoothing f, would
-    flatten: from exact vectors, 0.47 px of error against 1.5 on a rendered shot with a turning object.
-    w_g = |∇I|² / (|∇I|² + σ_g²).
-    Detail of `start` finer than b is lost: choose with `flow.selection.select_flow` afterwards.
+    The finest scale, three quarters of the work, is solved on tiles of 128 x 128 pixels: those where the next coarser
+    one has a pixel that `select_flow` selects. Other tiles keep the start. If more than half of the tiles are needed,
+    or with one scale, the whole frame is solved.
 
     References
     ----------
@@ -109,25 +103,11 @@ def refine_flow(
 
 
 def dense_flow(guides: GuidePair) -> np.ndarray:
-    """Estimate the flow from the pictures alone, for renderers that give no vectors.
+    """Estimate the flow (H, W, 2), pixels, from the guides alone, for renderers without vectors.
 
-    Parameters
-    ----------
-    guides : GuidePair
-        As for `refine_flow`; of several guides the last, the least noisy, starts the search.
-
-    Returns
-    -------
-    (H, W, 2) float32 array
-        Pixels.
-
-    Notes
-    -----
-    Dense inverse search on 8 bits finds the displacement; TV-L1, here on the flow itself, refines it.
-
-    References
-    ----------
-    Kroeger et al.: Fast optical flow using dense inverse search. 2016. doi:10.1007/978-3-319-46493-0_29
+    Dense inverse search on 8 bits of the last guide, the least noisy, finds the displacement (Kroeger et al.: Fast
+    optical flow using dense inverse search. 2016. doi:10.1007/978-3-319-46493-0_29); TV-L1 on the flow itself refines
+    it.
     """
     guides = _blurred(guides)
     height, width = guides.centre.shape[:2]
@@ -141,6 +121,27 @@ def dense_flow(guides: GuidePair) -> np.ndarray:
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         start = np.asarray(search.calc(first, second, start), np.float32)
     return _solve(_build_pyramid(guides, 3), np.zeros_like(start), start, 3, 30, _DENSE_ATTACHMENT)
+
+
+def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
+    """Estimate a flow (H, W, 2), pixels from later to earlier, on pictures reduced to `_ROUGH_PIXELS` pixels.
+
+    Parameters
+    ----------
+    earlier, later : (H, W) array
+        From `flow.guide.tone_map`.
+    """
+    height, width = later.shape
+    factor = min(1.0, float(np.sqrt(_ROUGH_PIXELS / (height * width))))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    pictures = (
+        picture if factor == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        for picture in (later, earlier)
+    )
+    flow = dense_flow(pair_guides(*(smooth_tones(picture) for picture in pictures)))
+    if factor == 1:
+        return flow
+    return cv2.resize(flow, (width, height)) * np.array([width / size[0], height / size[1]], np.float32)
 
 
 def _blurred(guides: GuidePair) -> GuidePair:
@@ -170,7 +171,7 @@ def _smooth_start(start: np.ndarray, pyramid: Sequence[GuidePair]) -> np.ndarray
 def _find_tiles(
     coarse: GuidePair, start: np.ndarray, base: np.ndarray, change: np.ndarray
 ) -> list[tuple[slice, slice]] | None:
-    """Find where base + change, solved at half size, explains the guides better: rows and columns; None: all over."""
+    """Find where base + change, solved at half size, explains the guides better: rows and columns; None: everywhere."""
     height, width = start.shape[:2]
     size = coarse.centre.shape[1::-1]
     better = select_flow([_rescale(start, *size), _rescale(base, *size) + change], coarse)[1] > 0
@@ -272,8 +273,8 @@ def _linearize(
     """Expand the difference of the guides to first order about base + change.
 
     The guides come with their gradients, (H, W, 3 G), the neighbour's of the whole frame. `data` is (5, G, H, W): the
-    difference as it would be without a change, its slope in x and in y, one over the square of the slope, and how far
-    a step may go, in slopes.
+    difference without a change, its slope in x and in y, one over the square of the slope, and the bound of a step, in
+    slopes.
     """
     height, width, channels = noise.shape
     frame_height, frame_width = neighbour.shape[:2]
@@ -303,7 +304,7 @@ def _linearize(
 
 @njit(parallel=True, nogil=True, cache=True)
 def _step_primal(change: np.ndarray, dual: np.ndarray, data: np.ndarray) -> None:
-    """Move each vector towards where its pixel matches, then towards its neighbours."""
+    """Move each vector towards its match, then towards its neighbours."""
     u, v = change[0], change[1]
     rho, gx, gy, inverse_square, bound = data[0], data[1], data[2], data[3], data[4]
     channels, height, width = rho.shape

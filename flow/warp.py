@@ -14,7 +14,7 @@ Four = tuple[Any, Any, Any, Any]
 
 
 class Place(NamedTuple):
-    """Whether a position is in the frame, the four pixels around it, and how far from the first, (x0, y0), it is."""
+    """Whether a position is in the frame, its four pixels, and its fractions from the first pixel (x0, y0)."""
 
     inside: np.bool
     x0: int
@@ -27,19 +27,13 @@ class Place(NamedTuple):
 
 @njit(inline="always")
 def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
-    """Find the four pixels around a position.
+    """Find the four pixels around a position; outside the frame those of its edge.
 
     Parameters
     ----------
     px, py : float32
-        The position, pixels, from the centre of the first pixel; NaN and infinities are outside.
+        Pixels, from the centre of the first pixel; NaN and infinities are outside.
     width, height : int
-        Of the frame.
-
-    Returns
-    -------
-    Place
-        Outside the frame its edge.
     """
     # Written so that a NaN or infinite position fails the test.
     inside = px >= -0.5 and px <= width - 0.5 and py >= -0.5 and py <= height - 0.5
@@ -56,18 +50,7 @@ def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
 
 @njit(inline="always")
 def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Bilinear weights of the four pixels around a position.
-
-    Parameters
-    ----------
-    place : Place
-        From `locate`.
-
-    Returns
-    -------
-    tuple of float32
-        Row by row; they sum to 1.
-    """
+    """Bilinear weights of the four pixels around a position, row by row."""
     one = np.float32(1)
     fx, fy = place.fx, place.fy
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
@@ -82,18 +65,11 @@ def interpolate(
     Parameters
     ----------
     image : (H, W, C) float32 array
-        In any unit.
     channel : int
-        Which.
     place : Place
         From `locate`.
     weights : tuple of float32
-        From `weigh`; the same for all channels.
-
-    Returns
-    -------
-    float32
-        In the image's unit.
+        From `weigh`.
     """
     # Unsigned: of a signed index numba asks each time whether it counts from the end.
     x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
@@ -150,7 +126,7 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
 
 @njit(inline="always")
 def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, wx: Four, wy: Four) -> np.float32:
-    """Weigh sixteen values of a flat image, within the range of the four in their midst."""
+    """Weigh sixteen values of a flat image, clamped to the range of the four central ones."""
     x0, x1, x2, x3 = columns
     y0, y1, y2, y3 = rows[0] + channel, rows[1] + channel, rows[2] + channel, rows[3] + channel
     a, b, c, d = image[y1 + x1], image[y1 + x2], image[y2 + x1], image[y2 + x2]
@@ -203,41 +179,37 @@ def warp(
     first_row: int = 0,
     out: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample an image, or a stack of any number of AOV channels, where a flow points.
+    """Sample an image, or a stack of any number of AOV channels, at the positions of a flow.
 
     Parameters
     ----------
     image : (H, W) or (H, W, C) float array
-        In any unit; taken as float32. NaN and Inf are the caller's to remove: one spreads to every pixel that samples
-        it.
+        Taken as float32. Remove NaN and Inf first: a non-finite pixel spreads to every pixel that samples it.
     flow : (H, W, 2) or (h, W, 2) float array
         Pixels, x right then y down; of all rows, or of some.
     interpolation : str
-        "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position,
-        so that it never rings (nor goes below zero) beside a firefly; or "nearest", which leaves noise as it is.
+        "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position, so that it never
+        rings (nor goes below zero) beside a firefly; or "nearest", which keeps the statistics of noise.
     first_row : int
         The image's row that the first row of `flow` belongs to.
     out : float32 array, optional
-        Contiguous, of the shape of the result: where it is written. Without: a new one.
+        Contiguous, for the result.
 
     Returns
     -------
     warped : float32 array
         Of the shape of `image`, less the rows without flow: `image[y + v, x + u]`; outside the frame the edge value.
     inside : (H, W) or (h, W) bool array
-        Whether the position lies on a pixel of the frame: x + u in [-0.5, W - 0.5], and y + v alike. False where the
-        flow is not finite.
+        x + u in [-0.5, W - 0.5], and y + v alike. False where the flow is not finite.
 
     Raises
     ------
     ValueError
         If the shapes do not agree, `out` is not contiguous float32, or `interpolation` is unknown.
 
-    Notes
-    -----
-    Weights are exact float32 products. `cv2.remap` is not used because its bilinear weights are quantised
-    to 1/32 px before OpenCV 5, its cubic (a = -0.75, unclamped) undershoots at HDR edges, and it refuses
-    images of 32767 px or more.
+    Notes ----- Weights are exact float32 products. `cv2.remap` is not used because its bilinear weights are quantised
+    to 1/32 px before OpenCV 5, its cubic (a = -0.75, unclamped) undershoots at HDR edges, and it refuses images of
+    32767 px or more.
 
     References
     ----------

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.convention import SCALES, Choice, FramePair, Patches, Trial, choose_convention
+from flow.convention import SCALES, Choice, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
+from flow.patches import FramePair, Patches
 from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes

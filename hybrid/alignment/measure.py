@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.convention import rough_flow
 from flow.guide import tone_map
+from flow.tvl1 import rough_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import compress, measure_exposure, remodulate

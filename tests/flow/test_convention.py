@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flow.convention import PARTS, Choice, FramePair, Patches, choose_convention
+from flow.convention import PARTS, Choice, choose_convention
 from flow.motion import CYCLES, MotionConvention
+from flow.patches import FramePair, Patches
 
 HEIGHT, WIDTH = 90, 140
 SIZES = WIDTH, HEIGHT, WIDTH, HEIGHT
