@@ -46,7 +46,9 @@ def estimate_confidence(
     (H, W) float32 array
         In [0, 1]. Non-finite guides give 0.
 
-    Notes ----- inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2), then
+    Notes
+    -----
+    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2), then
     the minimum of 3 x 3 pixels, because the border of an occlusion holds a mix. Δa is divided by the albedo where that
     is above 1. Shadows and reflections, which move without the geometry, are not detected.
 

@@ -99,7 +99,9 @@ def choose_convention(
     ValueError
         No pairs, or vectors with fewer channels than `assumed` has.
 
-    Notes ----- Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a
+    Notes
+    -----
+    Both frames' luminance, L / (L + exposure), is compared on patches of 9 x 9 pixels. m is the mean over a
     patch of neighbour(x + v) − centre(x), q = 0.3 s + 0.004, s the noise of a pixel. The cost of a patch is min(1,
     (m/2q)²) less the cost of noise alone. Patches that a convention moves out of the visible part cost as much as the
     rest; all are unexplained if these hold more than half of the change. A convention is clearly better than another if

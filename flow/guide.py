@@ -55,7 +55,9 @@ def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
     spacing : int
         Distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter.
 
-    Notes ----- The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, is blind to slopes and
+    Notes
+    -----
+    The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, is blind to slopes and
     to straight edges and has the noise's own deviation. Its magnitude is averaged over 15 x 15 pixels by the square of
     the mean root, to which outliers (corners, fireflies) add little. Texture of the size of a pixel counts as noise.
 
@@ -128,7 +130,9 @@ def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure:
     Guide
         One plane, or two with albedo. The same for ``a * color`` and ``a * exposure``.
 
-    Notes ----- Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided
+    Notes
+    -----
+    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided
     filter over 5 x 5 pixels (He, Sun, Tang: Guided image filtering. 2013. doi:10.1109/TPAMI.2012.213).
     """
     if color.ndim != 3 or color.shape[2] != 3:

@@ -39,7 +39,9 @@ def select_flow(
     choice : (H, W) uint8 array
         Index of the selected candidate.
 
-    Notes ----- Error: e = min(5, Σ_g |I₁(x + f) − I₀(x)| / (σ_g + 1/255)), mean over boxes of 9 x 9 pixels. A noisy
+    Notes
+    -----
+    Error: e = min(5, Σ_g |I₁(x + f) − I₀(x)| / (σ_g + 1/255)), mean over boxes of 9 x 9 pixels. A noisy
     guide counts for little, a difference below one step of 8 bits for nothing, and one pixel (an edge, a disocclusion)
     for at most five deviations. Candidate i beats j where e_i < 0.85 e_j − 3 s / 9, with s = Σ_g σ_g / (σ_g + 1/255):
     means over 81 noisy pixels differ by about s / 9 by chance. Where a candidate leaves the frame there is no evidence.

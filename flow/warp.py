@@ -207,7 +207,9 @@ def warp(
     ValueError
         If the shapes do not agree, `out` is not contiguous float32, or `interpolation` is unknown.
 
-    Notes ----- Weights are exact float32 products. `cv2.remap` is not used because its bilinear weights are quantised
+    Notes
+    -----
+    Weights are exact float32 products. `cv2.remap` is not used because its bilinear weights are quantised
     to 1/32 px before OpenCV 5, its cubic (a = -0.75, unclamped) undershoots at HDR edges, and it refuses images of
     32767 px or more.
 

@@ -84,7 +84,9 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     mask : (T, H, W) bool
         True where a value was replaced.
 
-    Notes ----- In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
+    Notes
+    -----
+    In the 3×3×T neighbourhood of a pixel let m be the median of the mean over channels, and u its n-th
     largest value, n the number of frames trusted at that pixel (at least 2, one more than the firefly). A value is an
     outlier where it exceeds m + 16 (u − m) and eight times the mean of the others. A light present in every frame, even
     one pixel wide, is among the n largest and stays; a firefly is in one frame, and warping spreads it over at most

@@ -48,7 +48,9 @@ def drift_weights(
     (T, H, W) float32
         Factors in (0, 1] for the confidence; 1 at the centre, and everywhere in windows of three frames.
 
-    Notes ----- With n the centre's samples and e_l the estimate l frames away, the mean of (n − e_l)² − (n − e_1)² is
+    Notes
+    -----
+    With n the centre's samples and e_l the estimate l frames away, the mean of (n − e_l)² − (n − e_1)² is
     by how much the farther estimate is worse: the noise of n cancels. Light that drifts by δ a frame adds (l² − 1) δ².
     Where the centre's estimate and its neighbours' differ by d², (d² − δ²) / 2 = v is the error of each, and the
     average of least error weighs e_l by v / (v + l² δ²). Means are over σ = 16 pixels, weighed by the lesser confidence

@@ -164,12 +164,16 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
     ----------
     lights : Highlights
         Of the frame, within it.
-    color, other : (H, W, C) float32
-        Frame and neighbour, finite.
+    color : (H, W, C) float32
+        The frame, finite.
     pixels : (K, 2) intp
         Moved positions in the neighbour.
+    other : (H, W, C) float32
+        The neighbour, finite.
 
-    Notes ----- At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
+    Notes
+    -----
+    At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
     frame has no pixel above an eighth within a pixel's distance.
     """
     first, second = cv2.dilate(_level(color), np.ones((3, 3), np.uint8)), _level(other)
@@ -188,10 +192,12 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
     ----------
     places : (K, 2) intp
         From `find_bright_samples` on `color`.
-    color, other : (H, W, C) float32
-        Frame and neighbour, finite.
+    color : (H, W, C) float32
+        The frame, finite.
     pixels : (K, 2) intp
         Moved positions in the neighbour.
+    other : (H, W, C) float32
+        The neighbour, finite.
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
     brightest = cv2.dilate(_level(other), np.ones((SPREAD, SPREAD), np.uint8))

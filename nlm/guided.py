@@ -48,7 +48,9 @@ def guided_filter(
     (H, W, C) float32
         Within the range of the input in the (4·radius + 1)² box that a pixel depends on.
 
-    Notes ----- In each box a = (Σ_I + ε·1)⁻¹ cov(I, p) and b = mean(p) − a · mean(I), Σ_I the covariance of the guide;
+    Notes
+    -----
+    In each box a = (Σ_I + ε·1)⁻¹ cov(I, p) and b = mean(p) − a · mean(I), Σ_I the covariance of the guide;
     the output is mean(a) · I + mean(b), the means over all boxes that cover the pixel. Boxes are cut at the frame's
     edge. G × G systems are solved by Cholesky in float64, as are the running sums: a firefly of 1e6 would leave its
     rounding in float32 sums.

@@ -141,7 +141,9 @@ def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[
     list of tuple of int
         Indices of layers.
 
-    Notes ----- A depth-first search. All sums that continue a partial set lie between its sum with all negative and its
+    Notes
+    -----
+    A depth-first search. All sums that continue a partial set lie between its sum with all negative and its
     sum with all positive values of the undecided layers: the branch is cut where too many values of the picture lie
     outside. A layer with less light than the tolerance is added where that brings the sum nearer.
     """

@@ -34,7 +34,9 @@ def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, 
     first_row : int
         The frame's row that the first row belongs to: cells lie as in the whole frame.
 
-    Notes ----- With a and c the two confidences, d_s becomes max(0, d_s − (1 − a/c) · l · K[c (d_s − d_t) / l] / K[c]),
+    Notes
+    -----
+    With a and c the two confidences, d_s becomes max(0, d_s − (1 − a/c) · l · K[c (d_s − d_t) / l] / K[c]),
     K a Gaussian mean over σ = 6 pixels. The light l is the mean of both pictures in this channel plus the exposure: a
     pixel counts by its relative difference, at most 2, so that a firefly leaves no ring.
     """

@@ -196,7 +196,9 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     (H, W, 3) float32
         Nowhere below 0 where the picture is not.
 
-    Notes ----- With K a Gaussian mean, a that of the picture in the mean over channels (highlights count as at most
+    Notes
+    -----
+    With K a Gaussian mean, a that of the picture in the mean over channels (highlights count as at most
     four exposures), l the picture plus 5 % of a and 0.1 % of the exposure, u = 1 / max(l, a) and d = u (noisy −
     picture), of noisy − picture at most 20 l, the picture becomes picture + s l K d / K(u l),
 

@@ -54,7 +54,9 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
     (H, W, C) float32
         In squared units.
 
-    Notes ----- (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the neighbours; then
+    Notes
+    -----
+    (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the neighbours; then
     `smooth_variance`, which bounds the contribution of an outlier. Unlike the sample variance of all frames this hardly
     depends on how much noise warping has removed from the neighbours (which halves the sample variance at half a
     pixel). With fewer than two neighbours' worth of confidence the result fades into `variance_from_residual`. Moving
@@ -138,7 +140,9 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     (H, W, F) float32
         Guides without noise come back as they are, to about 1e-3.
 
-    Notes ----- Non-local means over 3×3 pixels and all frames. The variance is the lesser of that between frames and
+    Notes
+    -----
+    Non-local means over 3×3 pixels and all frames. The variance is the lesser of that between frames and
     that of the spatial residual: noise shows in both, texture only in the second, and texture resampled by warping
     mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles of the picture without noise are left
     out.
