@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
+import pytest
 
 from hybrid.alignment.window import AlignedWindow
-from hybrid.breakdown import stage_layers
+from hybrid.breakdown import layers_of, stage_layers, write_breakdown
+from hybrid.cli import main
+from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import PerFrame
 from hybrid.stream import FrameStream
@@ -48,3 +52,45 @@ def test_frames_that_are_missing_do_not_count_and_a_frame_alone_has_none(tmp_pat
     np.testing.assert_array_equal(stage_layers(first, window.color[1])["stage.align"], window.trust[2])
     alone = align(tmp_path / "one", frames=1)
     assert not stage_layers(alone, alone.color[1])["stage.align"].any()
+
+
+def test_layers_are_named_in_the_order_of_time():
+    weights = np.arange(5, dtype=np.float32)[:, None, None] * np.ones((1, 2, 3), np.float32)
+    layers = layers_of(weights[..., None] * np.ones(3, np.float32), weights)
+    names = ("before2", "before1", "centre", "after1", "after2")
+    for index, name in enumerate(names):
+        assert (layers[f"weight.{name}"] == index).all()
+        assert (layers[f"contribution.{name}"] == index).all()
+
+
+def test_the_picture_shows_the_frames_in_the_order_of_time(tmp_path):
+    """From the frame before on the left to the frame after on the right, above their weights."""
+    scene = Scene(frames=1, height=24, width=32)
+    shot = open_shot(scene.write(tmp_path / "noisy"))
+
+    def add(index, layers):
+        for value, name in enumerate(("before1", "centre", "after1")):
+            layers[f"weight.{name}"] = np.full((24, 32), 0.25 * (value + 1), np.float32)
+            layers[f"contribution.{name}"] = np.full((24, 32, 3), 0.05 * (value + 1), np.float32)
+
+    out = scene.write(tmp_path / "out", edit=add)
+    write_breakdown([shot], out, 3, tmp_path / "breakdown.png")
+    picture = cv2.imread(str(tmp_path / "breakdown.png"))[..., 0]
+    contributions, weights = (picture[top + 12, [16, 48, 80]] for top in (24, 48))
+    assert contributions[0] < contributions[1] < contributions[2]
+    np.testing.assert_allclose(weights, np.round(255 * np.array([0.25, 0.5, 0.75])), atol=1)
+
+
+@pytest.mark.neural
+def test_a_first_frame_gets_nothing_from_before_it(tmp_path):
+    """Of the first frame of a shot the breakdown of `denoise` names the next one, as the one after."""
+    pytest.importorskip("torch")
+    scene = Scene(frames=2, step=(0, 0), height=64, width=64, noise=0.05)
+    noisy = scene.write(tmp_path / "noisy")
+    words = ["denoise", str(noisy), "-o", str(tmp_path / "out"), "--first-pass", "none"]
+    assert main([*words, "--breakdown", str(tmp_path / "b.png")]) == 0
+    first = sorted((tmp_path / "out").glob("*.exr"))[0]
+    image = read_exr(first)
+    means = {layer.name: float(image.pixels(layer.channels).mean()) for layer in image.layers if "weight" in layer.name}
+    assert means["weight.before1"] == 0
+    assert means["weight.after1"] > 0.1

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from hybrid.cli import main
-from hybrid.comparison.results import read_comparison
-from tests.scenes import Scene
+from hybrid.comparison.metrics import psnr
+from hybrid.comparison.results import Comparison, read_comparison
+from hybrid.files.shots import open_shot
+from tests.scenes import Scene, grained
 
 SMALL = Scene(height=24, width=32, frames=2)
 
@@ -106,3 +108,54 @@ def test_a_cut_is_said_before_methods_run(tmp_path: Path, capsys: pytest.Capture
     assert said in " ".join(capsys.readouterr().err.split())
     assert main(words) == 0
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+def results_of(folder: Path) -> Comparison:
+    return read_comparison(folder / "results.json")
+
+
+def write_noisy(folder: Path, seed: int, noise: float) -> Path:
+    """Frames of the small shot with noise of another seed and strength."""
+
+    def edit(index: int, layers: dict[str, np.ndarray]) -> None:
+        layers["ViewLayer.Combined"] = grained(layers["ViewLayer.Combined"], (seed, index), noise)
+
+    return SMALL.write(folder, clean=True, edit=edit)
+
+
+def test_both_references_are_read(tmp_path: Path) -> None:
+    """With the second one ignored, the noise of the first would count as an error of the method."""
+    noisy, clean = SMALL.write(tmp_path / "noisy"), SMALL.write(tmp_path / "clean", clean=True)
+    halves = [write_noisy(tmp_path / f"half{seed}", seed, 0.1) for seed in (5, 6)]
+    words = ["compare", str(noisy), "--methods", "noisy", "--external", f"clean={clean}", "--rounds", "1"]
+    for name, chosen in (("one", halves[:1]), ("two", halves)):
+        references = [word for half in chosen for word in ("--reference", str(half))]
+        assert main([*words, *references, "-o", str(tmp_path / name)]) == 0
+    one, two = results_of(tmp_path / "one"), results_of(tmp_path / "two")
+    assert two.facts["Reference"].startswith("Two independent halves")
+    assert not one.facts["Reference"].startswith("Two independent halves")
+    assert two.results[1].metrics["psnr"].mean > one.results[1].metrics["psnr"].mean + 3
+
+
+def test_exposure_reaches_the_measures(shots: tuple[Path, Path], tmp_path: Path) -> None:
+    noisy, clean = shots
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1"]
+    assert main([*words, "--exposure", "4", "-o", str(tmp_path / "report")]) == 0
+    image, reference = (open_shot(folder).read(SMALL.first).color for folder in shots)
+    statistic = results_of(tmp_path / "report").results[0].metrics["psnr"]
+    assert statistic.values[0] == pytest.approx(psnr(image, reference, exposure=4))
+    assert statistic.values[0] != pytest.approx(psnr(image, reference), abs=0.1)
+
+
+def test_levels_are_measured(shots: tuple[Path, Path], tmp_path: Path) -> None:
+    noisy, clean = shots
+    level = write_noisy(tmp_path / "level", 9, SMALL.noise / 2)
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1"]
+    words += ["--samples", "8", "--level", f"{level}=32", "-o", str(tmp_path / "report")]
+    assert main(words) == 0
+    said = results_of(tmp_path / "report").facts["Worth in samples"]
+    scores = []
+    for number in (SMALL.first, SMALL.first + 1):
+        image, reference = (open_shot(folder).read(number).color for folder in (level, clean))
+        scores.append(10 ** (-psnr(image, reference) / 10))
+    assert f"32: {-10 * np.log10(np.mean(scores)):.2f} dB" in said

@@ -90,6 +90,41 @@ def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
     assert [float(store.load("noisy", n, FLIP_MAP).mean()) for n in shot.numbers] == pytest.approx(expected, rel=1e-5)
 
 
+def test_the_shots_exposure_reaches_every_measure() -> None:
+    """At exposure 4 all measures but the bias are those of four times the light at exposure 1."""
+    shot, reference = make_shots()
+
+    def brighter(frames: MemoryShot) -> MemoryShot:
+        return MemoryShot({n: replace(f, color=4 * f.color) for n, f in frames.frames.items()})
+
+    (measured,) = compare_shot(shot, reference, NOISY, CompareOptions(exposure=4.0)).results
+    (expected,) = compare_shot(brighter(shot), brighter(reference), NOISY).results
+    (other,) = compare_shot(shot, reference, NOISY).results
+    exposed = set(measured.metrics) - {"mean_bias"}
+    assert exposed == {"psnr", "ssim", "relmse", "relmse_trimmed", "smape", "flip", "temporal_psnr", "static_std"}
+    for key in exposed:
+        assert measured.metrics[key].values == pytest.approx(expected.metrics[key].values, rel=1e-4), key
+        assert measured.metrics[key].mean != pytest.approx(other.metrics[key].mean, rel=5e-3), key
+
+
+def test_temporal_psnr_follows_the_motion() -> None:
+    """An error that moves with its surface is no flicker, whatever the pixels beside it are."""
+    rng = np.random.default_rng(7)
+    texture = rng.uniform(0.2, 0.8, (SIZE[0], SIZE[1] + 8, 3)).astype(np.float32)
+    error = (1 + 0.1 * rng.normal(size=texture.shape)).astype(np.float32)
+    clean, rendered = {}, {}
+    for number in (1, 2, 3):
+        part = np.s_[:, 8 - 2 * number : 8 - 2 * number + SIZE[1]]  # moves to the right by two pixels a frame
+        vectors = np.zeros((*SIZE, 4), np.float32)
+        vectors[..., 0], vectors[..., 2] = -2, -2  # previous at (x + X, y − Y), next at (x − Z, y + W)
+        clean[number] = Frame(number, texture[part].copy())
+        color = (texture * error)[part].copy()
+        rendered[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
+    (result,) = compare_shot(MemoryShot(rendered), MemoryShot(clean), NOISY).results
+    assert result.metrics["psnr"].mean < 40
+    assert result.metrics["temporal_psnr"].mean > 80
+
+
 def test_frames_are_measured_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two frames wait for each other; the figures are in the order of the frames."""
     both = Barrier(2, timeout=60)
