@@ -47,9 +47,11 @@ def test_the_maps_show_where_geometry_trusts_light_differs_and_the_network_has_c
 
 def test_frames_that_are_missing_do_not_count_and_a_frame_alone_has_none(tmp_path):
     window = align(tmp_path / "three")
-    first = replace(window, trust=window.trust.copy(), confidence=window.confidence.copy())
-    first.trust[0] = first.confidence[0] = 0
-    np.testing.assert_array_equal(stage_layers(first, window.color[1])["stage.align"], window.trust[2])
+    trust, confidence = window.geometric_confidence.copy(), window.confidence.copy()
+    first = replace(window, geometric_confidence=trust, confidence=confidence)
+    first.geometric_confidence[0] = first.confidence[0] = 0
+    layers = stage_layers(first, window.color[1])
+    np.testing.assert_array_equal(layers["stage.align"], window.geometric_confidence[2])
     alone = align(tmp_path / "one", frames=1)
     assert not stage_layers(alone, alone.color[1])["stage.align"].any()
 

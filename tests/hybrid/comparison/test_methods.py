@@ -83,7 +83,7 @@ class TestMaps:
 
     def test_estimates_of_side_frames_are_contributions_of_theirs(self, shot: Shot) -> None:
         aligned = self.aligned(shot, 0.0)
-        aligned = replace(aligned, estimate=np.repeat(aligned.color[1:2], 3, axis=0))
+        aligned = replace(aligned, first_pass=np.repeat(aligned.color[1:2], 3, axis=0))
         alone = window_maps(aligned, lambda window: average(window.first_pass, window.confidence))
         assert alone["Temporal contribution"].max() == 0
         trusted = replace(aligned, confidence=np.ones_like(aligned.confidence))
