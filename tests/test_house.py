@@ -108,7 +108,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/commands/simulate.py",
     "hybrid/commands/status.py",
     "hybrid/memory.py",
-    "hybrid/neural/train.py",
     "hybrid/simulate/evaluation.py",
     "hybrid/simulate/motion.py",
     "hybrid/simulate/random_assets.py",

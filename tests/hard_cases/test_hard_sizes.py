@@ -5,8 +5,8 @@ import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
 from hybrid.first_pass import PerFrame
-from hybrid.plan import plan_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
+from hybrid.stream import plan_shot
 from tests.flow.scenes import plain
 from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 

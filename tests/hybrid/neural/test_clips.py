@@ -74,6 +74,22 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
         np.testing.assert_array_equal(value, wanted, err_msg=name)
 
 
+def test_frames_that_are_not_trusted_show_the_centre(dim, tmp_path, monkeypatch):
+    """In proportion to the confidence, color and guides alike."""
+    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
+    window = FrameStream(open_shot(tmp_path / "dim", frames=str(MIDDLE)), Rules(), first_pass=Classical(FINAL)).align(
+        MIDDLE
+    )
+    color, confidence = window.color, window.confidence[..., None]
+    expected = confidence * color + (1 - confidence) * color[2]
+    assert np.abs(expected - color).max() > 0.1 * color.mean()  # some are not trusted
+    np.testing.assert_allclose(clip.color[0].permute(0, 2, 3, 1).numpy(), expected, rtol=1e-4, atol=1e-5)
+    for name in ("albedo", "normal"):
+        guide = getattr(window, name)
+        expected = confidence * guide + (1 - confidence) * guide[2]
+        np.testing.assert_allclose(getattr(clip, name)[0].permute(0, 2, 3, 1).numpy(), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_path, monkeypatch):
     (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))

@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,8 +24,9 @@ from network.presets import Model
 from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
 from network.training import losses
 from network.training.clips import Clip, Clips, Sample, Samples, open_clips, split_by_shot, whole_frames, write_shards
-from network.training.config import LOSSES, SamplerConfig, TrainConfig
+from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
 from network.training.loop import batch_loss, image_loss, predict, train, validate
+from network.training.perceptual import VGG19, Perceptual
 from tests.network.small import MODELS, make_model, make_robust
 
 pytestmark = pytest.mark.neural
@@ -145,6 +148,76 @@ def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> Non
     assert values[1] > 0.5
 
 
+# Settings that the loss depends on
+
+
+def one_batch(clips: Clips, **fixed: float) -> Sample:
+    sampler = replace(CONFIG.sampler, fireflies=0, drop_frames=0, **fixed)
+    return torch.utils.data.default_collate([Samples(clips, sampler, 7)[0]])
+
+
+def sharp(model: Model) -> Model:
+    """A network that is not at the mean of its window, so that parts of the window give other images."""
+    with torch.no_grad():
+        model.head.window.weight.mul_(30)
+        model.head.window.bias[4] = 5
+    return model
+
+
+@pytest.mark.parametrize("terms", TERMS)
+def test_the_loss_has_the_terms_that_are_asked_for(clips: Clips, terms: str) -> None:
+    """All of them, with the weight of the whole window, as counted by hand."""
+    batch, model, config = one_batch(clips), sharp(make_model()), replace(CONFIG, terms=terms, whole=0.25, loss="l1")
+    subsets = {
+        "temporal": [((1,), 1.0), ((0, 2), 1.0), ((0, 1, 2), 0.25)],
+        "spatial": [((0, 1, 2), 1.0)],
+        "power": [(s, 1.0) for s in ((0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2))],
+    }[terms]
+    with torch.no_grad():
+        filtered = predict(model, batch)
+        facts = batch.color, batch.target, batch.modulation, batch.exposure
+        expected = torch.log1p(losses.temporal_loss(losses.l1, filtered, *facts, subsets) / batch.error).item()
+        assert batch_loss(model, batch, config, losses.l1).item() == pytest.approx(expected, rel=1e-5)
+        whole = batch_loss(model, batch, replace(config, whole=4.0), losses.l1).item()
+    assert (whole != pytest.approx(expected, rel=1e-3)) == (terms == "temporal")
+
+
+@pytest.mark.parametrize("make", [make_model, make_robust])
+def test_the_slope_weighs_errors_beyond_the_target(clips: Clips, make: Callable[[], Model]) -> None:
+    batch, model = one_batch(clips), make()
+    with torch.no_grad():
+        plain, steep = (batch_loss(model, batch, replace(CONFIG, slope=s), losses.l1).item() for s in (1.0, 3.0))
+    assert plain * 1.01 < steep
+    assert math.expm1(steep) <= 3 * math.expm1(plain) * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("make", [make_model, make_robust])
+def test_losses_are_over_those_of_the_clips_best_input(clips: Clips, make: Callable[[], Model]) -> None:
+    batch, model = one_batch(clips), make()
+    with torch.no_grad():
+        once, half = (
+            batch_loss(model, batch._replace(error=factor * batch.error), CONFIG, losses.l1).item() for factor in (1, 2)
+        )
+    assert math.expm1(once) == pytest.approx(2 * math.expm1(half), rel=1e-4)
+
+
+def test_the_perceptual_loss_is_vgg19s(
+    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    vgg, read = VGG19().eval().requires_grad_(False), []
+    monkeypatch.setattr(network.training.loop, "load_vgg19", lambda source: read.append(source) or vgg)
+    config = replace(CONFIG, steps=1, loss="perceptual", vgg="vgg.pth")
+    loss = image_loss(config)
+    assert isinstance(loss, Perceptual)
+    assert loss.vgg is vgg
+    used: list[torch.Tensor] = []
+    vgg.register_forward_hook(lambda module, inputs, output: used.append(inputs[0]))
+    train(sets[0], sets[0].of([]), make_model(), config, tmp_path / "w.safetensors")
+    assert read == ["vgg.pth"] * 2
+    assert used
+
+
 # Training
 
 
@@ -177,6 +250,51 @@ def test_a_training_on_neighbours_asks_for_them(clips: Clips, tmp_path: Path) ->
     found = open_clips(tmp_path / "pair")
     (loss,) = train(found, found.of([]), make_robust(), config, tmp_path / "w.safetensors")
     assert np.isfinite(loss)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_a_pretrained_backbone_is_trained_with_its_share_of_the_rate(
+    share: float, sets: tuple[Clips, Clips], tmp_path: Path
+) -> None:
+    """The first step of Adam moves each weight by the learning rate."""
+    model = make_robust()
+    torch.nn.init.normal_(model.average_blend.weight)
+    torch.nn.init.constant_(model.backbone.last.bias, 0.5)
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    train(sets[0], sets[0].of([]), model, replace(CONFIG, steps=1, backbone_rate=share), tmp_path / "w.safetensors")
+    moved = {name: float((value - before[name]).detach().abs().max()) for name, value in model.named_parameters()}
+    backbone = max(value for name, value in moved.items() if name.startswith("backbone."))
+    others = max(value for name, value in moved.items() if not name.startswith("backbone."))
+    assert others > 1e-4
+    assert backbone == pytest.approx(share * others, rel=0.05)
+
+
+def test_the_moving_average_is_saved_and_validated(
+    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, model, first = tmp_path / "w.safetensors", make_model(), make_model()
+    validated: list[Model] = []
+    monkeypatch.setattr(network.training.loop, "validate", lambda model, clips: validated.append(model) or {})
+    train(*sets, model, replace(CONFIG, steps=1, rate=0.1, warmup=0, ema=0.9), out)
+    assert len(validated) == 1
+    models = model, first, load_model(out), validated[0]
+    weights = zip(*(each.parameters() for each in models), strict=True)
+    for last, initial, saved, average in weights:
+        expected = torch.lerp(last, initial, 0.1).detach()  # after one step a tenth of the first weights
+        torch.testing.assert_close(saved, expected, rtol=2e-3, atol=2e-4)  # stored as halves
+        torch.testing.assert_close(average, expected, rtol=1e-4, atol=1e-6)
+    assert not equal_weights(validated[0], model)
+
+
+def test_gradients_are_clipped(sets: tuple[Clips, Clips], tmp_path: Path) -> None:
+    """Far below the epsilon of Adam, which is blind to the scale of gradients, nothing moves."""
+    moved = []
+    for norm in (1.0, 1e-13):
+        model, before = make_model(), make_model()
+        train(sets[0], sets[0].of([]), model, replace(CONFIG, steps=1, clip_norm=norm), tmp_path / "w.safetensors")
+        pairs = zip(model.parameters(), before.parameters(), strict=True)
+        moved.append(max(float((p - q).detach().abs().max()) for p, q in pairs))
+    assert moved[1] < 0.01 * moved[0]
 
 
 def test_a_training_is_determined_by_its_seed(sets: tuple[Clips, Clips], tmp_path: Path) -> None:

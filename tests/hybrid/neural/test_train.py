@@ -1,0 +1,68 @@
+"""Weights that trainings begin with."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from hybrid.neural import train as module  # noqa: E402
+from hybrid.neural.train import TrainInputs, _initial_model  # noqa: E402
+from network.checkpoint import load_model, shipped_weights  # noqa: E402
+from network.oidn_weights import load_oidn  # noqa: E402
+from network.presets import build_preset  # noqa: E402
+
+pytestmark = pytest.mark.neural
+
+
+class FiveFrames:
+    """All that is asked of clips."""
+
+    frames = 5
+
+
+INPUTS = TrainInputs(Path("clips"), "fast")
+
+
+def weights(model):
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def equal(one, other):
+    return all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+def test_a_preset_begins_with_the_weights_of_its_seed():
+    model = _initial_model(INPUTS, FiveFrames(), seed=3)
+    assert equal(weights(model), weights(build_preset("fast", seed=3)))
+    assert not equal(weights(model), weights(build_preset("fast", seed=4)))
+
+
+@pytest.mark.oidn
+@pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
+def test_oidn_is_the_backbone_that_training_begins_with():
+    model = _initial_model(replace(INPUTS, init="oidn"), FiveFrames(), seed=3)
+    assert equal(weights(model.backbone), load_oidn("rt_hdr_alb_nrm_small").state_dict())
+    assert not equal(weights(model.backbone), weights(build_preset("fast", seed=3).backbone))
+
+
+def test_oidn_is_asked_for_its_weights(monkeypatch):
+    given = []
+    monkeypatch.setattr(module, "start_from_oidn", given.append)
+    model = _initial_model(replace(INPUTS, init="oidn"), FiveFrames(), seed=3)
+    assert given == [model]
+    with pytest.raises(ValueError, match="init is 'oidn', expected with it a preset on OIDN's backbone, not 'unet'"):
+        _initial_model(replace(INPUTS, preset="unet", init="oidn"), FiveFrames(), seed=3)
+
+
+def test_a_preset_that_ships_is_what_training_begins_with():
+    model = _initial_model(replace(INPUTS, init="balanced"), FiveFrames(), seed=3)
+    assert equal(weights(model), weights(load_model(shipped_weights("balanced"))))
+
+
+def test_windows_of_another_length_are_asked_for_by_name():
+    with pytest.raises(ValueError, match="expected windows of 7 frames, as quality has, got 5; --window 5 trains"):
+        _initial_model(replace(INPUTS, preset="quality"), FiveFrames(), seed=3)
+    assert _initial_model(replace(INPUTS, preset="quality", window=5), FiveFrames(), seed=3).frames == 5
