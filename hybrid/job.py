@@ -495,7 +495,7 @@ class Job:
             raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
         with judging or nullcontext():
             if options.max_memory is not None:  # even with no stage, before any pixel is read
-                plan_rows(parse_size(options.max_memory), shot, ())
+                plan_rows(parse_size(options.max_memory), shot.views[0], ())
             views, report = judge_views(shot, strict=options.strict)
             _check_views(views, report, options)
         if options.preset == "auto":

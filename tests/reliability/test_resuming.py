@@ -351,7 +351,10 @@ def test_resume_of_the_network_with_something_else(folder, case):
 
 @pytest.mark.neural
 def test_resume_with_another_threshold(folder):
-    as_fresh(folder, [], ["--threshold", "0.3"], nothing, command=["denoise", "in", "--preset", "tkpcn"])
+    as_fresh(folder, [], ["--threshold", "0.3"], nothing, command=["denoise", "in", "--weights", KERNELS])
+
+
+KERNELS = ROOT / "tests" / "data" / "small.safetensors"
 
 
 def two_layers(index: int, layers: Layers) -> None:
