@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.window import AlignedWindow
-from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, gather_and_denoise
+from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, pool_and_denoise
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import Denoised
 
@@ -104,7 +104,7 @@ class AverageDenoiser(WindowDenoiser):
 
 @dataclass(frozen=True)
 class PooledDenoiser(WindowDenoiser):
-    """OIDN on the pooled samples of the window (`hybrid.pseudo_reference.gather_and_denoise`)."""
+    """OIDN on the pooled samples of the window (`hybrid.pseudo_reference.pool_and_denoise`)."""
 
     device: str
     timings: Timings
@@ -118,4 +118,4 @@ class PooledDenoiser(WindowDenoiser):
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         """Denoise the centre of a window."""
-        return Denoised(gather_and_denoise(aligned, device=self.device, timings=self.timings))
+        return Denoised(pool_and_denoise(aligned, device=self.device, timings=self.timings))

@@ -129,7 +129,7 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
         return average(aligned.first_pass, aligned.confidence) * aligned.modulation
 
 
-def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
+def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
     """Pool the samples of a window at its centre, and denoise them with OIDN; radiance (H, W, 3), finite.
 
     Parameters
@@ -139,7 +139,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
     device : str
         OIDN's device, as for `hybrid.oidn.denoise_oidn`; ImportError without pyoidn.
     timings : Timings, optional
-        Counts the stages "gather" and "denoise".
+        Counts the stages "pool" and "denoise".
 
     Notes
     -----
@@ -151,7 +151,7 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
     if aligned.first_pass is None or aligned.residual is None or aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
-    with timings.stage("gather"):
+    with timings.stage("pool"):
         pooled = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
         mean = pooled.average * aligned.modulation
         image = pooled.image * aligned.modulation
@@ -167,5 +167,5 @@ def gather_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: 
             scale=measure_gain(aligned.centre_first_pass),
             device=device,
         )
-    with timings.stage("gather"):
+    with timings.stage("pool"):
         return np.asarray(mean + np.float32(SECOND_LOOK) * (denoised - mean), np.float32)

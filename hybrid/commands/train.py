@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -30,11 +30,14 @@ from hybrid.commands.options import (
     usage,
 )
 from hybrid.commands.shots import import_neural, judge_alike, parse_input, parse_layers, say_cuts
+from hybrid.comparison.samples import samples_of
+from hybrid.files.profile import Profile
+from hybrid.files.replace import check_outputs
+from hybrid.files.shots import Shot, open_shot
+from hybrid.plan import Context
+from hybrid.runtime.allocator import reuse_freed_memory
+from hybrid.stream import plan_shot
 from network.training.config import SamplerConfig, TrainConfig
-
-if TYPE_CHECKING:
-    from hybrid.files.profile import Profile
-    from hybrid.files.shots import Shot
 
 TRAINING = "Training"
 
@@ -68,9 +71,6 @@ def open_levels(
     default all levels, as the headers of Cycles have them. Raises FileNotFoundError if there is no such folder,
     sequence or level, and ValueError if there are several levels and no samples of one of them.
     """
-    from hybrid.comparison.samples import samples_of
-    from hybrid.files.shots import open_shot
-
     path = Path(spec)
     if path.is_dir():
         found = sorted({item.name.partition(".")[0] for item in path.glob("*.exr") if not item.name.startswith(".")})
@@ -161,11 +161,6 @@ def make_clips(
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
     Shots that have clips already are skipped, so that the same command continues an interrupted run.
     """
-    from hybrid.files.shots import open_shot
-    from hybrid.plan import Context
-    from hybrid.runtime.allocator import reuse_freed_memory
-    from hybrid.stream import plan_shot
-
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
     if reference and target is not None:
@@ -299,8 +294,6 @@ def train(
     Fine-tune on your own footage, without any reference: ravg make-clips of it, then --init fast --rate 1e-4.
     """
     neural = import_neural()
-    from hybrid.files.replace import check_outputs
-
     if init in (None, "oidn") and preset not in neural.TRAINING_PRESETS:
         known = ", ".join(neural.TRAINING_PRESETS)
         raise typer.BadParameter(f"--preset is {preset!r}, expected one of {known}")

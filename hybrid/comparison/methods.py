@@ -21,7 +21,7 @@ from hybrid.files.shots import Shot
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, denoise_frame_oidn, find_first_pass, read_denoised
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, gather_and_denoise
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
 from nlm.average import average, replace_nonfinite, robust_average
@@ -300,7 +300,7 @@ METHODS: dict[str, Method] = {
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
-    "gathered": _aligned("Gated averages", gather_and_denoise, source="oidn-fast"),
+    "gathered": _aligned("Gated averages", pool_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("fast", "bundled"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in OIDN_MODE_OF_PRESET.items()},
     "tKPCN": _network("tkpcn", "none"),

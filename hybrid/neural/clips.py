@@ -18,7 +18,7 @@ from hybrid.neural.network_denoiser import exposure_of
 from hybrid.neural.tiling import tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
 from hybrid.plan import Rules
-from hybrid.pseudo_reference import gated_average, gather_and_denoise
+from hybrid.pseudo_reference import gated_average, pool_and_denoise
 from hybrid.stream import FrameStream
 from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
@@ -117,7 +117,7 @@ def write_clips(
     ]
     # OIDN, if it makes the first passes, is there to denoise the pooled samples too.
     has_oidn = all(first_pass.name in OIDN_MODES for first_pass in first_passes)
-    make_target = gather_and_denoise if has_oidn else gated_average
+    make_target = pool_and_denoise if has_oidn else gated_average
 
     def targets_of(number: int) -> dict[str, NDArray[np.float32]]:
         """Targets that all levels of a frame share, if any."""

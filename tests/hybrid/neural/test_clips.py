@@ -16,7 +16,7 @@ from hybrid.neural import clips as module
 from hybrid.neural import open_network, unet_denoiser
 from hybrid.neural.clips import ClipSource, write_clips
 from hybrid.plan import Rules
-from hybrid.pseudo_reference import FINAL, gated_average, gather_and_denoise
+from hybrid.pseudo_reference import FINAL, gated_average, pool_and_denoise
 from hybrid.stream import FrameStream
 from network.checkpoint import save_model
 from network.presets import build_preset
@@ -112,7 +112,7 @@ def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path
     write_clips(ClipSource("dim", {"noisy": shot}, [4]), tmp_path, tile=0, estimate="oidn-fast")
     window = FrameStream(shot, Rules(), first_pass=find_first_pass("oidn-fast", shot).first_pass).align(MIDDLE)
     image = found[0].pseudo_reference[0].permute(1, 2, 0).numpy()
-    np.testing.assert_array_equal(image, gather_and_denoise(window))
+    np.testing.assert_array_equal(image, pool_and_denoise(window))
     assert np.abs(image - gated_average(window)).max() > 0.01 * image.mean()
 
 

@@ -15,7 +15,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import PerFrame, find_first_pass
 from hybrid.oidn import _device
-from hybrid.pseudo_reference import SECOND_LOOK, gated_average, gather_and_denoise
+from hybrid.pseudo_reference import SECOND_LOOK, gated_average, pool_and_denoise
 from hybrid.stabilize import Denoised, FrameDenoiser
 from hybrid.stream import FrameStream
 from nlm.pooling import pool_samples
@@ -60,7 +60,7 @@ def test_the_gathered_picture_is_denoised_with_the_scale_of_the_whole_frame(tmp_
     shot = open_shot(SCENE.write(tmp_path))
     for stages, guides in ((STAGES, (None, True)), (STAGES | {"prefilter"}, ("balanced", False))):
         aligned = FrameStream(shot, only(stages), first_pass=PerFrame(truth)).align(MIDDLE)
-        result = gather_and_denoise(aligned)
+        result = pool_and_denoise(aligned)
         gathered = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
         image, average = (layer * aligned.modulation for layer in (gathered.image, gathered.average))
         np.testing.assert_allclose(given["color"], image, rtol=1e-6)
@@ -113,7 +113,7 @@ def test_a_window_without_estimates_is_an_error(tmp_path) -> None:
     aligned = FrameStream(shot, only(STAGES)).align(MIDDLE)
     assert aligned.residual is None
     with pytest.raises(ValueError, match="expected a window with estimates"):
-        gather_and_denoise(aligned)
+        pool_and_denoise(aligned)
 
 
 def test_without_pyoidn_the_command_says_so(tmp_path, monkeypatch, capfd) -> None:
@@ -134,7 +134,7 @@ class TestWithOidn:
         clean = truth(shot.read(MIDDLE))
         fast = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn-fast", shot).first_pass).align(MIDDLE)
         best = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn-best", shot).first_pass).align(MIDDLE)
-        gathered = psnr(gather_and_denoise(fast), clean)
+        gathered = psnr(pool_and_denoise(fast), clean)
         # Measured: 1.4 and 0.9 dB.
         assert gathered > psnr(gated_average(fast), clean) + 0.5
         assert gathered > psnr(best.first_pass[2] * best.modulation, clean) + 0.5
@@ -145,7 +145,7 @@ class TestWithOidn:
         parts = [
             FrameDenoiser(
                 FrameStream(shot, only(STAGES), radius=1, first_pass=find_first_pass("oidn-fast", shot).first_pass),
-                lambda aligned: Denoised(gather_and_denoise(aligned)),
+                lambda aligned: Denoised(pool_and_denoise(aligned)),
                 rows=rows,
             )
             .make(1002)
