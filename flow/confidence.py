@@ -28,8 +28,7 @@ def estimate_confidence(
 
     Parameters
     ----------
-    flow : (H, W, 2) float array
-        Pixels, finite, centre to neighbour.
+    flow : (H, W, 2) float array, pixels, finite, centre to neighbour
     inside : (H, W) bool array
         From `flow.warp.warp`; False also where the vector, or a pixel it leads to, is invalid.
     reverse : (H, W, 2) float array, optional
@@ -38,8 +37,7 @@ def estimate_confidence(
         Of the centre and the warped neighbour, both or none; likewise the normals.
     normal, warped_normal : (H, W, 3) float array, optional
         In any one space, of any length, 0 where there is no surface.
-    first_row : int
-        The frame's row that the first row of `flow` belongs to.
+    first_row : int, the frame's row that the first row of `flow` belongs to
 
     Returns
     -------
@@ -139,10 +137,8 @@ def mix_centre(
     Parameters
     ----------
     warped, centre : (H, W) or (H, W, C) float array
-    confidence : (H, W) float array
-        In [0, 1].
-    out : float32 array, optional
-        Contiguous, for the result.
+    confidence : (H, W) float array, in [0, 1]
+    out : float32 array, optional, contiguous, for the result
     """
     if warped.shape != centre.shape or confidence.shape != centre.shape[:2]:
         raise ValueError(

@@ -11,25 +11,25 @@ import numpy as np
 from flow.motion import UNITS, VERTICAL, MotionConvention
 from flow.patches import WORTH, Patches, keeps_change, mean_cost
 
-# So many of those that leave least are tried on all patches of all pairs.
+# Conventions of least cost that are tried on all patches of all pairs.
 FINALISTS = 4
-# Of fewer patches the spread of their differences is unknown: nothing is clearly better by them.
+# With fewer patches the spread of differences is unknown, and no convention is clearly better.
 FEWEST = 8
-# Standard errors, of the differences patch by patch, by which one reading is clearly better than another.
+# Standard errors of the mean difference by which a convention is clearly better.
 CLEARLY = 3.0
-# What noise alone gives is known to about 1 % of the picture: a reading that leaves less than this is good.
+# The cost of noise is known to about 1 % of the picture: a convention that leaves less than this is good.
 LEAST = 0.02
-# Readings that leave this share of what changes need no comparison with any others. Half as long as they should be,
-# vectors left 0.4 of it on the bundled shot, right ones less than 0.02.
+# A convention that leaves less than this share of the change needs no comparison. Vectors of half the length left 0.4
+# of the change on the bundled shot, right ones less than 0.02.
 GOOD = 0.25
-# Where nothing is known of the scale, other lengths are tried unless a plain one leaves less than this share.
+# With an unknown scale other lengths are tried unless a plain one leaves less than this share.
 EXACT = 0.05
-# What overrules what was stated leaves less than this share of what that leaves; or, where no motion explains much
-# of the change (reflections, what was hidden), that explains less than this share of what it does.
+# A convention overrules the stated one if it leaves less than this share of the stated one's cost; or, where no motion
+# explains much of the change (reflections, disocclusions), if the stated one explains less than this share of it.
 OVERRULES = 0.5
 # Vectors may span half a frame (a shutter of 180 degrees) or two, and point either way.
 SCALES = (1.0, -1.0, 2.0, -2.0, 0.5, -0.5)
-# Readings whose vectors (their ninth decile) are shorter, pixels, or longer, picture widths, are not tried.
+# Conventions whose vectors (their ninth decile) are shorter, pixels, or longer, picture widths, are not tried.
 SHORTEST, LONGEST = 0.02, 1.0
 # Lengths, pixels, tried for the ninth decile of the vectors where nothing better explains the pictures.
 LENGTHS = 0.5 * 2 ** np.arange(0, 8.5, 0.5)
@@ -78,8 +78,7 @@ def choose_convention(
     ----------
     pairs : sequence of Patches
         At least one, of frames of one size. Costs are cached in the pairs.
-    assumed : MotionConvention
-        Used where the pictures do not decide.
+    assumed : MotionConvention, used where the pictures do not decide
     settled : collection of str
         Parts that are known; other values are tried only if the known ones explain little.
     surfaces : callable
@@ -126,7 +125,7 @@ def choose_convention(
     chosen = trials.read(assumed, settled, typed)
     believed, found = not trials.clearly_better(None, chosen), None
     if believed and not trials.good(chosen) and len(trials.costs(None)) >= FEWEST:
-        # A change of light is explained by no motion. Vectors are wrong where a search explains what they do not.
+        # No motion explains a change of light. Vectors are wrong where an estimated flow explains more.
         found = trials.search()
         believed = trials.worth(chosen, WORTH) or found >= (1 - WORTH) * trials.left(None)
     choice = trials.choice(chosen, settled, found=found, unrelated=unrelated)
@@ -146,7 +145,7 @@ class _Trials:
     def __init__(self, pairs: Sequence[Patches]) -> None:
         self.pairs = pairs
         self.expected = float(np.mean(np.concatenate([pair.expected for pair in self.pairs])))
-        # The pair that tells most.
+        # The pair with most change.
         self.screen = max(self.pairs, key=lambda pair: float(np.mean(pair.still - pair.expected)))
         self.tried: dict[MotionConvention, None] = {}  # in the order they were tried
 
@@ -239,7 +238,7 @@ class _Trials:
             if reading == assumed or SHORTEST <= lengths[kind] * abs(x) <= LONGEST * resolution[1]:
                 # Half NDC twice as long is NDC.
                 readings.setdefault((kind, reading.offset, x, y), reading)
-        # As many vectors as are assumed; forward rather than backward turned round; then what changes least.
+        # As many vectors as assumed first, then positive scales, then the fewest changed parts.
         changes = {r: sum(getattr(r, part) != getattr(assumed, part) for part in PARTS) for r in readings.values()}
         return sorted(readings.values(), key=lambda r: (r.pair != assumed.pair, r.scale < 0, changes[r]))
 
@@ -275,7 +274,7 @@ class _Trials:
         """Parts in which conventions differ that cost no more than the chosen one; all, if that explains nothing."""
         if not self.clearly_better(chosen, None):
             return tuple(part for part in PARTS if part not in settled)
-        # Not those that differ by a fitted scale alone, nor those that tell less.
+        # Without those that differ by a fitted scale alone, or hold one vector where this one holds two.
         others = [r for r in self.tried if r.pair == chosen.pair and not 0.8 < r.scale / chosen.scale < 1 / 0.8]
         others += [r for r in self.tried if r.pair == chosen.pair and r.scale == chosen.scale]
         equals = [r for r in others if not self.clearly_better(chosen, r)]
@@ -319,7 +318,7 @@ def _agreeing(
     assumed: MotionConvention, settled: frozenset[str], vectors: Sequence[np.ndarray]
 ) -> Iterator[MotionConvention]:
     """All conventions with the settled parts, the preferred ones first."""
-    # The scale varies slowest: vectors of the length they are in their unit go before all others.
+    # The scale varies slowest: plain lengths go before all others.
     options: dict[str, Sequence[object]] = {
         "scale": SCALES,
         "offset": (0.0,),

@@ -36,8 +36,7 @@ def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
     ----------
     color : (H, W, 3) float array
         Linear radiance. Negative and NaN count as 0, Inf as white.
-    exposure : float
-        The radiance that maps to 0.5, positive.
+    exposure : float, the radiance that maps to 0.5, positive
     """
     if not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a positive number")
@@ -50,10 +49,8 @@ def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
 
     Parameters
     ----------
-    image : (H, W) or (H, W, C) float array
-        Finite.
-    spacing : int
-        Distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter.
+    image : (H, W) or (H, W, C) float array, finite
+    spacing : int, distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter
 
     Notes
     -----
@@ -122,8 +119,7 @@ def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure:
     albedo : (H, W, 3) float array, optional
         At least 0. It steers the smoothing, and is a guide plane of its own; without albedo the luminance steers
         itself.
-    exposure : float
-        The radiance that maps to 0.5, positive: one value for both frames of a pair.
+    exposure : float, the radiance that maps to 0.5, positive: one value for both frames of a pair
 
     Returns
     -------
@@ -154,10 +150,8 @@ def smooth_tones(tone: np.ndarray, steer: np.ndarray | None = None) -> Guide:
 
     Parameters
     ----------
-    tone : (H, W) float32 array
-        In [0, 1].
-    steer : (H, W, up to 3) float32 array, optional
-        Of a range of about 1.
+    tone : (H, W) float32 array, in [0, 1]
+    steer : (H, W, up to 3) float32 array, optional, of a range of about 1
     """
     # Contrasts of the steering image below the root of this are smoothed over. A picture's own noise is strong.
     tolerance = 1e-2 if steer is None else 1e-3

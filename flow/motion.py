@@ -149,10 +149,8 @@ def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np
 
     Parameters
     ----------
-    vectors : (H, W, C) array of float
-        As rendered, C at least `convention.channels`.
-    convention : MotionConvention
-        `MotionConvention.factors` makes pixels of the result.
+    vectors : (H, W, C) array of float, as rendered, C at least `convention.channels`
+    convention : MotionConvention, `MotionConvention.factors` makes pixels of the result
     """
     size = convention.channels // (2 if convention.pair else 1)
     first = _decode(vectors[..., :size], convention)
@@ -199,15 +197,13 @@ def compose_flow(
     ----------
     first, second : (H, W, 2) array of float
         Finite, pixels; `second` belongs to the frame that `first` points to.
-    first_valid, second_valid : (H, W) array of bool, optional
-        Default: all True.
+    first_valid, second_valid : (H, W) array of bool, optional, default: all True
 
     Returns
     -------
     flow : (H, W, 2) array of float32
         f₂(x) = f₁(x) + f₁'(x + f₁(x)), f₁' sampled bilinearly, with its edge value outside the frame.
-    valid : (H, W) array of bool
-        `first` is valid, lands in the frame, and every sampled vector of `second` is valid.
+    valid : (H, W) array of bool, `first` is valid, lands in the frame, and every sampled vector of `second` is valid
     """
     if first.shape != second.shape:
         raise ValueError(f"first has shape {first.shape}, expected that of second, {second.shape}")
@@ -263,8 +259,7 @@ def invert_flow(
 
     Parameters
     ----------
-    flow : (H, W, 2) array of float
-        Pixels, finite, of frame b.
+    flow : (H, W, 2) array of float, pixels, finite, of frame b
     valid : (H, W) array of bool, optional
         Of frame b; invalid vectors are left out.
     depth : (H, W) array of float, optional
@@ -275,8 +270,7 @@ def invert_flow(
     -------
     inverse : (H, W, 2) array of float32
         Of frame a. Where nothing arrives (hidden in b), the mean of the neighbours within two pixels, else 0.
-    valid : (H, W) array of bool
-        True where a vector arrived.
+    valid : (H, W) array of bool, True where a vector arrived
     """
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
@@ -311,8 +305,7 @@ def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: 
     flow, reverse : (H, W, 2) array of float
         Pixels, finite: centre to neighbour, possibly of some rows only, and back. Outside the frame r has its edge
         value.
-    first_row : int
-        The frame's row that the first row of `flow` belongs to.
+    first_row : int, the frame's row that the first row of `flow` belongs to
     """
     loop, _ = warp(reverse, flow, first_row=first_row)
     loop += flow

@@ -17,18 +17,18 @@ from flow.warp import locate
 
 # Patches of 9 x 9 pixels: the noise of their means is a ninth of a pixel's.
 RADIUS = 4
-# Enough for 0.2 % of the picture to be eight of them, few enough for a reading to take milliseconds.
+# Enough for 0.2 % of the picture to be eight of them, few enough for milliseconds a convention.
 MOST_PATCHES = 4096
-# Readings are screened on this many of one pair: half are those that change most, half lie anywhere.
+# Conventions are screened on so many patches of one pair: half are those that change most, half lie anywhere.
 SCREENED = 192
-# A difference of means that is taken for noise: the scale of `nlm.gate.color_gate`, a third of a pixel's noise and
-# one step of 8 bits. Noise alone brings twice that once in a thousand patches.
+# A difference of means within noise: the scale of `nlm.gate.color_gate`, a third of a pixel's noise and one step of
+# 8 bits. Noise alone exceeds twice this scale in one of a thousand patches.
 NOISE_SHARE, NOISE_FLOOR = 0.3, 0.004
-# A reading that moves a greater share of what changes out of the picture than it keeps there explains nothing.
+# A convention that moves more of the change out of the picture than it keeps explains nothing.
 INSIDE = 0.5
-# Vectors explain at least this share of what a flow found in the pictures does, where that explains as much.
+# Vectors explain at least this share of the change that an estimated flow explains.
 WORTH = 0.5
-# Neighbours that differ in more of the picture than this may be two shots.
+# Frames that differ in a greater share of the picture may be two shots.
 CUT = 0.5
 
 
@@ -233,8 +233,7 @@ def keeps_change(inside: np.ndarray, still: np.ndarray) -> bool:
     Parameters
     ----------
     inside : (P,) bool array
-    still : (P,) float array
-        Costs without motion.
+    still : (P,) float array, costs without motion
     """
     return bool(inside.any()) and float(still[inside].sum()) >= INSIDE * float(still.sum())
 
@@ -244,8 +243,7 @@ def mean_cost(costs: np.ndarray, still: np.ndarray) -> float:
 
     Parameters
     ----------
-    costs, still : (P,) float array
-        With a motion, NaN outside, and without.
+    costs, still : (P,) float array, with a motion, NaN outside, and without
     """
     inside = ~np.isnan(costs)
     if not keeps_change(inside, still):

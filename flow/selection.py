@@ -34,10 +34,8 @@ def select_flow(
 
     Returns
     -------
-    flow : (H, W, 2) float32 array
-        Pixels.
-    choice : (H, W) uint8 array
-        Index of the selected candidate.
+    flow : (H, W, 2) float32 array, pixels
+    choice : (H, W) uint8 array, index of the selected candidate
 
     Notes
     -----

@@ -12,18 +12,17 @@ from flow.guide import GuidePair, pair_guides, smooth_tones
 from flow.selection import select_flow
 from flow.warp import interpolate, locate, weigh
 
-# Of the coupling between the data and the smoothness half of the energy (Zach's theta), and of the dual
-# ascent; tau / theta = 0.25 / 0.3 is below the bound for convergence.
+# Coupling of the data and the smoothness half of the energy (Zach's theta), and step of the dual ascent;
+# tau / theta = 0.25 / 0.3 is below the bound for convergence.
 _THETA = np.float32(0.3)
 _DUAL_STEP = np.float32(0.25 / 0.3)
 # λ of each guide, for guides in [0, 1]: 255 times that of 8-bit images (0.03 to 0.06 there). Higher follows the guides
-# more closely, which a flow has to that is made of nothing else.
+# more closely, as a flow from guides alone needs.
 _REFINE_ATTACHMENT, _DENSE_ATTACHMENT = 8.0, 16.0
 # Standard deviation, pixels, of the Gaussian that the guides are smoothed with first.
 _BLUR = 0.8
-# Side, pixels, of the tiles that are refined where not all of a frame is, and the rim that is solved around them: with
-# it 99 of 100 vectors are within 0.04 px of those of a whole frame, with half of it within 0.4. Where more than this
-# share is called for, rims would cost what the tiles save.
+# Side, pixels, of refined tiles, and the rim solved around each: with this rim 99 of 100 vectors are within 0.04 px of
+# those of a whole frame, with half of it within 0.4. Beyond this share of tiles the rims cost more than is saved.
 _TILE, _RIM, _MOST_TILES = 128, 32, 0.5
 # `rough_flow` works on pictures of at most so many pixels.
 _ROUGH_PIXELS = 2**17
@@ -36,19 +35,16 @@ def refine_flow(
 
     Parameters
     ----------
-    guides : GuidePair
-        Their noise weakens the data term where a gradient is no stronger than the noise.
+    guides : GuidePair, their noise weakens the data term where a gradient is no stronger than the noise
     start : (H, W, 2) float array
         Pixels; vectors that are not finite, or longer than the frame, start from 0.
     scales : int
         Number of scales, each half the size of the one before; fewer where the image has not 16 pixels left.
-    warps, iterations : int
-        At each scale: linearisations, and steps of each.
+    warps, iterations : int, at each scale: linearisations, and steps of each
 
     Returns
     -------
-    (H, W, 2) float32 array
-        Finite, pixels.
+    (H, W, 2) float32 array, finite, pixels
 
     Notes
     -----
@@ -130,8 +126,7 @@ def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    earlier, later : (H, W) array
-        From `flow.guide.tone_map`.
+    earlier, later : (H, W) array, from `flow.guide.tone_map`
     """
     height, width = later.shape
     factor = min(1.0, float(np.sqrt(_ROUGH_PIXELS / (height * width))))

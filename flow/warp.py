@@ -66,10 +66,8 @@ def interpolate(
     ----------
     image : (H, W, C) float32 array
     channel : int
-    place : Place
-        From `locate`.
-    weights : tuple of float32
-        From `weigh`.
+    place : Place, from `locate`
+    weights : tuple of float32, from `weigh`
     """
     # Unsigned: of a signed index numba asks each time whether it counts from the end.
     x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
@@ -190,10 +188,8 @@ def warp(
     interpolation : str
         "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position, so that it never
         rings (nor goes below zero) beside a firefly; or "nearest", which keeps the statistics of noise.
-    first_row : int
-        The image's row that the first row of `flow` belongs to.
-    out : float32 array, optional
-        Contiguous, for the result.
+    first_row : int, the image's row that the first row of `flow` belongs to
+    out : float32 array, optional, contiguous, for the result
 
     Returns
     -------

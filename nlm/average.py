@@ -25,8 +25,7 @@ def average(window: Floats, weight: Floats) -> Floats:
     Parameters
     ----------
     window : (T, H, W, C) float32
-    weight : (T, H, W) float32
-        At least 0.
+    weight : (T, H, W) float32, at least 0
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
@@ -40,13 +39,11 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
     Parameters
     ----------
     window : (T, H, W, C) float32
-    weight : (T, H, W) float32
-        At least 0.
+    weight : (T, H, W) float32, at least 0
 
     Returns
     -------
-    (H, W, C) float32
-        The centre's value where all weights are 0.
+    (H, W, C) float32, the centre's value where all weights are 0
 
     Notes
     -----
@@ -74,15 +71,12 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     Parameters
     ----------
     window : (T, H, W, C) float32
-    weight : (T, H, W) float32
-        A pixel of weight 0 is neither evidence nor replaced.
+    weight : (T, H, W) float32, a pixel of weight 0 is neither evidence nor replaced
 
     Returns
     -------
-    cleaned : (T, H, W, C) float32
-        A copy of the window with outliers replaced.
-    mask : (T, H, W) bool
-        True where a value was replaced.
+    cleaned : (T, H, W, C) float32, a copy of the window with outliers replaced
+    mask : (T, H, W) bool, True where a value was replaced
 
     Notes
     -----
@@ -111,15 +105,13 @@ def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
 
     Parameters
     ----------
-    image : (H, W, C) float32
-        A pixel counts as non-finite if any of its channels is.
+    image : (H, W, C) float32, a pixel counts as non-finite if any of its channels is
 
     Returns
     -------
     filled : (H, W, C) float32
         A finite copy, filled by a normalised box filter whose radius doubles; 0 if no pixel is finite.
-    mask : (H, W) bool
-        True where a pixel was replaced.
+    mask : (H, W) bool, True where a pixel was replaced
     """
     if image.ndim != 3:
         raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
@@ -152,8 +144,7 @@ def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[
     ----------
     window : (T, H, W, C) array
     weight : (T, H, W) array
-    name : str
-        Name of the weights in the error.
+    name : str, name of the weights in the error
     """
     if window.ndim != 4 or window.shape[0] % 2 == 0:
         raise ValueError(f"window: expected (frames, height, width, channels) with odd frames, got {window.shape}")

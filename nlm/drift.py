@@ -36,12 +36,10 @@ def drift_weights(
     ----------
     estimates : (T, H, W, 3) float32
         Denoised, aligned. Non-finite pixels are skipped.
-    noisy : (H, W, 3) float32
-        The centre frame as rendered, in the same unit.
+    noisy : (H, W, 3) float32, the centre frame as rendered, in the same unit
     confidence : (T, H, W) float32
     exposure : float
-    first_row : int
-        The frame's row that the first row belongs to: cells lie as in the whole frame.
+    first_row : int, the frame's row that the first row belongs to: cells lie as in the whole frame
 
     Returns
     -------
@@ -95,8 +93,7 @@ def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats) -> Non
     ----------
     estimates : (T, H, W, 3) float32
     confidence : (T, H, W) float32
-    weight : (T, H, W) float32
-        From `drift_weights`.
+    weight : (T, H, W) float32, from `drift_weights`
 
     Notes
     -----

@@ -68,15 +68,12 @@ def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
 
     Parameters
     ----------
-    color : (H, W, C) float32
-        Radiance or irradiance, finite.
+    color : (H, W, C) float32, radiance or irradiance, finite
 
     Returns
     -------
-    places : (K, 2) intp
-        Row and column of the brightest pixel of each.
-    isolated : (K,) bool
-        True for a firefly.
+    places : (K, 2) intp, row and column of the brightest pixel of each
+    isolated : (K,) bool, True for a firefly
 
     Notes
     -----
@@ -96,12 +93,9 @@ def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = No
 
     Parameters
     ----------
-    color : (H, W, C) float32
-        Radiance or irradiance, finite.
-    pixels : (K, 2) intp
-        Anywhere, also outside the frame.
-    factor : (H, W, C) float32, optional
-        Factor from `color` to radiance.
+    color : (H, W, C) float32, radiance or irradiance, finite
+    pixels : (K, 2) intp, anywhere, also outside the frame
+    factor : (H, W, C) float32, optional, factor from `color` to radiance
 
     Notes
     -----
@@ -129,8 +123,7 @@ def follow_motion(lights: Highlights, moved: Points) -> Places:
     Parameters
     ----------
     lights : Highlights
-    moved : (K, 2) float64
-        Rows and columns.
+    moved : (K, 2) float64, rows and columns
     """
     straight = lights.pixels + nearest_pixel(moved)
     return np.where(_same_phase(moved)[:, None], straight, nearest_pixel(lights.points + moved))
@@ -141,12 +134,9 @@ def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask
 
     Parameters
     ----------
-    first : Highlights
-        Of the frame.
-    moved : (K, 2) float64
-        Motion to the neighbour, rows and columns.
-    second : Highlights
-        Measured in the neighbour at the moved position.
+    first : Highlights, of the frame
+    moved : (K, 2) float64, motion to the neighbour, rows and columns
+    second : Highlights, measured in the neighbour at the moved position
 
     Notes
     -----
@@ -162,14 +152,10 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
 
     Parameters
     ----------
-    lights : Highlights
-        Of the frame, within it.
-    color : (H, W, C) float32
-        The frame, finite.
-    pixels : (K, 2) intp
-        Moved positions in the neighbour.
-    other : (H, W, C) float32
-        The neighbour, finite.
+    lights : Highlights, of the frame, within it
+    color : (H, W, C) float32, the frame, finite
+    pixels : (K, 2) intp, moved positions in the neighbour
+    other : (H, W, C) float32, the neighbour, finite
 
     Notes
     -----
@@ -190,14 +176,10 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
 
     Parameters
     ----------
-    places : (K, 2) intp
-        From `find_bright_samples` on `color`.
-    color : (H, W, C) float32
-        The frame, finite.
-    pixels : (K, 2) intp
-        Moved positions in the neighbour.
-    other : (H, W, C) float32
-        The neighbour, finite.
+    places : (K, 2) intp, from `find_bright_samples` on `color`
+    color : (H, W, C) float32, the frame, finite
+    pixels : (K, 2) intp, moved positions in the neighbour
+    other : (H, W, C) float32, the neighbour, finite
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
     brightest = cv2.dilate(_level(other), np.ones((SPREAD, SPREAD), np.uint8))
@@ -210,8 +192,7 @@ def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Po
 
     Parameters
     ----------
-    lights : Highlights
-        Of the frame.
+    lights : Highlights, of the frame
     others : sequence of (Highlights, (K, 2) float64, (K,) bool)
         Measured in other frames, the motion there, and where the other frame shows the same highlight.
 
@@ -242,8 +223,7 @@ def add_highlights(picture: Floats, lights: Highlights) -> Floats:
     Parameters
     ----------
     picture : (H, W, C) float32
-    lights : Highlights
-        From `average_highlights`.
+    lights : Highlights, from `average_highlights`
     """
     brighter = picture.copy()
     blocks = _blocks(lights.pixels, picture.shape, 3)
@@ -257,8 +237,7 @@ def remove_highlights(color: Floats, pixels: Places) -> Floats:
 
     Parameters
     ----------
-    color : (H, W, C) float32
-        Finite.
+    color : (H, W, C) float32, finite
     pixels : (K, 2) intp
     """
     rows, columns, inside = _blocks(pixels, color.shape)

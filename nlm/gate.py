@@ -18,8 +18,8 @@ Mask = NDArray[np.bool_]
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)
 _AROUND_SIZE = (15, 15)
-# q = share · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is
-# noise; 0.004, one step of 8 bits, is what the estimates themselves differ by where nothing is noisy.
+# q = share · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is noise; 0.004,
+# one step of 8 bits, is the difference of the estimates without noise.
 SHARE, _FLOOR = 0.3, 0.004
 
 
@@ -42,13 +42,10 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
 
     Parameters
     ----------
-    estimates : (T, H, W, 3) float32
-        Denoised, aligned, at least 0.
-    noisy : (H, W, 3) float32
-        The centre frame as rendered, in the same unit.
+    estimates : (T, H, W, 3) float32, denoised, aligned, at least 0
+    noisy : (H, W, 3) float32, the centre frame as rendered, in the same unit
     exposure : float
-    shares : sequence of float
-        Tolerated difference of two estimates as a share of the centre's noise, at least 0.
+    shares : sequence of float, tolerated difference of two estimates as a share of the centre's noise, at least 0
 
     Returns
     -------

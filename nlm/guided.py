@@ -13,7 +13,7 @@ from nlm.average import replace_nonfinite
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-# Rows that one thread filters with the same running sums.
+# Rows filtered with the same running sums.
 _STRIP = 64
 
 
@@ -30,23 +30,18 @@ def guided_filter(
 
     Parameters
     ----------
-    image : (H, W, C) float32
-        Non-finite pixels are left out and filled.
+    image : (H, W, C) float32, non-finite pixels are left out and filled
     guide : (H, W, G) float32
         Albedo, normal, depth … in any units: each channel is normalised to mean 0 and variance 1 first.
-    radius : int
-        Of the boxes, in pixels of the image.
-    eps : float
-        Regularisation ε as a share of each guide's variance: structure fainter than its root is smoothed.
-    subsample : int
-        1, 2 or 4: coefficients are fitted on an image so many times smaller.
+    radius : int, of the boxes, in pixels of the image
+    eps : float, regularisation ε as a share of each guide's variance: structure fainter than its root is smoothed
+    subsample : int, 1, 2 or 4: coefficients are fitted on an image so many times smaller
     moments : (2, G) float64, optional
         Means and deviations of the guide in the whole frame, from `measure_guide`, where the arrays are a part of it.
 
     Returns
     -------
-    (H, W, C) float32
-        Within the range of the input in the (4·radius + 1)² box that a pixel depends on.
+    (H, W, C) float32, within the range of the input in the (4·radius + 1)² box that a pixel depends on
 
     Notes
     -----

@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# A pixel is bright where it exceeds the picture by half of the light, and by eight deviations of what most pixels do.
+# A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
-# So few bright pixels tell no motion, and so great a share of all is noise.
+# Fewer bright pixels show no motion; a greater share of all pixels is noise.
 _LEAST, _MOST = 20, 0.05
-# Motion is searched for within so many pixels a frame, on a block of so many pixels on a side.
+# Search radius, pixels a frame, and side of the searched block.
 _REACH, _BLOCK = 32, 512
-# A motion is one that this share of the bright pixels have, and more than chance by six deviations and eight pixels.
+# This share of the bright pixels must share a motion, and more than chance by six deviations and eight pixels.
 _SHARE, _SIGMAS, _MORE = 0.2, 6.0, 8
-# Bright pixels that move within so many pixels of where surfaces do are lost highlights, whose samples are noisy: put
-# back as rendered they cost 2.5 dB of a pan over a bar with many lamps.
+# Bright pixels that move within so many pixels of the surfaces' motion are highlights with noisy samples: added back as
+# rendered they cost 2.5 dB of a pan over a bar with many lamps.
 _APART = 2.5
 # The same light differs by a factor of two at most.
 _ALIKE = 2.0
@@ -39,8 +39,7 @@ def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
 
     Parameters
     ----------
-    here, there : (H, W) bool
-        From `find_bright`.
+    here, there : (H, W) bool, from `find_bright`
 
     Notes
     -----
@@ -68,10 +67,8 @@ def confirmed_by_neighbour(
 
     Parameters
     ----------
-    excess, bright : (H, W) array
-        Of the frame, as for `find_bright` and from `find_bright`.
-    other_excess, other_bright : (H, W) array
-        Of the other frame.
+    excess, bright : (H, W) array, of the frame, as for `find_bright` and from `find_bright`
+    other_excess, other_bright : (H, W) array, of the other frame
     flow : (H, W, 2) float32 or None
         Motion of surfaces to the other frame, pixels, x first; None: nothing moves.
     """
@@ -86,10 +83,10 @@ def confirmed_by_neighbour(
             inside &= np.hypot(moved[:, 0], moved[:, 1]) > _APART
         elif np.hypot(down, right) <= _APART:
             continue
-        y, x, own_y, own_x = y[inside], x[inside], rows[inside], columns[inside]
-        own, other = excess[own_y, own_x], other_excess[y, x]
-        alike = other_bright[y, x] & (other <= _ALIKE * own) & (own <= _ALIKE * other)
-        found[own_y[alike], own_x[alike]] = True
+        y, x, from_y, from_x = y[inside], x[inside], rows[inside], columns[inside]
+        here, there = excess[from_y, from_x], other_excess[y, x]
+        alike = other_bright[y, x] & (there <= _ALIKE * here) & (here <= _ALIKE * there)
+        found[from_y[alike], from_x[alike]] = True
     return found
 
 

@@ -16,8 +16,8 @@ Mask = NDArray[np.bool_]
 # The image is cut into tiles whose planes stay in the cache. Long rows, because every pass over a row
 # costs as much again before its first pixel (64 wide: 2.5 times slower than 512).
 _TILE_HEIGHT, _TILE_WIDTH = 32, 512
-# A relative difference of 1e-3 is never told from noise: half floats are no finer (2^-11), and it keeps the
-# colour distance finite where the variance is 0. Relative, so that the filter stays scale equivariant.
+# A relative difference of 1e-3 counts as noise: half floats are no finer (2^-11), and the colour distance stays finite
+# where the variance is 0. Relative, so that the filter stays scale equivariant.
 _RELATIVE_VARIANCE = 1e-6
 # Below the square of any radiance worth keeping (1e-15); only there to make 0/0 a 0.
 _TINY = 1e-30
@@ -28,9 +28,9 @@ _HUGE = 1e18
 # Largest distance a single pixel adds to a patch: one firefly then cannot veto a patch of otherwise
 # matching pixels, nor swamp the running sums.
 _PIXEL_CAP = 25.0
-# A value that lies 28 deviations from the centre's is no tap: (u_p − u_q)² > 400 (V_p + V_q). A firefly so
-# never leaks into its surroundings. Generous, because the tail of ordinary noise has to be averaged with
-# the rest: at ten deviations it stayed, at a cost of up to 0.4 dB against references of three Cycles shots.
+# A value 28 deviations from the centre's is no tap: (u_p − u_q)² > 400 (V_p + V_q), so that no firefly leaks into its
+# surroundings. The tail of ordinary noise must be averaged with the rest: at ten deviations the tail stayed, at a cost
+# of up to 0.4 dB against references of three Cycles shots.
 _FAR = 400.0
 # From this distance on a weight is 0.
 _NEVER = 16.0
@@ -77,12 +77,9 @@ def joint_nlm(
         for all frames, as these are aligned.
     confidence : (T, H, W) float32, optional
         In [0, 1]; default 1.
-    radius, patch_radius : int
-        Of the search and of the compared patches, pixels.
-    k : float
-        Strength of the colour distance: more smooths more.
-    where : (H, W) bool, optional
-        A tile without a True pixel is copied from the centre.
+    radius, patch_radius : int, of the search and of the compared patches, pixels
+    k : float, strength of the colour distance: more smooths more
+    where : (H, W) bool, optional, a tile without a True pixel is copied from the centre
 
     Returns
     -------

@@ -13,21 +13,21 @@ from nlm.variance import second_differences
 
 Floats = NDArray[np.float32]
 
-# Of the guided filter: 9×9 pixels see the samples of a window 400 times, and what is a part of what changes slowly.
+# Guided filter: 9×9 pixels hold the samples of a window 400 times, and shares of light change slowly.
 _RADIUS, _EPS = 4, 1e-2
-# Added to what is divided by, of the exposure: where nothing is lit, all parts have the same share of nothing.
+# Added to divisors, times the exposure: where nothing is lit, all parts have the same share.
 _EPSILON = np.float32(1e-6)
 # A sum may differ from the whole by this share of both and of the exposure: half floats round by 5e-4 for each part
-# and its color. Of the values a twentieth may differ by more: saturated halves, and pixels that are not finite.
+# and its color. A twentieth of the values may differ by more: saturated halves, and non-finite pixels.
 _NEAR, _MOST = 5e-3, 0.05
-# Subsets that are looked at, and values of a frame that each is compared on.
+# Limit of tested subsets, and of compared values of a frame.
 _SUBSETS, _VALUES = 20_000, 1_500
-# A layer has noise where the median of its second differences, in patches of 9×9 pixels, exceeds this share of its
-# mean; so it does in this share of its patches. Edges of masks fill no patch.
+# A layer is noisy if the median of its second differences, in patches of 9×9 pixels, exceeds this share of its mean in
+# this share of its patches. Edges of masks fill no patch.
 _NOISE, _PATCHES = 0.01, 0.02
-# Albedo below which there is no color to speak of.
+# Albedo below this carries no color.
 _DARK = 0.01
-# How often what was bounded is shared out again to the other parts.
+# Rounds that distribute light beyond bounds over the other parts.
 _ROUNDS = 3
 
 
@@ -36,8 +36,7 @@ def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
 
     Parameters
     ----------
-    parts : sequence of (..., C) float32
-        As rendered, times albedo for a layer that is rendered without.
+    parts : sequence of (..., C) float32, as rendered, times albedo for a layer that is rendered without
     whole : (..., C) float32
     exposure : float
     """
@@ -59,8 +58,7 @@ def share_outside(part: Floats, whole: Floats, exposure: float) -> float:
 
     Parameters
     ----------
-    part, whole : (..., C) float32
-        As rendered.
+    part, whole : (..., C) float32, as rendered
     exposure : float
     """
     slack = np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
@@ -75,11 +73,10 @@ def shares_noise(part: Floats, whole: Floats) -> bool:
 
     Parameters
     ----------
-    part, whole : (H, W, 3) float32
-        As rendered, finite.
+    part, whole : (H, W, 3) float32, as rendered, finite
     """
     of_part, of_whole = (_second_differences(layer).astype(np.float64) for layer in (part, whole))
-    # Of the median's order alone: one bright sample has no vote of its own.
+    # Clipped near the median: a single bright sample must not decide.
     most = 10 * np.median(np.abs(of_part)) or np.inf
     of_part, of_whole = (np.clip(found, -most, most) for found in (of_part, of_whole))
     power = float(np.mean(of_part**2))
@@ -109,15 +106,13 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
 
     Parameters
     ----------
-    layer : (H, W, C) float32
-        As rendered, finite.
-    albedo : (H, W, 3) float32
-        In [0, 1].
+    layer : (H, W, C) float32, as rendered, finite
+    albedo : (H, W, 3) float32, in [0, 1]
     """
     color = albedo if layer.shape[-1] == albedo.shape[-1] else albedo.mean(axis=-1, keepdims=True)
     light, level = np.abs(_blur(layer)), _blur(color)
     lit = (light > 0) & (level > _DARK)
-    # No further than once the mean: a firefly is no texture.
+    # Clipped to once the mean: a firefly is no texture.
     of_layer, of_color = (
         np.clip((image[lit] - mean[lit]) / mean[lit], -1, 1).astype(np.float64)
         for image, mean in ((layer, light), (color, level))
@@ -138,8 +133,7 @@ def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[
 
     Returns
     -------
-    list of tuple of int
-        Indices of layers.
+    list of tuple of int, indices of layers
 
     Notes
     -----
@@ -189,7 +183,7 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
             continue
         if chosen and np.mean(np.abs(total - target) <= slack) >= 1 - _MOST:
             found.append(chosen)
-            continue  # more of them add next to nothing
+            continue  # further layers add next to nothing
         if k < len(values):
             begun += [(k + 1, chosen, total), (k + 1, (*chosen, k), total + values[k])]
     return found
@@ -202,12 +196,9 @@ def filter_layers(
 
     Parameters
     ----------
-    layers : sequence of (H, W, C) float32
-        Averaged over time.
-    guide : (H, W, G) float32
-        The denoised light and more.
-    moments : (2, G) float64, optional
-        As for `nlm.guided.guided_filter`.
+    layers : sequence of (H, W, C) float32, averaged over time
+    guide : (H, W, G) float32, the denoised light and more
+    moments : (2, G) float64, optional, as for `nlm.guided.guided_filter`
     """
     if not layers:
         return []
@@ -230,8 +221,7 @@ def split_light(
     ----------
     filtered : sequence of (H, W, 3) float32
         The parts, from `filter_layers`; negative light is allowed.
-    denoised : (H, W, 3) float32
-        The picture.
+    denoised : (H, W, 3) float32, the picture
     exposure : float
     factors : sequence of (H, W, 3) float32 or None, optional
         Factor of each part in the sum, at least 0; None: 1.
@@ -240,8 +230,7 @@ def split_light(
 
     Returns
     -------
-    list of (H, W, 3) float32
-        Parts that add up to `denoised` where the bounds allow this.
+    list of (H, W, 3) float32, parts that add up to `denoised` where the bounds allow this
 
     Notes
     -----
@@ -268,7 +257,7 @@ def split_light(
         share = np.divide(gap, total, out=np.zeros_like(gap), where=total > 0)
         for k, limit in enumerate(limits):
             part = parts[k] + share * weights[k]
-            np.maximum(part, 0, out=part, where=(filtered[k] >= 0) & (denoised >= 0))  # but for rounding it is
+            np.maximum(part, 0, out=part, where=(filtered[k] >= 0) & (denoised >= 0))  # differs by rounding alone
             if limit is not None:
                 bounded = np.clip(part, *limit)
                 weights[k] = np.where(bounded == part, weights[k], np.float32(0))
@@ -282,10 +271,8 @@ def add_light(parts: Sequence[Floats], factors: Sequence[Floats | np.float32 | N
 
     Parameters
     ----------
-    parts : sequence of (H, W, C) float32
-        At least one.
-    factors : sequence of (H, W, C) float32 or None
-        None: 1.
+    parts : sequence of (H, W, C) float32, at least one
+    factors : sequence of (H, W, C) float32 or None, where None is 1
     """
     total = np.zeros_like(parts[0])
     for part, factor in zip(parts, factors, strict=True):

@@ -34,8 +34,7 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
 
     Parameters
     ----------
-    estimates : (T, H, W, 3) float32
-        Denoised, aligned by an interpolation that keeps detail.
+    estimates : (T, H, W, 3) float32, denoised, aligned by an interpolation that keeps detail
     residuals : (T, H, W, 3) float32
         Noisy frame minus estimate, subtracted before alignment and aligned to the nearest pixel: interpolated noise is
         no longer white, and a denoiser takes such noise for texture.
@@ -73,8 +72,7 @@ def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Fl
 
     Parameters
     ----------
-    picture : (H, W, 3) float32
-        Finite.
+    picture : (H, W, 3) float32, finite
     estimates, residuals : (T, H, W, 3) float32
         As for `pool_samples`, in the unit of the picture. Non-finite values do not count.
     """

@@ -24,15 +24,11 @@ def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, 
 
     Parameters
     ----------
-    window : (T, H, W, 3) float32
-        Aligned pictures, contiguous, finite.
-    alike : (T, H, W) float32
-        Confidence of each pixel as is.
-    trusted : (T, H, W) float32
-        Confidence without regard to light, at least `alike`.
+    window : (T, H, W, 3) float32, aligned pictures, contiguous, finite
+    alike : (T, H, W) float32, confidence of each pixel as is
+    trusted : (T, H, W) float32, confidence without regard to light, at least `alike`
     exposure : float
-    first_row : int
-        The frame's row that the first row belongs to: cells lie as in the whole frame.
+    first_row : int, the frame's row that the first row belongs to: cells lie as in the whole frame
 
     Notes
     -----

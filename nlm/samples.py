@@ -19,36 +19,36 @@ from nlm.variance import gaussian_mean, ratio, second_differences
 
 Floats = NDArray[np.float32]
 
-# A correction counts as far as it exceeds its own noise by so many deviations, and so many times the variance. At 1
-# noise that looks like detail costs up to 1.3 dB of a rendered shot at 8 samples; at 2.5 no shot at 8 to 512 samples
-# loses more than 0.03 dB.
+# Deviations, and multiples of the variance, of its own noise that are subtracted from a correction. At 1, noise that
+# looks like detail costs up to 1.3 dB of a rendered shot at 8 samples; at 2.5 no shot at 8 to 512 samples loses more
+# than 0.03 dB.
 _DEVIATIONS = 2.5
 _VARIANCES = 2.5
-# Where no other frame tells the noise, the spatial residual does, which a renderer's filter that spreads samples over
-# its neighbours (σ = 1 pixel) makes up to 100 times too small.
+# Without neighbours the noise comes from the spatial residual, which a renderer's pixel filter (σ = 1 pixel) makes up
+# to 100 times too small.
 _SPREAD = 300.0
-# Deviations of the Gaussians that errors are averaged with, pixels: over 200 pixels for what frames have in common, and
-# over 50 for what one frame shows alone.
+# Deviations, pixels, of the Gaussians that average errors: over 200 pixels for detail that frames share, and over 50
+# for detail of the centre alone.
 _SIGMA_SHARED, _SIGMA_CENTRE = 4.0, 2.0
-# Errors are relative to the light, which is the picture's mean over σ = 2 pixels plus this share of the exposure: in
-# the dark an error is seen by its size, and not by its ratio.
+# Errors are relative to the light: the picture's mean over σ = 2 pixels plus this share of the exposure, as the eye
+# sees an error in the dark by its size, and not by its ratio.
 _DARK = 0.3
 # A relative error counts up to this: a firefly must not decide for all pixels around it.
 _LIMIT = np.float32(6)
-# Means are restored over Gaussians of these deviations, pixels, where their squares exceed k (1 + f / N) times their
-# variance, N being how many samples the noise comes from: (deviation, k, f). A variance that a few bright samples make
-# is not known itself. Without f a shot at 54 dB lost 2 dB to five fireflies; so no shot at 8 to 512 samples loses 0.1.
+# (deviation in pixels, k, f) of the Gaussians over which means are restored, where the square of a mean exceeds
+# k (1 + f / N) times its variance, N the number of samples that make the noise: a variance from a few bright samples is
+# unknown itself. Without f a shot at 54 dB lost 2 dB to five fireflies; with f no shot at 8 to 512 samples loses 0.1.
 _MEANS = (48.0, 1.0, 3000.0), (12.0, 8.0, 300.0)
-# How far a sample may lie from the picture when means are compared, in units of the light. Limits of 20 to 200 bring
-# the mean equally near; 6 leaves 1 % where lamps are small.
+# Limit of the distance of a sample from the picture when means are compared, in units of the light. Limits of 20 to 200
+# restore the mean equally well; 6 leaves 1 % where lamps are small.
 _FAR = np.float32(20)
-# The light that a mean is relative to has this share of its surroundings: there is noise where a picture is black.
+# This share of the surrounding mean is added to the light: black pixels have noise too.
 _SOFT = 0.05
-# Light beyond so many exposures is a lamp's, and does not count as the light of its surroundings.
+# Light beyond so many exposures is a highlight, and does not count in the mean of its surroundings.
 _LAMP = 4.0
-# The least weight of a frame whose geometry is the centre's, and whose light is not.
+# Least weight of a frame with the centre's geometry and other light.
 _OTHER_LIGHT = 0.02
-# Cells of a mean on a side of its deviation.
+# Cells per deviation of a mean.
 _CELLS = 6
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
 _WARPED = np.float32(0.7)
@@ -72,12 +72,10 @@ def average_neighbours(
     ----------
     estimates : (T, H, W, 3) float32
         Denoised, aligned; with `residuals` None the noisy frames.
-    residuals : (T, H, W, 3) float32, optional
-        Noisy frame minus estimate, aligned.
+    residuals : (T, H, W, 3) float32, optional, noisy frame minus estimate, aligned
     confidence, geometry : (T, H, W) float32
         Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
-    modulation : (H, W, 3) float32
-        Factor from the unit of the window to radiance.
+    modulation : (H, W, 3) float32, factor from the unit of the window to radiance
     """
     weight = np.maximum(confidence, np.float32(_OTHER_LIGHT) * geometry)
     estimates, weight = check_window(estimates, weight, "confidence")
@@ -98,19 +96,15 @@ def blend_samples(
 
     Parameters
     ----------
-    picture : (H, W, 3) float32
-        Denoised, finite.
-    noisy : (H, W, 3) float32
-        The frame as rendered, finite.
+    picture : (H, W, 3) float32, denoised, finite
+    noisy : (H, W, 3) float32, the frame as rendered, finite
     neighbours : SampleMean
     exposure : float
-    variance : (H, W, 3) float32, optional
-        Variance of `noisy` from the renderer, used where no neighbour is trusted.
+    variance : (H, W, 3) float32, optional, variance of `noisy` from the renderer, used where no neighbour is trusted
 
     Returns
     -------
-    (H, W, 3) float32
-        `noisy` where it has no noise, `picture` where the noise exceeds the difference of both.
+    (H, W, 3) float32, `noisy` where it has no noise, `picture` where the noise exceeds the difference of both
 
     Notes
     -----
@@ -172,8 +166,7 @@ def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
     Parameters
     ----------
     noisy, picture : (H, W, 3) float32
-    rate : (H, W) float32
-        One over the light.
+    rate : (H, W) float32, one over the light
     """
     residuals = (second_differences(image) * rate[..., None] for image in (noisy, noisy - picture))
     energies = (np.square(residual).sum(axis=-1) / np.float32(36) for residual in residuals)
@@ -185,16 +178,13 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
 
     Parameters
     ----------
-    picture : (H, W, 3) float32
-        Denoised, finite.
-    noisy : (H, W, 3) float32
-        The frame as rendered, fireflies included, finite: right in the mean.
+    picture : (H, W, 3) float32, denoised, finite
+    noisy : (H, W, 3) float32, the frame as rendered, fireflies included, finite: right in the mean
     exposure : float
 
     Returns
     -------
-    (H, W, 3) float32
-        Nowhere below 0 where the picture is not.
+    (H, W, 3) float32, nowhere below 0 where the picture is not
 
     Notes
     -----

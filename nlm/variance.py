@@ -19,10 +19,10 @@ _CAP = 16.0
 # Variance of a bilinearly warped frame over the centre's: the mean of (2/3)² (any fraction of a pixel along
 # both axes), 2/3 (along one) and 1 (none). It counts only where side frames are few.
 _WARPED = 0.7
-# Variance of guides without noise: deviations of a thousandth of their range. What the filter would change in a tile
-# that has no more is 1e-4 (RMS, five shots).
+# Variance of guides without noise: deviations of a thousandth of their range. In tiles with no more the filter would
+# change 1e-4 (RMS, five shots).
 _NOISELESS = np.float32(1e-6)
-# Of the boxes that variances are smoothed with, pixels.
+# Radius, pixels, of the boxes that smooth variances.
 _RADIUS = 2
 
 
@@ -31,8 +31,7 @@ def variance_from_halves(a: Floats, b: Floats) -> Floats:
 
     Parameters
     ----------
-    a, b : (H, W, C) float32
-        The same picture twice, each with half of the samples.
+    a, b : (H, W, C) float32, the same picture twice, each with half of the samples
     """
     if a.shape != b.shape:
         raise ValueError(f"b: expected shape {a.shape} like a, got {b.shape}")
@@ -44,15 +43,12 @@ def variance_from_window(window: Floats, confidence: Floats) -> Floats:
 
     Parameters
     ----------
-    window : (T, H, W, C) float32
-        Finite.
-    confidence : (T, H, W) float32
-        In [0, 1].
+    window : (T, H, W, C) float32, finite
+    confidence : (T, H, W) float32, in [0, 1]
 
     Returns
     -------
-    (H, W, C) float32
-        In squared units.
+    (H, W, C) float32, in squared units
 
     Notes
     -----
@@ -130,15 +126,12 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
 
     Parameters
     ----------
-    guides : (T, H, W, F) float32
-        Aligned, finite, of about unit range.
-    confidence : (T, H, W) float32
-        In [0, 1].
+    guides : (T, H, W, F) float32, aligned, finite, of about unit range
+    confidence : (T, H, W) float32, in [0, 1]
 
     Returns
     -------
-    (H, W, F) float32
-        Guides without noise come back as they are, to about 1e-3.
+    (H, W, F) float32, guides without noise come back as they are, to about 1e-3
 
     Notes
     -----
@@ -163,10 +156,8 @@ def gaussian_mean(image: Floats, sigma: float) -> Floats:
 
     Parameters
     ----------
-    image : (H, W) float32
-        Finite.
-    sigma : float
-        Pixels.
+    image : (H, W) float32, finite
+    sigma : float, pixels
     """
     side = 2 * int(3 * sigma) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
