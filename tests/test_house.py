@@ -145,6 +145,46 @@ def test_compiled_loops_leave_the_order_of_arithmetic_alone():
     assert parallel == {"tvl1.py", "kernels.py"}
 
 
+def defines(dotted: str) -> bool:
+    """Whether a dotted name is a module or package, or a name in a module, or a name in a class of a module."""
+    parts = dotted.split(".")
+    for count in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:count])
+        path = path.with_suffix(".py") if path.with_suffix(".py").is_file() else path / "__init__.py"
+        if path.is_file():
+            body: list[ast.stmt] | None = ast.parse(path.read_text(encoding="utf-8")).body
+            for name in parts[count:]:
+                body = None if body is None else members(body).get(name)
+            return body is not None
+    return False
+
+
+def members(body: list[ast.stmt]) -> dict[str, list[ast.stmt]]:
+    """Names that statements define, with the statements of those that are classes."""
+    found: dict[str, list[ast.stmt]] = {}
+    for node in body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            found[node.name] = node.body if isinstance(node, ast.ClassDef) else []
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found[node.target.id] = []
+        elif isinstance(node, ast.Assign):
+            found |= {name.id: [] for target in node.targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+    return found
+
+
+def test_names_of_the_glossary_exist():
+    page = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    glossary = page.partition("## Glossary")[2].partition("## Words")[0]
+    cells = [line.strip("|").split("|")[-1] for line in glossary.splitlines() if line.startswith("| ")]
+    cells = [cell for cell in cells if cell.strip() != "code"]
+    assert len(cells) > 50
+    assert all("`" in cell for cell in cells)
+    assert [name for cell in cells for name in re.findall(r"`([\w.]+)`", cell) if not defines(name)] == []
+    assert defines("flow")
+    assert not defines("hybrid.plan.NOTHING")
+    assert not defines("hybrid.nothing")
+
+
 def public_functions(package: str) -> list[tuple[str, ast.FunctionDef]]:
     """Functions that others may call, methods left out; `simulate` builds scenes for itself alone."""
     inner = {"commands", "simulate"}
