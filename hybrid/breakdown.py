@@ -1,4 +1,4 @@
-"""What each frame of the window has contributed: layers, figures, and a picture."""
+"""Contribution of each frame of the window to a result: layers, statistics, and an image."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from nlm.average import average, replace_nonfinite
 
 Array = NDArray[np.float32]
 
-# Pixels on a side of a frame in the picture, at most: seven of them stand side by side.
-PICTURE_SIDE = 480
+PICTURE_SIDE = 480  # pixels of the longer side of a frame in the image, at most: up to seven are side by side
 
 
 def frame_names(frames: int) -> list[str]:
-    """Names of the frames of a window, as layers are called: before2, before1, centre, after1, after2."""
+    """Return the names of a window's frames in time order: before2, before1, centre, after1, after2."""
     offsets = range(-(frames // 2), frames // 2 + 1)
     return [f"before{-k}" if k < 0 else f"after{k}" if k else "centre" for k in offsets]
 
 
 class Breakdown:
-    """Weights of the frames over all pixels and frames of a shot, as in the paper's Table 1.
+    """Statistics of the frames' weights over all pixels and frames of a shot, as in the paper's Table 1.
 
     References
     ----------
@@ -40,7 +39,7 @@ class Breakdown:
         self._sum = self._least = self._greatest = np.zeros(0)
 
     def add(self, weights: Array) -> None:
-        """Count the weights ``(T, H, W)`` of one more frame."""
+        """Add the weights ``(T, H, W)`` of one more frame."""
         flat = weights.reshape(len(weights), -1).astype(np.float64)
         if not self.pixels:
             self._sum = np.zeros(len(flat))
@@ -51,7 +50,7 @@ class Breakdown:
         self.pixels += flat.shape[1]
 
     def rows(self) -> Iterator[tuple[str, str, str, str]]:
-        """Frame, average, minimum and maximum weight, to be printed; none where nothing has been counted."""
+        """Yield name, average, minimum and maximum weight of each frame, formatted; nothing before the first `add`."""
         if not self.pixels:
             return
         values = (self._sum / self.pixels, self._least, self._greatest)
@@ -60,19 +59,14 @@ class Breakdown:
 
 
 def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
-    """Layers to be added to a frame's file.
+    """Return the layers for a frame's file: ``contribution.before2`` and so on, ``weight.before2`` and so on.
 
     Parameters
     ----------
     parts : (T, H, W, 3) array
-        Radiance that each frame contributes; they sum to the result.
+        Radiance contributed by each frame, in time order; their sum is the result.
     weights : (T, H, W) array
-        Weight of each frame; they sum to 1.
-
-    Returns
-    -------
-    dict of str to array
-        ``contribution.before2`` and so on, ``weight.before2`` and so on.
+        Weight of each frame; their sum is 1.
     """
     names = frame_names(len(parts))
     layers = {f"contribution.{name}": part for name, part in zip(names, parts, strict=True)}
@@ -80,22 +74,20 @@ def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
 
 
 def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
-    """Layers that say what each stage did where.
+    """Return layers in [0, 1] that show the effect of each stage.
 
     Parameters
     ----------
     aligned : AlignedWindow
-        A window.
     irradiance : (H, W, 3) array
-        What was made of it.
+        Result of the window.
 
     Returns
     -------
     dict of str to (H, W) array
-        All in [0, 1]. ``stage.align``: how far geometry trusts the other frames, their mean, those that are missing
-        aside. ``stage.gate``: the same after their light was compared. ``stage.network``: by which share the result
-        differs from the average of the estimates (of the colors, where there are none) over the frames so weighed,
-        |r − a| / (a + exposure), means over channels.
+        ``stage.align``: mean geometric confidence of the neighbours that exist. ``stage.gate``: the same after
+        comparison of their light. ``stage.network``: relative difference of the result to the weighted average of the
+        first passes (without these: of the colors), |r − a| / (a + exposure), means over channels.
     """
     sides = [
         index for index, trust in enumerate(aligned.geometric_confidence) if index != aligned.centre and trust.any()
@@ -111,19 +103,19 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
 
 
 def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, path: Path) -> None:
-    """Write a PNG of the middle frame: noisy and denoised, what each frame contributes, and its weight.
+    """Write a PNG of the middle frame: noisy and denoised, the contributions in time order, and below their weights.
+
+    Weights are black at 0 and white at 1; all other images have one exposure and are sRGB encoded.
 
     Parameters
     ----------
     pictures : sequence of Shot
-        The input, once for each picture in its files; they stand one below the other.
+        The noisy shot, once for each view in its files; the views are below each other.
     output : str or Path
-        Where frames with the layers of `layers_of` have been written.
+        Pattern or folder of frames with the layers of `layers_of`.
     frames : int
         Length of the window.
     path : Path
-        Of the PNG. Top row: noisy, denoised. Then the contributions of the frames in order of time, and below each
-        its weight, black 0 and white 1. All but the weights are exposed alike and sRGB encoded.
     """
     sheets = [_sheet(shot, output, frame_names(frames)) for shot in pictures]
     width = max(sheet.shape[1] for sheet in sheets)
@@ -133,7 +125,7 @@ def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, p
 
 
 def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:
-    """The rows of one picture, in [0, 1]."""
+    """The rows of one view, in [0, 1]."""
     number = shot.numbers[len(shot.numbers) // 2]
     kinds = [[shot.own_name(f"{kind}.{name}") for name in names] for kind in ("contribution", "weight")]
     denoised = shot.reopened({number: output_path(output, shot, number)}, aovs=[*kinds[0], *kinds[1]]).read(number)

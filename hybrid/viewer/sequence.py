@@ -1,4 +1,4 @@
-"""A sequence of EXR files as someone watches it: frames that come, layers, each as a picture of 8 bits."""
+"""A sequence of EXR files for the viewer: frames as they appear, and their layers as 8-bit images."""
 
 from __future__ import annotations
 
@@ -25,35 +25,29 @@ from hybrid.files.sources import MADE_FROM
 from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
 
-Picture = NDArray[np.uint8]
+Image8 = NDArray[np.uint8]
 
-# Layers of frames that were looked at lately, so that another exposure is a matter of milliseconds.
-KEPT_BYTES = 512 * 2**20
-# Of a JPEG, pixels.
-LARGEST_SIDE = 65500
+# Cache of decoded layers, so that another exposure takes milliseconds.
+CACHE_BYTES = 512 * 2**20
+LARGEST_SIDE = 65500  # pixels of a JPEG
 
 
 class Sequence:
-    """Frames of a pattern or a folder; there may be none yet.
+    """Frames of a pattern, a folder or one file; there may be none yet.
 
-    Parameters
-    ----------
-    spec : str
-        ``shot.####.exr``, a folder, or one file.
-    finished : bool
-        Whether it is a result: then the denoised picture is shown first, also where the file keeps a noisy one.
+    With `finished` the denoised layer is the first choice, also where the file keeps a noisy one.
     """
 
     def __init__(self, spec: str, *, finished: bool) -> None:
         self.spec = spec
         self.finished = finished
         self._files: dict[int, Path] = {}
-        self._kept: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
+        self._cache: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
         self._ranges: dict[str, tuple[float, float]] = {}
         self._lock = threading.Lock()
 
     def files(self) -> dict[int, Path]:
-        """Frame number → file, of what is there now."""
+        """Return the files that exist now, by frame number."""
         try:
             found, frames = find_files(self.spec)
         except FileNotFoundError:
@@ -63,97 +57,77 @@ class Sequence:
         return self._files
 
     def versions(self) -> dict[int, str]:
-        """Frame number → what changes when its file is replaced."""
+        """Return a version of each file, by frame number, that changes when the file is replaced."""
         found = {}
         for number, path in self.files().items():
             try:
                 status = path.stat()
-            except OSError:  # gone since the folder was listed
+            except OSError:  # deleted since the folder was listed
                 continue
             found[number] = _version(status)
         return found
 
     def layers(self, number: int) -> tuple[list[str], str]:
-        """Names of the layers of a frame, and of the one to begin with; from the header."""
+        """Return the names of a frame's layers, and the name of the first choice; reads the header only."""
         image = read_exr(self._path(number), pixels=False)
         taken = _layers(image)
         first = taken.target if self.finished else taken.color
         return [_name(layer) for layer in image.layers], _name(first)
 
     def check_sizes(self) -> None:
-        """Refuse a sequence whose frames are too large to be shown; from the header of the first.
-
-        Raises
-        ------
-        ExrError
-            If the display window is larger than what can be shown.
-        """
+        """Raise ExrError if the display window of the first frame is too large for the viewer."""
         for path in list(self.files().values())[:1]:
             try:
                 image = read_exr(path, pixels=False)
-            except (OSError, ExrError):  # not whole yet
+            except (OSError, ExrError):  # incomplete so far
                 continue
             _refuse_large_display(image)
 
     def exposure(self, number: int) -> float:
-        """What the color of a frame is divided by for a mean of 0.18."""
+        """Return the divisor that brings the mean of a frame's color to 0.18."""
         image = read_exr(self._path(number))
         color, _ = replace_nonfinite(image.pixels(_layers(image).color.channels))
         return float(measure_exposure(color) / 0.18)
 
-    def picture(self, number: int, name: str, gain: float, ev: float) -> Picture:
-        """Show a layer of a frame.
+    def picture(self, number: int, name: str, gain: float, ev: float) -> Image8:
+        """Return a layer of a frame as an (H, W, 3) 8-bit image on the display window, black outside the data.
 
-        Parameters
-        ----------
-        number : int
-            Frame number.
-        name : str
-            Of the layer, as `layers` gives it.
-        gain : float
-            What radiance is multiplied by.
-        ev : float
-            Stops that albedo and single channels are brightened by.
-
-        Returns
-        -------
-        (H, W, 3) uint8 array
-            On the display window, black outside the data. Radiance and albedo are sRGB encoded. Vectors have their zero
-            at middle gray; single channels are gray, those in [0, 1] as they are. What black and white are of vectors
-            and of other channels is the range of the first frame that was looked at.
+        Radiance is multiplied by `gain`, albedo and single channels are brightened by `ev` stops; radiance and albedo
+        are sRGB encoded. Vectors have their zero at middle gray. Single channels are gray: in [0, 1] unchanged,
+        others scaled, like vectors, by the range of the first frame that was shown.
 
         Raises
         ------
         KeyError
             If there is no such frame or layer.
         OSError, ExrError
-            If the file cannot be read, for instance because it is not whole yet.
+            If the file cannot be read, for instance because it is incomplete so far.
         """
         path = self._path(number)
         key = path, _version(path.stat()), name
         with self._lock:
-            pixels = self._kept.get(key)
+            pixels = self._cache.get(key)
         image = read_exr(path, pixels=pixels is None)
         layer = {_name(layer): layer for layer in image.layers}[name]
         _refuse_large_display(image)
         if pixels is None:
             pixels = image.pixels(layer.channels)
-            self._keep(key, pixels)
+            self._cache_pixels(key, pixels)
         return _on_display_window(self._encode(pixels, layer, _layers(image), gain, ev), image.parts[layer.part])
 
     def facts(self, number: int) -> dict[str, Any]:
-        """What a frame's header says of its making, and the mean weight of each frame of its window, if it has them."""
+        """Return the header's facts on the denoising, and the mean weight of each frame of the window, if present."""
         path = self._path(number)
         image = read_exr(path, pixels=False)
         header = image.parts[0].header
         own = {key: value for key, value in header.items() if key.startswith("ravg/") and key != MADE_FROM}
         made = {key.removeprefix("ravg/"): str(value) for key, value in own.items()}
-        # Options that were given stand in a header by themselves, as JSON.
+        # The given options are one attribute, as JSON.
         with suppress(ValueError, AttributeError, RecursionError):
             settings = json.loads(made.get("settings", "{}")).items()
             made = {name: value for name, value in made.items() if name != "settings"}
             made |= {name: str(value) for name, value in settings if value not in (None, False)}
-        # Of one of several pictures they are called after it: Back.Combined.weight.before1.
+        # A view's layers have its name: Back.Combined.weight.before1.
         weights = {
             layer.name.replace("weight.", ""): layer
             for layer in image.layers
@@ -166,39 +140,39 @@ class Sequence:
         return {"file": path.name, "made": made, "weights": means}
 
     def record(self) -> dict[str, Any]:
-        """What the latest run has left beside its frames: stages with their cost, and the plan; {} where none has."""
-        beside = next(iter(self._files.values()), None)
-        records = [] if beside is None else list(read_records(beside.parent, sequence_name(beside)))
+        """Return the record of the latest run: stages with their cost, and the plan; {} if there is none."""
+        path = next(iter(self._files.values()), None)
+        records = [] if path is None else list(read_records(path.parent, sequence_name(path)))
         return records[-1][1] if records else {}
 
     def _path(self, number: int) -> Path:
         return self._files[number] if number in self._files else self.files()[number]
 
-    def _keep(self, key: Hashable, pixels: NDArray[Any]) -> None:
+    def _cache_pixels(self, key: Hashable, pixels: NDArray[Any]) -> None:
         with self._lock:
-            self._kept[key] = pixels
-            while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > KEPT_BYTES:
-                self._kept.popitem(last=False)
+            self._cache[key] = pixels
+            while len(self._cache) > 1 and sum(cached.nbytes for cached in self._cache.values()) > CACHE_BYTES:
+                self._cache.popitem(last=False)
 
-    def _encode(self, pixels: NDArray[Any], layer: Layer, taken: Layers, gain: float, ev: float) -> Picture:
+    def _encode(self, pixels: NDArray[Any], layer: Layer, taken: Layers, gain: float, ev: float) -> Image8:
         components = [component_of(channel) for channel in layer.channels]
         roles = {kind.name: role for role, kind in vars(taken).items() if isinstance(kind, Layer)}
         shown: NDArray[Any]
         if components[:3] == ["R", "G", "B"]:
             shown = encode_srgb(pixels[..., :3] * np.float32(2**ev if roles.get(layer.name) == "albedo" else gain))
         elif len(components) > 1:
-            vectors = pixels[..., : 3 if len(components) == 3 else 2]  # of four, the others lead to another frame
+            vectors = pixels[..., : 3 if len(components) == 3 else 2]  # the last two of four point to another frame
             low, high = self._range(layer.name, vectors)
             shown = np.full((*pixels.shape[:2], 3), 0.5, np.float32)
-            shown[..., : vectors.shape[2]] += vectors / max(2 * max(high, -low), 1e-30)  # where all is zero, gray
+            shown[..., : vectors.shape[2]] += vectors / max(2 * max(high, -low), 1e-30)  # gray where all is zero
         else:
             low, high = self._range(layer.name, pixels)
-            brightness = 2**ev / max(high - low, 1e-30)  # where all is one value, black
+            brightness = 2**ev / max(high - low, 1e-30)  # black for a constant
             shown = np.repeat((pixels - low) * brightness, 3, axis=2)
         return np.round(np.clip(np.nan_to_num(shown), 0, 1) * 255).astype(np.uint8)
 
     def _range(self, name: str, pixels: NDArray[Any]) -> tuple[float, float]:
-        """What is black and white in a layer: the same for all frames, or they would flicker."""
+        """Black and white level of a layer: the same for all frames, or they would flicker."""
         with self._lock:
             if name not in self._ranges:
                 finite = pixels[np.isfinite(pixels)]
@@ -209,12 +183,12 @@ class Sequence:
 
 
 def _version(status: os.stat_result) -> str:
-    """What changes when a file is replaced or written to, also by one of the same size and time."""
+    """A text that changes when a file is replaced or written, also with the same size and time."""
     return f"{status.st_mtime_ns:x}-{status.st_size:x}-{status.st_ino:x}-{status.st_ctime_ns:x}"
 
 
 def _layers(image: ExrImage) -> Layers:
-    """What is taken for what; of files with several pictures, of the first."""
+    """The layers by their roles; of files with several views, of the first view."""
     try:
         return find_layers(image)
     except ExrError:
@@ -223,7 +197,7 @@ def _layers(image: ExrImage) -> Layers:
 
 
 def _time_of(name: str) -> tuple[str, int]:
-    """Of which picture, and where in time: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
+    """View and offset in time of a weight: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
     picture, _, name = name.rpartition(".")
     digits = name.strip("abcdefghijklmnopqrstuvwxyz")
     return picture, (-1 if name.startswith("before") else 1) * int(digits or 0)
@@ -234,7 +208,7 @@ def _name(layer: Layer) -> str:
 
 
 def _refuse_large_display(image: ExrImage) -> None:
-    """Raise ExrError for a picture that is too large to be shown, however few of its pixels are stored."""
+    """Raise ExrError for a display window that is too large, however few pixels are stored."""
     for part in image.parts:
         left, top, right, bottom = part.display_window
         width, height = right - left + 1, bottom - top + 1
@@ -245,8 +219,8 @@ def _refuse_large_display(image: ExrImage) -> None:
             )
 
 
-def _on_display_window(picture: Picture, part: Part) -> Picture:
-    """A picture of the data window, cut or surrounded with black to the display window."""
+def _on_display_window(picture: Image8, part: Part) -> Image8:
+    """An image of the data window, cropped or padded with black to the display window."""
     left, top, right, bottom = part.display_window
     x, y, last_x, last_y = part.data_window
     if (left, top, right, bottom) == (x, y, last_x, last_y):
@@ -260,19 +234,14 @@ def _on_display_window(picture: Picture, part: Part) -> Picture:
     return shown
 
 
-def encode_picture(picture: Picture, suffix: str) -> bytes:
-    """Encode a picture as a browser takes it.
+def encode_picture(picture: Image8, suffix: str) -> bytes:
+    """Encode an image for a browser.
 
     Parameters
     ----------
     picture : (H, W, 3) array of uint8
-        Red, green and blue.
     suffix : str
-        "png", which is exact, or "jpg", which is small and quick.
-
-    Returns
-    -------
-    bytes
+        "png" (lossless), or "jpg" (small and fast).
     """
     settings = {
         "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],

@@ -1,9 +1,8 @@
-"""The page and its pictures over HTTP: to this machine alone, and to whoever has the address that is printed.
+"""HTTP server of the viewer: the page and its images, for this machine and the printed address only.
 
-Every address begins with a secret that is drawn anew for each run, so that no other user of the machine, and no page
-from elsewhere in the same browser, can ask for a picture. A request whose ``Host`` is not this server's own is refused:
-it comes from a page whose name was pointed at this machine (DNS rebinding). No part of an address is ever a path: a
-sequence goes by its position, a frame by its number, a layer by its name in the file's header.
+Every URL begins with a secret that is random for each run, so that neither other users of the machine nor other pages
+in the browser can request an image. A request with a foreign ``Host`` is refused (DNS rebinding). No part of a URL is a
+path: a sequence is given by its position, a frame by its number, a layer by its name in the file's header.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from hybrid.files.exr import ExrError
 from hybrid.viewer.sequence import Sequence, encode_picture
 
 LOOPBACK = "127.0.0.1"
-# What the page may do: show and ask for what this server has, and nothing else.
+# The page may only request what this server provides.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -42,26 +41,10 @@ KINDS = {"png": "image/png", "jpg": "image/jpeg"}
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Serves sequences to a browser on this machine.
-
-    Parameters
-    ----------
-    sequences : list of Sequence
-        The first is the result, the others stand beside it.
-    rate : float
-        Frames per second.
-    port : int
-        0: one that is free.
-
-    Raises
-    ------
-    OSError
-        If the port is taken.
-    """
+    """Serves sequences (the first is the result) to a browser on this machine; port 0: any free port."""
 
     daemon_threads = True
-    # Windows would let two servers share a port.
-    allow_reuse_address = sys.platform != "win32"
+    allow_reuse_address = sys.platform != "win32"  # there two servers could share a port
 
     def __init__(self, sequences: list[Sequence], *, rate: float = 24, port: int = 0) -> None:
         self.sequences = sequences
@@ -81,25 +64,25 @@ class ViewServer(ThreadingHTTPServer):
 
     @property
     def hosts(self) -> set[str]:
-        """What a request may name as its host."""
+        """Accepted values of ``Host``."""
         return {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
 
     @property
     def exposure(self) -> float:
-        """What radiance is divided by at 0 EV, everywhere: measured on a frame of the last sequence that has one."""
+        """Divisor of radiance at 0 EV for all sequences, from the middle frame of the last sequence that has frames."""
         if self._exposure is None:
             for sequence in reversed(self.sequences):
                 numbers = sorted(sequence.files())
                 if numbers:
                     try:
                         self._exposure = sequence.exposure(numbers[len(numbers) // 2])
-                    except (OSError, ExrError):  # not whole yet
+                    except (OSError, ExrError):  # incomplete so far
                         continue
                     break
         return self._exposure or 1.0
 
     def state(self) -> dict[str, Any]:
-        """What there is now: frames with their versions, layers, the record of the run."""
+        """Return the current frames with their versions, the layers, and the record of the run."""
         names = [Path(sequence.spec).name for sequence in self.sequences]
         if len(set(names)) < len(names):  # noisy/shot.####.exr and denoised/shot.####.exr
             names = ["/".join(Path(sequence.spec).parts[-2:]) for sequence in self.sequences]
@@ -127,7 +110,7 @@ class ViewServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: ViewServer
     protocol_version = "HTTP/1.1"
-    timeout = 60  # a connection that nobody uses is closed
+    timeout = 60  # seconds until an idle connection is closed
 
     def do_GET(self) -> None:
         if self.headers.get("Host") not in self.server.hosts:
@@ -141,7 +124,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             code, kind, body, lasting = self._find(rest, parse_qs(parts.query))
         except (KeyError, IndexError, ValueError) as error:
-            # A damaged file is one that the page may ask for again: it may not be whole yet.
+            # The page may request a damaged file again: it may be incomplete so far.
             code = 409 if isinstance(error, ExrError) else 404
             self._answer(code, "text/plain; charset=utf-8", str(error).encode())
         except MemoryError as error:
@@ -152,7 +135,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(code, kind, body, lasting=lasting)
 
     def _find(self, rest: str, query: dict[str, list[str]]) -> tuple[int, str, bytes, bool]:
-        """Code, media type, body, and whether the browser may keep it."""
+        """Status, media type and body of a request, and whether the browser may cache it."""
         if rest in PAGE:
             name, kind = PAGE[rest]
             text = files("hybrid.viewer").joinpath(name).read_text(encoding="utf-8")
@@ -172,8 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not -32 <= ev <= 32:  # NaN is refused as well
             raise ValueError(f"ev is {ev}, expected -32 to 32")
         picture = sequence.picture(int(number), query["layer"][0], 2**ev / self.server.exposure, ev)
-        # The address holds the version of the file.
-        return 200, KINDS[suffix], encode_picture(picture, suffix), "version" in query
+        return 200, KINDS[suffix], encode_picture(picture, suffix), "version" in query  # of the file
 
     def _answer(self, code: int, kind: str, body: bytes, *, lasting: bool = False) -> None:
         self.send_response(code)
@@ -186,4 +168,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal is for the person who started this."""
+        """Log nothing: the terminal belongs to the user."""

@@ -175,10 +175,10 @@ def test_another_exposure_does_not_read_again(scene, monkeypatch):
 
 def test_what_is_kept_is_bounded(scene, monkeypatch):
     one = 40 * 56 * 3 * 4
-    monkeypatch.setattr(module, "KEPT_BYTES", 2 * one)
+    monkeypatch.setattr(module, "CACHE_BYTES", 2 * one)
     for number in (1001, 1002, 1003):
         scene.picture(number, "ViewLayer.Combined", 1, 0)
-    assert sum(pixels.nbytes for pixels in scene._kept.values()) == 2 * one
+    assert sum(pixels.nbytes for pixels in scene._cache.values()) == 2 * one
 
 
 def test_a_result_begins_with_the_denoised_picture_and_an_input_with_the_noisy_one(tmp_path):
