@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -14,33 +14,23 @@ from hybrid.files.frame import Frame
 from hybrid.files.profile import parse_motion
 from hybrid.files.shots import Shot
 from hybrid.first_pass import SPECS
-from hybrid.job import DenoiseOptions, choose_first_pass, open_denoiser, replace_options
+from hybrid.job import DEFAULTS, DenoiseOptions, choose_first_pass, open_denoiser, prepare_process, replace_options
 from hybrid.plan import Plan
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
 
 Array = NDArray[np.float32]
 
-# Layers of a frame in memory; any other name is an AOV.
+# Layers of each frame, by index or number.
+Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]
+# Names of layers that are no AOVs.
 LAYERS = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
 
 
 class ArrayFrames:
-    """Frames in memory, read as those of a shot.
+    """Frames in memory, read as those of a shot; parameters are those of `denoise_arrays`."""
 
-    Parameters
-    ----------
-    frames : sequence or mapping of int to mapping of str to array
-        Layers of each frame: those of `denoise_arrays`. Frames of a mapping may be computed when they are looked up.
-    motion : str, optional
-        Convention of the motion vectors; see `denoise_arrays`.
-    """
-
-    def __init__(
-        self,
-        frames: Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]],
-        motion: str | None = None,
-    ) -> None:
+    def __init__(self, frames: Layers, motion: str | None = None) -> None:
         self.numbers = tuple(sorted(frames) if isinstance(frames, Mapping) else range(len(frames)))
         if not self.numbers:
             raise ValueError("frames: expected at least one, got none")
@@ -83,25 +73,15 @@ class ArrayFrames:
 
 @dataclass(frozen=True)
 class ArrayResult:
-    """A denoised frame.
+    """A denoised frame, with the reasons of the stages that ran."""
 
-    Attributes
-    ----------
-    number : int
-        The frame's number: its key, or its index.
-    layers : mapping of str to (H, W, C) array of float32
-        "color" (linear radiance), and the AOVs and alpha that were denoised along.
-    plan : Plan
-        Which stages ran, and why.
-    """
-
-    number: int
-    layers: Mapping[str, Array]
+    number: int  # the frame's key, or its index
+    layers: Mapping[str, Array]  # "color", linear radiance, and AOVs and alpha, (H, W, C) each
     plan: Plan
 
 
 def denoise_arrays(
-    frames: Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]],
+    frames: Layers,
     options: DenoiseOptions | None = None,
     *,
     motion: str | None = None,
@@ -119,8 +99,8 @@ def denoise_arrays(
     frames : sequence or mapping of int to mapping of str to array
         Layers of each frame, all of one size: "color" (H, W, 3), linear radiance; optional "albedo", "normal",
         "variance" of the color's mean, "estimate", an image denoised already, (H, W, 3) each; "depth", "alpha" (H, W);
-        "motion" (H, W, 2 or 4). Any other name is an AOV (H, W, C), which a network denoises along. Numbers of a
-        mapping decide which frames are neighbours.
+        "motion" (H, W, 2 or 4). Any other name is an AOV (H, W, C), which a network denoises along. Keys of a mapping
+        are frame numbers, and its frames may be computed when they are looked up.
     options : DenoiseOptions, optional
         What is asked for; options about files, passes and memory are refused.
     motion : str, optional
@@ -152,9 +132,8 @@ def denoise_arrays(
     [(32, 48, 3), (32, 48, 3), (32, 48, 3)]
     """
     chosen = replace_options(options, changes)
-    defaults = {entry.name: entry.default for entry in fields(chosen)}
     for name in ("budget", "keep_first_pass", "passes", "breakdown", "max_memory", "resume", "keep_going", "strict"):
-        if getattr(chosen, name) != defaults[name]:
+        if getattr(chosen, name) != DEFAULTS[name]:
             raise ValueError(f"{name} is {getattr(chosen, name)!r}, expected none for frames in memory")
     if chosen.first_pass not in SPECS:
         raise ValueError(f"first_pass is {chosen.first_pass!r}, expected one of {', '.join(SPECS)}")
@@ -171,6 +150,7 @@ def _denoise(
     options: DenoiseOptions,
     progress: Callable[[ArrayResult], bool | None] | None,
 ) -> Iterator[ArrayResult]:
+    prepare_process(options)
     denoiser = open_denoiser(options)
     source = choose_first_pass(cast("Shot", shot), options, denoiser)
     stream = FrameStream(shot, options.rules, source.first_pass, radius=denoiser.radius)

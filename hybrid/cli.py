@@ -75,7 +75,7 @@ class Command(TyperCommand):
             new = OLD_OPTIONS.get(old)
             if new in known and old not in known:
                 args[index] = f"{new}{equals}{value}"
-                _say_renamed(ctx, old, str(new))
+                _note_renamed(ctx, old, str(new))
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter:
@@ -87,7 +87,7 @@ class Command(TyperCommand):
             raise
 
 
-def _say_renamed(ctx: Any, old: str, new: str) -> None:
+def _note_renamed(ctx: Any, old: str, new: str) -> None:
     """Have a line logged that an old name was used."""
     ctx.meta.setdefault(RENAMED, []).append(f"{old} is now {new}; the old name goes in the next release")
 
@@ -127,7 +127,7 @@ class Commands(TyperGroup):
         """Find the command that the arguments begin with."""
         if args and args[0] in OLD_COMMANDS:
             old, (new, options) = args[0], OLD_COMMANDS[args[0]]
-            _say_renamed(ctx, f"ravg {old}", f"ravg {new}{''.join(f' {option}' for option in options)}")
+            _note_renamed(ctx, f"ravg {old}", f"ravg {new}{''.join(f' {option}' for option in options)}")
             args = [new, *options, *args[1:]]
         return super().resolve_command(ctx, args)
 

@@ -248,6 +248,14 @@ def import_neural() -> ModuleType:
     return neural
 
 
+def prepare_process(options: DenoiseOptions) -> None:
+    """Apply the options that concern the whole process: threads, and the reuse of freed memory."""
+    if options.threads is not None:
+        limit_threads(options.threads)
+    if options.reuse_freed_memory and options.max_memory is None:
+        reuse_freed_memory()
+
+
 def open_denoiser(
     options: DenoiseOptions, timings: Timings | None = None, breakdown: Breakdown | None = None
 ) -> WindowDenoiser:
@@ -370,7 +378,7 @@ def check_paths(
     check_outputs(written, read)
 
 
-def judge_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
+def validate_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
     """Return the views of a shot without layers that make no sense, and the findings.
 
     Parameters
@@ -481,9 +489,9 @@ class Job:
         output: str | Path,
         options: DenoiseOptions,
         paths: Paths = NO_PATHS,
-        judging: AbstractContextManager[object] | None = None,
+        validating: AbstractContextManager[object] | None = None,
     ) -> Job:
-        """Validate everything that a job depends on; `judging` is entered while frames are read and validated.
+        """Validate everything that a job depends on; `validating` is entered while frames are read and validated.
 
         Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be
         overwritten, or memory does not suffice.
@@ -493,10 +501,10 @@ class Job:
         denoiser = open_denoiser(options, timings, breakdown)
         if options.method != "network" and shot.aovs:
             raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
-        with judging or nullcontext():
+        with validating or nullcontext():
             if options.max_memory is not None:  # even with no stage, before any pixel is read
                 plan_rows(parse_size(options.max_memory), shot.views[0], ())
-            views, report = judge_views(shot, strict=options.strict)
+            views, report = validate_views(shot, strict=options.strict)
             _check_views(views, report, options)
         if options.preset == "auto":
             options = _fit_budget(views[0], options)
@@ -582,10 +590,7 @@ class Job:
         written are whole, also where the generator is closed early.
         """
         options, runs, done, total = self.options, self.options.passes, 0, self.total()
-        if options.threads is not None:
-            limit_threads(options.threads)
-        if options.reuse_freed_memory and options.max_memory is None:
-            reuse_freed_memory()
+        prepare_process(options)
         views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
         settings = RunSettings(self.plan_rows(), options.max_memory is None, attributes=self.header())
         home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent

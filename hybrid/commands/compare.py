@@ -26,7 +26,7 @@ from hybrid.commands.options import (
     StrictOption,
     choose,
 )
-from hybrid.commands.shots import judge_alike, open_input, say_cuts
+from hybrid.commands.shots import log_cuts, open_input, validate_renders
 from hybrid.comparison.compare import CompareOptions, compare_shot
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
@@ -149,7 +149,7 @@ def compare(
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
     opened = open_input(shot, frames, layer, profile=profile, motion=motion)
-    alike, findings = judge_alike({"shot": opened}, strict=strict)
+    alike, findings = validate_renders({"shot": opened}, strict=strict)
     noisy = alike["shot"]
     clean = [_open_matching(spec, noisy, frames) for spec in reference]
     chosen = _methods(methods, external, noisy, frames)
@@ -165,7 +165,7 @@ def compare(
         reference_samples=samples_of(clean[0]),
         levels=[(open_input(pattern, frames, layer, profile=profile), count) for pattern, count in _levels(level)],
         findings=findings,
-        check_shot=lambda: [finding.message for finding in say_cuts(plan(), (), strict=strict)],
+        check_shot=lambda: [finding.message for finding in log_cuts(plan(), (), strict=strict)],
         maps=output is not None,
     )
     reuse_freed_memory()

@@ -46,8 +46,8 @@ from hybrid.commands.shots import (
     expect_views_apart,
     import_neural,
     in_view,
+    log_cuts,
     log_findings,
-    say_cuts,
     split_stages,
     views_of,
 )
@@ -354,7 +354,7 @@ class _Report:
         self.outliers += frame.outliers
         if frame.plan is not None:
             self.plans[frame.number] = frame.plan
-            self.findings += say_cuts(frame.plan, self.findings, strict=False)
+            self.findings += log_cuts(frame.plan, self.findings, strict=False)
         light = frame.mean + frame.removed_radiance
         share = frame.removed_radiance / light if light > 0 else 0.0
         self._log(frame, share)

@@ -26,9 +26,9 @@ from hybrid.commands.options import (
     ShotArgument,
     StrictOption,
 )
-from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_findings, rules_of, say_cuts, views_of
+from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, rules_of, views_of
 from hybrid.files.layers import Layers, describe_layers
-from hybrid.job import judge_views
+from hybrid.job import validate_views
 from hybrid.plan import STAGES, Decision, Rules
 from hybrid.stream import plan_shot
 
@@ -66,7 +66,7 @@ def inspect(
 def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> None:
     """Print layers, findings and plan of a shot."""
     opened = read.open()
-    pictures, judgement = judge_views(opened, strict=strict)
+    pictures, judgement = validate_views(opened, strict=strict)
     log_findings(judgement, pictures)
     height, width = opened.shape
     progress = Progress("look", len(opened) * len(pictures))
@@ -75,7 +75,7 @@ def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> N
     plans, judged = [], list(judgement.findings)
     for picture in pictures:
         plans.append(plan_shot(picture, rules, advance=progress.advance))
-        judged += say_cuts(plans[-1], judged, strict=strict)
+        judged += log_cuts(plans[-1], judged, strict=strict)
     if as_json:
         of_each = [
             {

@@ -165,7 +165,7 @@ def log_findings(judgement: ValidationReport, views: Sequence[Shot]) -> None:
         LOG.info(f"pictures: {printable(colors)}: each is denoised; --layer color=NAME chooses one")
 
 
-def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, Shot], list[str]]:
+def validate_renders(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, Shot], list[str]]:
     """Return renders of one shot without layers that make no sense in one of them, and the messages of the findings.
 
     Findings are logged, and errors if `strict`. Of files with several views one has to be chosen.
@@ -182,7 +182,7 @@ def judge_alike(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, S
     return applied, [finding.message for finding in findings]
 
 
-def say_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
+def log_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = "") -> list[Finding]:
     """Log cuts and repeated frames of a plan that are not `known`, and return them; cuts are errors if `strict`."""
     cuts = [finding for cut in plan.cuts if (finding := find_cut(*cut)) not in known]
     repeats = [finding for pair in plan.repeats if (finding := find_repeat(*pair)) not in known]

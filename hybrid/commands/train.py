@@ -29,7 +29,7 @@ from hybrid.commands.options import (
     check_first_pass,
     usage,
 )
-from hybrid.commands.shots import import_neural, judge_alike, parse_input, parse_layers, say_cuts
+from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.comparison.samples import samples_of
 from hybrid.files.profile import Profile
 from hybrid.files.replace import check_outputs
@@ -185,10 +185,10 @@ def make_clips(
         if any(output.glob(f"{glob.escape(each.name)}.[0-9][0-9][0-9][0-9].safetensors")):
             bar.advance(len(each.first), f"{each.name} has clips already")
             continue
-        inputs, _ = judge_alike(each.shots, strict=strict)
+        inputs, _ = validate_renders(each.shots, strict=strict)
         render = None if target is None else inputs.pop(target)
         plan = plan_shot(next(iter(inputs.values())), context=Context(True, window // 2))
-        say_cuts(plan, (), strict=strict, name=each.name if len(opened) > 1 else "")
+        log_cuts(plan, (), strict=strict, name=each.name if len(opened) > 1 else "")
         clean = each.first.path(each.first.numbers[0]).with_name("reference.####.exr")
         source = neural.ClipSource(
             each.name,

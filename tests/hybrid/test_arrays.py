@@ -8,7 +8,7 @@ import pytest
 import hybrid
 from hybrid import arrays
 from hybrid.files.shots import open_shot
-from hybrid.job import judge_views
+from hybrid.job import validate_views
 from tests.scenes import Scene
 
 SCENE = Scene(frames=5)
@@ -22,7 +22,7 @@ def shot(tmp_path):
 
 def layers_of(shot):
     """The layers as the command reads them: without those that make no sense."""
-    (shot,), _ = judge_views(shot)
+    (shot,), _ = validate_views(shot)
     frames = {number: shot.read(number) for number in shot.numbers}
     names = ("color", "albedo", "normal", "depth", "motion")
     layers = {number: {name: getattr(frame, name) for name in names} for number, frame in frames.items()}

@@ -230,3 +230,22 @@ def test_the_old_name_of_the_first_pass_is_accepted():
 def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named():
     with pytest.raises(ValueError, match=r"preset is 'tkpcn', no preset any more, expected --weights .*tkpcn\.safet"):
         job.DenoiseOptions(preset="tkpcn")
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_threads_and_the_allocator_are_those_that_were_asked_for(shot_folder, tmp_path, monkeypatch, in_memory):
+    called = []
+    monkeypatch.setattr(job, "limit_threads", lambda count: called.append(count))
+    monkeypatch.setattr(job, "reuse_freed_memory", lambda: called.append("reuse"))
+
+    def run(**options):
+        if in_memory:
+            list(hybrid.denoise_arrays([{"color": np.ones((16, 16, 3))}], preset="draft", **options))
+        else:
+            shot = hybrid.open_shot(shot_folder, frames="1002")
+            list(hybrid.denoise_shot(shot, tmp_path / "out", preset="draft", **options))
+
+    run()
+    assert called == ["reuse"]
+    run(threads=3, reuse_freed_memory=False)
+    assert called == ["reuse", 3]
