@@ -48,7 +48,7 @@ COMMANDS = {
     "simulate": Entry(
         "simulate:simulate",
         "Networks",
-        "Make shots with Cycles: noise levels, guides, motion vectors, references; only the effects a scene calls for.",
+        "Render shots with Cycles: noise levels, guides, motion vectors, references; with the effects a scene needs.",
     ),
 }
 # Old name → new name, and options that stand for the old defaults; accepted for one release.
@@ -60,6 +60,7 @@ OLD_OPTIONS = {
     "--give-way": "--aov-sum",
     "--keep-estimates": "--keep-first-pass",
     "--loops": "--movies",
+    "--movers": "--moving-objects",
 }
 
 

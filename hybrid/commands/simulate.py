@@ -76,7 +76,6 @@ def simulate(
         int | None,
         typer.Option(min=0, metavar="N", help="number of moving objects in added motion", rich_help_panel=WHAT),
     ] = None,
-    movers: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     motion_blur: Annotated[
         bool, typer.Option("--motion-blur", help="render with motion blur", rich_help_panel=WHAT)
     ] = False,
@@ -111,14 +110,12 @@ def simulate(
     ] = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Render shots with Cycles: noise levels, guides, motion vectors and references, with the effects a scene needs."""
+    """Render shots with Cycles: noise levels, guides, motion vectors, references; with the effects a scene needs."""
     from hybrid.files.sequences import parse_frames
 
     known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]
     if scene not in known and not Path(scene).is_file():
         raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or one of {', '.join(known)}")
-    if movers is not None:
-        LOG.warning("--movers is now --moving-objects; the old name works in this release only")
 
     def settings(scene: str, seed: int) -> ShotSettings:
         return ShotSettings(
@@ -133,7 +130,7 @@ def simulate(
             center=parse_center(center) if center else None,
             camera=camera,
             motion=motion,
-            moving_objects=movers if moving_objects is None else moving_objects,
+            moving_objects=moving_objects,
             motion_blur=motion_blur,
             halves=halves,
             effects=effects,
