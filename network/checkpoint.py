@@ -99,6 +99,8 @@ def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
 def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, Any] | None = None) -> None:
     """Write a model in half precision; the file appears whole or not at all.
 
+    Raises ValueError if a weight is not finite, or more than `HEAVIEST`.
+
     Parameters
     ----------
     path : path
@@ -107,11 +109,6 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
         The model, in any precision.
     notes : mapping, optional
         Origin of the weights (training configuration, validation), as JSON values.
-
-    Raises
-    ------
-    ValueError
-        If a weight is not finite, or more than `HEAVIEST`.
     """
     tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in model.state_dict().items()}
     for name, value in tensors.items():

@@ -43,22 +43,15 @@ _TZA = struct.pack("<HBB", 0x41D7, 2, 0)
 def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
     """Read the tensors of a TZA file, OIDN's archive of weights.
 
+    Returns float32 tensors in the order of the file, which is the order of the layers. Raises ValueError if data is no
+    TZA file, is cut short, or holds numbers that are not finite.
+
     Parameters
     ----------
     data : bytes
         The file, of version 2.
     where : str
         Name of the file in error messages.
-
-    Returns
-    -------
-    dict of str to Tensor
-        Float32, in the order of the file, which is the order of the layers.
-
-    Raises
-    ------
-    ValueError
-        If data is no TZA file, is cut short, or holds numbers that are not finite.
 
     Notes
     -----
@@ -107,22 +100,15 @@ def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
 def build_unet(tensors: dict[str, Tensor], where: str = "TZA") -> OidnUNet:
     """Build the U-Net that the tensors of a TZA file belong to.
 
+    Returns a float32 network with these weights. Raises ValueError if the shapes are not those of a small, base or
+    large U-Net.
+
     Parameters
     ----------
     tensors : dict of Tensor
         From `read_tza`.
     where : str
         Name of the file in error messages.
-
-    Returns
-    -------
-    OidnUNet
-        Float32, with these weights.
-
-    Raises
-    ------
-    ValueError
-        If the shapes are not those of a small, base or large U-Net.
     """
     found = [tuple(value.shape) for value in tensors.values()]
     inputs = found[0][1] if found and len(found[0]) == 4 else 1

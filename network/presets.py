@@ -53,6 +53,8 @@ PRESETS: dict[str, Preset] = {
 def build_preset(name: str, frames: int | None = None, seed: int = 0) -> Model:
     """Build a network of `PRESETS` with initial weights; the global generator is left as it was.
 
+    The network is in training mode. Raises ValueError if there is no such preset.
+
     Parameters
     ----------
     name : str
@@ -61,16 +63,6 @@ def build_preset(name: str, frames: int | None = None, seed: int = 0) -> Model:
         Length of the windows, odd. Default: the preset's.
     seed : int
         Of the initial weights.
-
-    Returns
-    -------
-    Model
-        For training.
-
-    Raises
-    ------
-    ValueError
-        If there is no such preset.
     """
     if name not in PRESETS:
         raise ValueError(f"preset is {name!r}, expected one of {', '.join(PRESETS)}")

@@ -206,6 +206,8 @@ class RobustUNet(nn.Module):
     def forward(self, frames: Tensor, shared: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
         """Make the image of the centre.
 
+        Raises ValueError if frames are not the model's, or height or width is no multiple of 16.
+
         Parameters
         ----------
         frames, shared, static : Tensor
@@ -217,11 +219,6 @@ class RobustUNet(nn.Module):
             ``(N, 3, H, W)`` on the transfer curve.
         blend : Tensor
             ``(N, 1, H, W)`` in (0, 1): share of the average of first passes.
-
-        Raises
-        ------
-        ValueError
-            If frames are not the model's, or height or width is no multiple of 16.
         """
         self.expect_frames(len(frames) // len(shared))
         check_size("frames", static, self.multiple)
@@ -240,16 +237,13 @@ class RobustUNet(nn.Module):
     def encode_and_fuse(self, frames: Tensor, shared: Tensor) -> Tensor:
         """Run the finest scale of the encoder and its RA block; a row depends on two rows on each side.
 
+        Returns the input of the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all
+        frames are fused.
+
         Parameters
         ----------
         frames, shared : Tensor
             Of `PackedInputs`, of any even height.
-
-        Returns
-        -------
-        Tensor
-            Input of the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all frames
-            are fused.
         """
         count, last = self.frames, self._last_fused
         first, aux, layout = self.backbone.first, self.aux_conv.weight, torch.channels_last
@@ -316,6 +310,8 @@ def denoise_window(
 ) -> UNetOutput:
     """Run a model on an aligned window.
 
+    The output has the size of the window. Raises ValueError if the window has another number of frames.
+
     Parameters
     ----------
     model : RobustUNet
@@ -326,16 +322,6 @@ def denoise_window(
         Called with gradients instead of the model, where it is wrapped (distributed, compiled).
     borders : pairs of int
         Pixels by which the window is mirrored beyond its borders.
-
-    Returns
-    -------
-    UNetOutput
-        Of the size of the window.
-
-    Raises
-    ------
-    ValueError
-        If the window has another number of frames.
 
     Notes
     -----
@@ -394,7 +380,7 @@ def start_from_oidn(model: RobustUNet) -> RobustUNet:
 
 
 def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
-    """Prepare a model for running: channels last, no gradients.
+    """Prepare a model for running: channels last, no gradients; changes and returns it.
 
     Parameters
     ----------
@@ -402,11 +388,6 @@ def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
         Changed in place.
     bfloat16 : bool
         Round weights (`network.bfloat16.round_unet`); pays only on processors that compute in bfloat16.
-
-    Returns
-    -------
-    RobustUNet
-        The same.
     """
     model.eval().requires_grad_(False)
     if bfloat16:

@@ -16,6 +16,8 @@ def in_strips(
 ) -> list[Tensor]:
     """Run a local function strip by strip and join the results; with gradients, on all rows at once.
 
+    Returns the results for all rows.
+
     Parameters
     ----------
     run : callable
@@ -26,11 +28,6 @@ def in_strips(
         ``(..., H, W)``; coarser layers have H / 2, H / 4, ... rows.
     all_frames : bool
         Whether the layers hold all frames of a window; strips then have half as many rows.
-
-    Returns
-    -------
-    list of Tensor
-        Results for all rows.
 
     Notes
     -----

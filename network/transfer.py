@@ -53,10 +53,5 @@ def clip(x: Tensor, low: float, high: float) -> Tensor:
         Any shape.
     low, high : float
         Bounds.
-
-    Returns
-    -------
-    Tensor
-        Finite.
     """
     return x.nan_to_num(0, high, low).clamp(low, high)

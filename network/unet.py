@@ -107,7 +107,7 @@ class OidnUNet(nn.Module):
         return self.encoder[-1](x), skips
 
     def decode(self, x: Tensor, skips: Sequence[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
-        """Run the decoder, and a head on its finest features.
+        """Run the decoder, and a head on its finest features. Returns the head's outputs.
 
         Parameters
         ----------
@@ -118,11 +118,6 @@ class OidnUNet(nn.Module):
         head : callable
             From ``(N, width, H, W)`` features of the finest scale, or some of their rows, to ``(N, ., H, W)`` outputs
             that depend on one further row at most.
-
-        Returns
-        -------
-        list of Tensor
-            Outputs of the head.
         """
         stages = (cast(Stage, stage) for stage in self.decoder)
         *coarse, (finest, network_input) = zip(stages, reversed(skips), strict=True)
@@ -221,6 +216,9 @@ def denoise_color(
 ) -> Tensor:
     """Denoise images as OIDN does.
 
+    Returns ``(N, 3, H, W)`` linear radiance, float32, at least 0. Raises ValueError if the inputs are not as many as
+    the network's, or differ in shape.
+
     Parameters
     ----------
     unet : OidnUNet
@@ -231,16 +229,6 @@ def denoise_color(
         Likewise; albedo in [0, 1], normals in [−1, 1] in any fixed space, clipped to these ranges.
     exposure : float
         Factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`).
-
-    Returns
-    -------
-    Tensor
-        ``(N, 3, H, W)`` linear radiance, float32, at least 0.
-
-    Raises
-    ------
-    ValueError
-        If the inputs are not as many as the network's, or differ in shape.
     """
     layers = [(color, lambda x: pu_forward(clip(x * exposure, 0, LARGEST)))]
     if albedo is not None:

@@ -39,17 +39,14 @@ class SharedLight(NamedTuple):
 def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     """Average the AOVs of a window over time, and filter each guided by the denoised light; alpha is only averaged.
 
+    Returns the AOVs by name; `BEAUTY`, where some sums are incomplete, is the color filtered alike.
+
     Parameters
     ----------
     aligned : AlignedWindow
         The window.
     irradiance : (H, W, 3) array
         The denoised centre.
-
-    Returns
-    -------
-    dict of str to (H, W, C) array
-        By name; `BEAUTY`, where some sums are incomplete, is the color filtered alike.
     """
     means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
     names = [name for name in means if name != ALPHA]

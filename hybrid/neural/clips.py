@@ -72,6 +72,9 @@ def write_clips(
 ) -> list[Path]:
     """Write the training clips of a shot.
 
+    Returns the shards. Raises ValueError if the levels have no frame in common, frames are smaller than a tile, there
+    is no first pass, or both a reference and a target.
+
     Parameters
     ----------
     source : ClipSource
@@ -90,17 +93,6 @@ def write_clips(
         Of the places.
     advance : callable
         Called after each frame.
-
-    Returns
-    -------
-    list of Path
-        The shards.
-
-    Raises
-    ------
-    ValueError
-        If the levels have no frame in common, frames are smaller than a tile, there is no first pass, or both a
-        reference and a target.
 
     References
     ----------

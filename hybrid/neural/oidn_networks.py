@@ -60,17 +60,13 @@ def denoise_unet(
 ) -> Array:
     """Denoise one frame with OIDN's networks; in bfloat16 63 to 66 dB from OIDN's own image.
 
-    Without OIDN's weights it raises as `network.oidn_weights.load_oidn`; see `has_oidn_networks`.
+    Without OIDN's weights it raises as `network.oidn_weights.load_oidn`; see `has_oidn_networks`. Returns linear
+    radiance.
 
     Parameters
     ----------
     color, albedo, normal, quality, prefilter, clean : array, str or bool
         As for `hybrid.oidn.denoise_oidn`.
-
-    Returns
-    -------
-    (H, W, 3) array of float32
-        Linear radiance.
     """
     guides = {name: layer for name, layer in (("albedo", albedo), ("normal", normal)) if layer is not None}
     if prefilter is not None:
@@ -117,7 +113,7 @@ def bundled_preset(quality: Quality) -> str:
 def denoise_bundled(
     color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
-    """Denoise one frame with the backbone of a preset, which needs only torch.
+    """Denoise one frame with the backbone of a preset, which needs only torch. Returns linear radiance.
 
     Parameters
     ----------
@@ -125,11 +121,6 @@ def denoise_bundled(
         As for `hybrid.oidn.denoise_oidn`.
     quality : str
         Chooses the `bundled_preset`.
-
-    Returns
-    -------
-    (H, W, 3) array of float32
-        Linear radiance.
     """
     # Missing guides are 0.5 to a backbone, as in `network.robust_unet.pack_inputs`; a normal of 0 is 0.5 to it.
     albedo = np.full_like(color, 0.5) if albedo is None else albedo

@@ -40,6 +40,8 @@ def train_network(
 ) -> list[float]:
     """Train a preset, or given weights, on the clips of a folder.
 
+    Returns the losses. Raises ValueError if settings, clips and model do not fit together.
+
     Parameters
     ----------
     inputs : TrainInputs
@@ -54,16 +56,6 @@ def train_network(
         Whether to continue an interrupted training, as for `network.training.loop.train`.
     log : callable
         Called with a step and figures.
-
-    Returns
-    -------
-    list of float
-        The losses.
-
-    Raises
-    ------
-    ValueError
-        If settings, clips and model do not fit together.
 
     Notes
     -----

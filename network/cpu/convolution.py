@@ -28,7 +28,7 @@ def can_fuse(x: Tensor) -> bool:
 def convolve(
     x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None, *, relu: bool = True
 ) -> Tensor:
-    """Convolve, add, and apply a ReLU.
+    """Convolve, add, and apply a ReLU. Returns ``(N, O, H, W)``.
 
     Parameters
     ----------
@@ -40,11 +40,6 @@ def convolve(
         ``(N, O, H, W)``, channels last; the result overwrites it.
     relu : bool
         Whether to apply the ReLU.
-
-    Returns
-    -------
-    Tensor
-        ``(N, O, H, W)``.
     """
     if not can_fuse(x):
         result = functional.conv2d(x, weight, bias, padding=1)

@@ -43,7 +43,7 @@ def can_blend(x: Tensor, frames: int) -> bool:
 
 
 def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor, returned: Sequence[int]) -> Tensor:
-    """Run a `network.robust_average.ChannelAverage` block.
+    """Run a `network.robust_average.ChannelAverage` block. Returns the frames in `returned`, as x.
 
     Parameters
     ----------
@@ -57,11 +57,6 @@ def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor,
         ``(C,)``, of the robust average.
     returned : sequence of int
         Frames of the result.
-
-    Returns
-    -------
-    Tensor
-        As x, with the frames in `returned`.
     """
     pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
     batch, (height, width, channels) = len(x) // frames, pixels.shape[1:]
@@ -81,17 +76,14 @@ def can_project(x: Tensor) -> bool:
 def convolve_to_rgb(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Convolve features to three channels, in float32.
 
+    Returns ``(N, 3, H, W)`` float32, channels last; features beyond the borders count as 0.
+
     Parameters
     ----------
     x : Tensor
         ``(N, C, H, W)``, float32 or bfloat16.
     weight, bias : Tensor
         ``(3, C, 3, 3)`` and ``(3,)``, float32.
-
-    Returns
-    -------
-    Tensor
-        ``(N, 3, H, W)`` float32, channels last; features beyond the borders count as 0.
     """
     pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
     count, height, width, _ = pixels.shape

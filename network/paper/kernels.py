@@ -27,6 +27,9 @@ _PROCESSOR = "cpu"  # where compiled loops run; elsewhere torch's own operations
 def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
     """Thresholded, normalised kernel of raw weights (the paper's η_t).
 
+    Returns ``(N, K, H, W)``, not negative, sums to 1 over the taps. Raises ValueError if a float threshold is outside
+    ``[0, 1/K)``, or the centre is no tap.
+
     Parameters
     ----------
     weights : Tensor
@@ -35,16 +38,6 @@ def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *
         t, on the scale of the weights; a tensor broadcasts against ``(N, 1, H, W)``. Default ``1 / (2K)``.
     centre : int
         The tap with all the weight where no weight exceeds the threshold: the kernel is then the identity.
-
-    Returns
-    -------
-    Tensor
-        ``(N, K, H, W)``, not negative, sums to 1 over the taps.
-
-    Raises
-    ------
-    ValueError
-        If a float threshold is outside ``[0, 1/K)``, or the centre is no tap.
 
     Notes
     -----
@@ -61,6 +54,8 @@ def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *
 def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
     """Kernel of raw weights: normalised, thresholded, normalised again.
 
+    Returns a kernel as `threshold_kernel`, in float32 (float64 stays).
+
     Parameters
     ----------
     weights : Tensor
@@ -70,11 +65,6 @@ def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, 
         Default ``1 / (2K)``.
     centre : int
         As for `threshold_kernel`.
-
-    Returns
-    -------
-    Tensor
-        As of `threshold_kernel`; float32 (float64 stays).
 
     Notes
     -----
@@ -89,6 +79,8 @@ def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, 
 def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: int) -> Tensor:
     """Softmax of raw weights, thresholded and normalised again where a threshold is given.
 
+    Returns a kernel as `threshold_kernel`, in float32 (float64 stays).
+
     Parameters
     ----------
     weights : Tensor
@@ -97,11 +89,6 @@ def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: 
         t on the scale of the softmax, below 1/K. 0, the default, is the plain softmax: every tap has some weight.
     centre : int
         As for `threshold_kernel`.
-
-    Returns
-    -------
-    Tensor
-        As of `threshold_kernel`; float32 (float64 stays).
 
     Notes
     -----
@@ -122,6 +109,8 @@ def _at_least_float32(weights: Tensor) -> Tensor:
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     """Apply the kernels of one source to its frames, frame by frame.
 
+    Raises ValueError if the shapes do not fit together.
+
     Parameters
     ----------
     kernels : Tensor
@@ -135,11 +124,6 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
         ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``.
     denominators : Tensor
         ``(N, T, 1, H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)`` over the taps inside the image.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit together.
 
     Notes
     -----
@@ -171,7 +155,7 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:
-    """Filtered image of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``.
+    """Filtered image of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``. Returns ``(N, C, H, W)``.
 
     Parameters
     ----------
@@ -181,11 +165,6 @@ def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon:
         ``(N, C, H, W)``: x, the image where the kernels have no weight on these frames.
     epsilon : float
         Weight of the fallback, on the scale of a kernel, whose weights sum to 1.
-
-    Returns
-    -------
-    Tensor
-        ``(N, C, H, W)``.
     """
     return (numerators.sum(1) + epsilon * fallback) / (denominators.sum(1) + epsilon)
 
@@ -262,7 +241,7 @@ class Filtered:
         return self.image(self.centre)
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
-        """Image of some frames together.
+        """Image of some frames together. Returns ``(N, C, H, W)``.
 
         Parameters
         ----------
@@ -272,11 +251,6 @@ class Filtered:
             Indices of the frames; default: all.
         epsilon : float
             As for `mean_of`.
-
-        Returns
-        -------
-        Tensor
-            ``(N, C, H, W)``.
         """
         numerators, denominators = self.numerators, self.denominators
         if frames is not None:

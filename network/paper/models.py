@@ -151,7 +151,7 @@ class KernelHead(nn.Module):
             cast(Tensor, self.window.bias).zero_()
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Predict kernels.
+        """Predict kernels. Returns ``(N, taps, H, W)`` float32.
 
         Parameters
         ----------
@@ -161,11 +161,6 @@ class KernelHead(nn.Module):
             ``(N, T, 1, H, W)``.
         threshold : float, optional
             t·K in [0, 1). Default: the configured one, which the model was trained with.
-
-        Returns
-        -------
-        Tensor
-            ``(N, taps, H, W)`` float32.
         """
         config = self.config
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
@@ -336,6 +331,8 @@ def filter_window(
 ) -> Filtered:
     """Predict the kernels of a window and apply them to its color.
 
+    Returns the sums of each frame. Raises ValueError if shapes do not fit the model.
+
     Parameters
     ----------
     model : KernelModel
@@ -346,16 +343,6 @@ def filter_window(
         t·K in [0, 1), instead of the model's own; higher stays closer to the input.
     run : callable, optional
         Called instead of the model, where it is wrapped (distributed, compiled).
-
-    Returns
-    -------
-    Filtered
-        The sums of each frame.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit the model.
     """
     kernels = (model if run is None else run)(network_inputs(window), window.confidence, threshold)
     return Filtered.of(kernels, window.color)
@@ -370,11 +357,6 @@ def for_inference(model: KernelModel, bfloat16: bool) -> KernelModel:
         Changed in place.
     bfloat16 : bool
         Cast its weights; kernels and weights of frames stay float32.
-
-    Returns
-    -------
-    KernelModel
-        The same.
     """
     model.eval().requires_grad_(False)
     for parameter in model.parameters():

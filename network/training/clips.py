@@ -241,6 +241,8 @@ def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]],
 def important_places(importance: Tensor, size: int, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Draw tiles by importance, none closer to another than half a tile both ways.
 
+    Returns rows and columns of the corners.
+
     Parameters
     ----------
     importance : Tensor
@@ -251,11 +253,6 @@ def important_places(importance: Tensor, size: int, count: int, rng: np.random.G
         Number of tiles; fewer where no more fit.
     rng : numpy.random.Generator
         Source of randomness.
-
-    Returns
-    -------
-    list of (int, int)
-        Row and column of the corners.
     """
     corners, chances = place_chances(importance, size)
     places: list[tuple[int, int]] = []
@@ -272,6 +269,8 @@ def write_shards(
 ) -> list[Path]:
     """Write the clips of a shot as ``SHOT.0000.safetensors``, ``SHOT.0001.safetensors`` and so on.
 
+    Raises ValueError if there are no clips, or they differ in shape.
+
     Parameters
     ----------
     folder : path
@@ -287,11 +286,6 @@ def write_shards(
     -------
     list of Path
         The shards. They appear together when the last is finished.
-
-    Raises
-    ------
-    ValueError
-        If there are no clips, or they differ in shape.
     """
     folder = Path(folder)
     partial: list[Path] = []
@@ -489,21 +483,14 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
 def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
     """Split clips into those for training and those for validation; no shot is in both.
 
+    Raises ValueError if a name is not among the shots, or no clip is left to train on.
+
     Parameters
     ----------
     clips : Clips
         All clips.
     validation : sequence of str
         Names of the shots to keep out of training.
-
-    Returns
-    -------
-    training, validation : Clips
-
-    Raises
-    ------
-    ValueError
-        If a name is not among the shots, or no clip is left to train on.
     """
     unknown = sorted(set(validation) - set(clips.shots))
     if unknown:
@@ -678,17 +665,14 @@ class Samples(Dataset[Sample]):
 def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
     """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's first pass.
 
+    Returns ``(N,)``, at least 1e-6.
+
     Parameters
     ----------
     batch : Sample
         With N in front.
     loss : ImageLoss
         The loss.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``, at least 1e-6.
     """
     centre = batch.color.shape[1] // 2
     mean = mean_of(batch.color * batch.confidence, batch.confidence, batch.color[:, centre])
@@ -702,6 +686,8 @@ def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
 def whole_frames(clips: Clips, index: int, multiple: int) -> list[Sample]:
     """A clip at each of its levels, towards the cleanest target, as batches of one, unvaried.
 
+    The samples have N = 1 in front.
+
     Parameters
     ----------
     clips : Clips
@@ -710,11 +696,6 @@ def whole_frames(clips: Clips, index: int, multiple: int) -> list[Sample]:
         Of the clip.
     multiple : int
         Height and width are cropped, at the bottom and the right, to multiples of this.
-
-    Returns
-    -------
-    list of Sample
-        With N = 1 in front.
     """
     batches = []
     for level, targets in enumerate(clips.pairs(index)):

@@ -42,7 +42,7 @@ from network.windows import UNetWindow
 def predict(
     model: Model, batch: Sample, bfloat16: bool = False, run: Callable[..., Any] | None = None
 ) -> Filtered | UNetOutput:
-    """Run a model on a batch.
+    """Run a model on a batch. Both kinds of output have ``irradiance`` and ``parts()``.
 
     Parameters
     ----------
@@ -54,11 +54,6 @@ def predict(
         Whether the convolutions run in bfloat16.
     run : callable, optional
         Called instead of the model, where it is wrapped (distributed, compiled).
-
-    Returns
-    -------
-    Filtered or UNetOutput
-        Both have ``irradiance`` and ``parts()``.
     """
     with torch.autocast(batch.color.device.type, torch.bfloat16, enabled=bfloat16):
         if not isinstance(model, RobustUNet):
@@ -118,6 +113,8 @@ def batch_loss(
 ) -> Tensor:
     """Training loss of a batch: log(1 + the temporal loss of each crop, relative to that of its clip's best input).
 
+    Returns the mean over the batch, ``()``.
+
     Parameters
     ----------
     model : Model
@@ -130,11 +127,6 @@ def batch_loss(
         Of images.
     run : callable, optional
         As for `predict`.
-
-    Returns
-    -------
-    Tensor
-        ``()``, the mean over the batch.
 
     Notes
     -----
@@ -216,6 +208,8 @@ def train(
 ) -> list[float]:
     """Train a model and write the moving average of its weights.
 
+    Returns the loss of each step of this run; of several processes, of this one's share.
+
     Parameters
     ----------
     training, validation : Clips
@@ -233,11 +227,6 @@ def train(
         Called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
         ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with
         its values, as ``validation/psnr`` and so on.
-
-    Returns
-    -------
-    list of float
-        Loss of each step of this run; of several processes, of this one's share.
 
     Raises
     ------

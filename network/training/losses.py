@@ -130,17 +130,14 @@ def spatial_terms(frames: int) -> list[Term]:
 def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
     """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with its own weight.
 
+    The centre's term is the first.
+
     Parameters
     ----------
     frames : int
         Length of the window.
     whole : float
         Weight of the whole window; 0 leaves its term out.
-
-    Returns
-    -------
-    list of Term
-        The centre first.
 
     Notes
     -----
@@ -163,6 +160,8 @@ def power_terms(frames: int) -> list[Term]:
 def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -> Tensor:
     """Weights that punish errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1.
 
+    Returns ``(N, C, H, W)``.
+
     Parameters
     ----------
     prediction, target, noisy : Tensor
@@ -170,11 +169,6 @@ def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -
     slope : float
         λ ≥ 1. The greater, the more the network prefers noise to lost detail. For clean targets: where the target's
         noise is independent of the input's, that noise decides on which side the prediction is.
-
-    Returns
-    -------
-    Tensor
-        ``(N, C, H, W)``.
 
     References
     ----------
@@ -196,6 +190,8 @@ def temporal_loss(
 ) -> Tensor:
     """Spatial loss converted to a temporal one: the target is predicted from parts of the window.
 
+    Returns ``(N,)`` weighted mean of the terms.
+
     Parameters
     ----------
     loss : ImageLoss
@@ -214,11 +210,6 @@ def temporal_loss(
         From `temporal_terms`, `power_terms` or `spatial_terms`.
     slope : float
         λ of `asymmetry`; 1 for none.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)`` weighted mean of the terms.
 
     Notes
     -----
@@ -249,6 +240,7 @@ def image_loss(
     """Loss of the radiance of one image; all there is for a network whose images are no sums of its frames.
 
     Instead of parts of the window such a network gets windows of which `SamplerConfig.drop_frames` drops frames.
+    Returns ``(N,)``.
 
     Parameters
     ----------
@@ -258,11 +250,6 @@ def image_loss(
         ``(N, C, H, W)`` irradiance, of the prediction and of the noisy centre.
     target, modulation, scale, slope : Tensor and float
         As for `temporal_loss`.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
     """
     radiance = image * modulation
     weights = None if slope == 1 else asymmetry(radiance, target, noisy * modulation, slope)
@@ -278,7 +265,7 @@ def difference_loss(
     to_next: Tensor,
     trust: Tensor,
 ) -> Tensor:
-    """Loss of flicker: of changes between two successive images that their targets do not have.
+    """Loss of flicker: of changes between two successive images that their targets do not have. Returns ``(N,)``.
 
     Parameters
     ----------
@@ -294,11 +281,6 @@ def difference_loss(
         ``(N, 2, H, W)``, pixels: from each pixel of the first to its place in the second.
     trust : Tensor
         ``(N, 1, H, W)`` in [0, 1]: confidence that both are the same light.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)``.
 
     Notes
     -----
@@ -320,17 +302,12 @@ def difference_loss(
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio on ``x / (1 + x)``, whose limit, 1, is the peak.
+    """Peak signal-to-noise ratio on ``x / (1 + x)``, whose limit, 1, is the peak. Returns ``(N,)`` dB, at most 120.
 
     Parameters
     ----------
     prediction, target : Tensor
         ``(N, C, H, W)`` radiance; negative counts as 0.
-
-    Returns
-    -------
-    Tensor
-        ``(N,)`` dB, at most 120.
     """
     error = functional.relu(prediction) / (1 + functional.relu(prediction))
     error = error - functional.relu(target) / (1 + functional.relu(target))
