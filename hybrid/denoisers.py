@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.window import AlignedWindow
+from hybrid.first_pass import Backends
 from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, pool_and_denoise
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import Denoised
 
 Array = NDArray[np.float32]
-
-
-class Backends(NamedTuple):
-    """Functions with the parameters of `hybrid.oidn.denoise_oidn` that compute a first pass.
-
-    Attributes
-    ----------
-    quicker : callable or None
-        Runs OIDN's networks in less time.
-    bundled : callable or None
-        Runs a network that ships with ravg, where OIDN is not installed.
-    """
-
-    quicker: Callable[..., Array] | None = None
-    bundled: Callable[..., Array] | None = None
 
 
 class WindowDenoiser(Protocol):

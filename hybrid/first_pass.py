@@ -1,7 +1,7 @@
-"""Per-frame estimates: pictures that are denoised already, each by itself, which time makes stable.
+"""First passes: a denoised picture of each single frame, from which windows are made stable over time.
 
-An estimate comes from the file (Cycles keeps the ``Noisy Image`` beside what it has denoised), from any finished
-sequence, from OIDN where it is installed, or from our own pseudo-reference.
+A first pass comes from the file (Cycles keeps the ``Noisy Image`` beside the denoised one), from any finished sequence,
+from OIDN where it is installed, or from the classical chain.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,10 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
     "oidn-clean": {"quality": "high", "prefilter": "balanced"},
     "oidn-best": {"quality": "high", "prefilter": "high"},
 }
-# What is asked for by these names; by any other, a finished sequence.
+# Names of first passes; any other is the pattern of a finished sequence.
 SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
-# What "auto" takes of them for a preset of the network, which looks at the samples again: what the first look is
-# matters little. With "oidn" `fast`, which keeps half of it, gains 0.2 dB, and 0.2 in time, on eight validation shots,
+# The mode of OIDN that "auto" takes for a preset of the network, which reads the samples again: the first pass matters
+# little. With "oidn" `fast`, which keeps half of it, gains 0.2 dB, and 0.2 in time, on eight validation shots,
 # and takes 1.49 to 1.56 times OIDN's high mode where 1.5 is the bound; the two others gain next to nothing.
 OIDN_MODE_OF_PRESET = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": "oidn-fast"}
 
@@ -139,9 +139,27 @@ class Classical:
         return filter_window(window, self.preset, timings=stream.timings)
 
 
+class Backends(NamedTuple):
+    """Functions that stand for `hybrid.oidn.denoise_oidn`, with its parameters.
+
+    Attributes
+    ----------
+    torch : callable or None
+        Runs OIDN's networks on a processor in less time.
+    bundled : callable or None
+        Runs a network that ships with ravg, where OIDN is not installed.
+    """
+
+    torch: Callable[..., Array] | None = None
+    bundled: Callable[..., Array] | None = None
+
+
+NO_BACKENDS = Backends()
+
+
 @dataclass(frozen=True)
 class FirstPassSource:
-    """Where the estimates of a shot come from.
+    """The first pass of a shot.
 
     Attributes
     ----------
@@ -152,11 +170,11 @@ class FirstPassSource:
     reason : str
         Why this one.
     files : Shot or None
-        The finished sequence it is read from, if it is one.
+        The finished sequence that it is read from, if it is one.
     kept : tuple of Path
-        Where pictures are kept, if they are.
+        Where its pictures are kept, if they are.
     device : str or None
-        What OIDN computes on, if it does.
+        OIDN's device, if OIDN runs.
     """
 
     name: str
@@ -171,45 +189,36 @@ def find_first_pass(
     spec: str,
     shot: Shot,
     *,
-    own: ClassicalPreset = FINAL,
-    kept: str | None = None,
+    classical: ClassicalPreset = FINAL,
     mode: str = "oidn-clean",
+    kept: str | None = None,
     forced: str = "",
-    quicker: Callable[..., Array] | None = None,
-    bundled: Callable[..., Array] | None = None,
+    backends: Backends = NO_BACKENDS,
     device: str = "cpu",
 ) -> FirstPassSource:
-    """Find the estimates that are asked for.
+    """Find a first pass by its name.
 
     Parameters
     ----------
     spec : str
-        "auto": what is in the file, else `mode` where OIDN is installed, else our own. "oidn" (quality high,
-        guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with OIDN's balanced networks, in frames where
-        they hold noise), "oidn-best" (with its largest, in all), "nlm" (our own, from each frame's window), "bundled"
-        (`bundled`, by itself), "none", or the pattern of a finished sequence of the same frames.
+        "auto": the denoised picture in the file, else `mode` where OIDN is installed, else the bundled network, else
+        the classical chain. "oidn" (quality high, guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with
+        OIDN's balanced networks, in frames where they hold noise), "oidn-best" (with its largest, in all), "nlm" (the
+        classical chain on each frame's window), "bundled", "none", or the pattern of a finished sequence.
     shot : Shot
         The noisy shot.
-    own : ClassicalPreset
-        Of our own estimate.
-    kept : str, optional
-        Where OIDN's pictures are kept, and taken from if they are there and would be made the same: a pattern or a
-        folder. Where none are made, the reason says that none are kept.
+    classical : ClassicalPreset
+        The settings of the classical chain.
     mode : str
-        Of OIDN, for "auto"; "bundled" has its quality.
+        The mode of OIDN for "auto"; "bundled" has its quality.
+    kept : str, optional
+        A pattern or a folder that keeps OIDN's pictures; those that are there and would be the same are read.
     forced : str
-        What the user has forced (`hybrid.plan.Rules.forced`), on which guides and fireflies depend: pictures are kept
-        for that.
-    quicker : callable, optional
-        What "auto" has in the place of `hybrid.oidn.denoise_oidn` on a processor, with the same parameters.
-    bundled : callable, optional
-        What "auto" has where OIDN is not installed, before our own, with the same parameters.
+        The forced stages (`hybrid.plan.Rules.forced`), on which kept pictures depend.
+    backends : Backends
+        Functions that stand for OIDN.
     device : str
-        Of OIDN, as for `hybrid.oidn.find_device`.
-
-    Returns
-    -------
-    FirstPassSource
+        OIDN's device, as for `hybrid.oidn.find_device`.
 
     Raises
     ------
@@ -217,89 +226,81 @@ def find_first_pass(
         If OIDN is asked for by name and not installed.
     ValueError
         If a sequence lacks frames of the shot, or has each in the place of its neighbour; if `kept` is one file for
-        several, neighbours among them; if OIDN is to run on a device that is not there.
+        several frames; if OIDN has no such device.
     FileNotFoundError
         If there is no such sequence.
     """
-    keep = None if kept is None else partial(Kept, shot, kept, forced)
-    source = _choose(spec, shot, own, mode, keep, quicker, bundled, device)
+    if spec not in SPECS:
+        source = _sequence(spec, shot)
+    elif spec == "none":
+        source = FirstPassSource("none", None, "asked for")
+    elif spec == "auto" and shot.layers(shot.numbers[0]).estimate is not None:
+        source = FirstPassSource("file", PerFrame(lambda frame: frame.estimate), "the file holds a denoised picture")
+    elif spec in OIDN_MODES or (spec == "auto" and why_no_oidn() is None):
+        if spec != "auto" and (lacking := why_no_oidn()) is not None:
+            raise ImportError(f'first pass {spec}: {lacking}; expected: pip install "pyoidn"')
+        device = find_device(device)
+        reason, run = "asked for", partial(denoise_oidn, device=device)
+        in_torch = spec == "auto" and backends.torch is not None and device == "cpu"
+        if spec == "auto":
+            reason = "OIDN is installed; its networks run in torch" if in_torch else "OIDN is installed"
+        name = mode if spec == "auto" else spec
+        store = None if kept is None else _KeptPictures(shot, kept, forced, name, in_torch, device)
+        source = _oidn(name, (backends.torch or run) if in_torch else run, in_torch, store)
+        source = replace(source, reason=reason, device=device)
+    elif spec == "bundled" or (spec == "auto" and backends.bundled is not None):
+        if backends.bundled is None:
+            raise ImportError("first pass bundled: torch is needed, which this command does without; expected another")
+        run = partial(denoise_frame_oidn, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
+        reason = "asked for" if spec == "bundled" else f"{why_no_oidn()}; a network comes with ravg"
+        source = FirstPassSource("bundled", PerFrame(run), reason)
+    else:
+        reason = "asked for" if spec == "nlm" else f"no denoised picture in the file, and {why_no_oidn()}"
+        source = FirstPassSource("nlm", Classical(classical), reason)
     if kept is not None and source.name not in OIDN_MODES:
         return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
     return source
 
 
-def _choose(
-    spec: str,
-    shot: Shot,
-    own: ClassicalPreset,
-    mode: str,
-    keep: Callable[[str, bool, str], Kept] | None,
-    quicker: Callable[..., Array] | None,
-    bundled: Callable[..., Array] | None,
-    device: str,
-) -> FirstPassSource:
-    if spec == "auto":
-        if shot.layers(shot.numbers[0]).estimate is not None:
-            return FirstPassSource("file", PerFrame(_from_file), "the file holds a denoised picture")
-        if (lacking := why_no_oidn()) is None:
-            if quicker is not None and find_device(device) == "cpu":
-                return _oidn(mode, keep, "OIDN is installed; its networks run in torch", "cpu", quicker)
-            return _oidn(mode, keep, "OIDN is installed", device)
-        if bundled is not None:
-            return _bundled(mode, bundled, f"{lacking}; a network comes with ravg")
-        return FirstPassSource("nlm", Classical(own), f"no denoised picture in the file, and {lacking}")
-    if spec == "none":
-        return FirstPassSource("none", None, "asked for")
-    if spec == "nlm":
-        return FirstPassSource("nlm", Classical(own), "asked for")
-    if spec == "bundled":
-        if bundled is None:
-            raise ImportError("estimate bundled: torch is needed, which this command does without; expected another")
-        return _bundled(mode, bundled, "asked for")
-    if spec in OIDN_MODES:
-        if (lacking := why_no_oidn()) is not None:
-            raise ImportError(f'estimate {spec}: {lacking}; expected: pip install "pyoidn"')
-        return _oidn(spec, keep, "asked for", device)
+def _sequence(spec: str, shot: Shot) -> FirstPassSource:
+    """A finished sequence, in the grade of the shot."""
     sequence = open_matching_sequence(spec, shot)
     missing = [number for number in shot.numbers if not sequence.has(number)]
     if missing:
-        raise ValueError(f"estimate {spec}: expected frame {missing[0]}, which the shot has, got none")
-    other = find_other_frame(shot, lambda number: read_denoised(sequence, number) if sequence.has(number) else None)
+        raise ValueError(f"first pass {spec}: expected frame {missing[0]}, which the shot has, got none")
+
+    def read(number: int) -> Array | None:
+        return read_denoised(sequence, number) if sequence.has(number) else None
+
+    other = find_other_frame(shot, read)
     if other is not None:
-        raise ValueError(f"estimate {spec}: each picture belongs to {other}, expected those of the shot's own frames")
-    grade = find_sequence_grade(shot, lambda n: read_denoised(sequence, n) if sequence.has(n) else None)
+        raise ValueError(f"first pass {spec}: each picture belongs to {other}, expected those of the shot's own frames")
+    grade = find_sequence_grade(shot, read)
     if grade is not None and grade.factors is None:
-        raise ValueError(f"estimate {spec}: it {grade.message}, expected pictures of the shot's own light")
-    factors, why = (None, "asked for") if grade is None else (grade.factors, f"it {grade.message}: brought to that")
-    read = PerFrame(partial(_read_sequence, sequence, factors), files=sequence)
-    return FirstPassSource("sequence", read, why, sequence)
+        raise ValueError(f"first pass {spec}: it {grade.message}, expected pictures of the shot's own light")
+    factors = None if grade is None else grade.factors
+
+    def denoised(frame: Frame) -> Array | None:
+        # Neighbours outside the requested frames may be missing: these count for nothing.
+        picture = read(frame.number)
+        return picture if picture is None or factors is None else picture * np.array(factors, np.float32)
+
+    why = "asked for" if grade is None else f"it {grade.message}: brought to that"
+    return FirstPassSource("sequence", PerFrame(denoised, files=sequence), why, sequence)
 
 
-def _bundled(mode: str, run: Callable[..., Array], reason: str) -> FirstPassSource:
-    quality = OIDN_MODES[mode]["quality"]
-    return FirstPassSource("bundled", PerFrame(partial(denoise_frame_oidn, denoise=run, quality=quality)), reason)
+def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: _KeptPictures | None) -> FirstPassSource:
+    """A mode of OIDN, by this function, with its pictures kept or not."""
+    run: Callable[..., Array] = partial(_run_mode, mode, denoise=denoise)
+    if store is not None:
+        run = partial(store.read_or_run, run=run)
+    # Networks in torch work on a strip at a time.
+    holds = 0 if in_torch else HOLDS_FAST if mode == "oidn-fast" else HOLDS
+    first_pass = GuideAware(run, holds) if mode == "oidn-clean" else PerFrame(run, holds)
+    return FirstPassSource(mode, first_pass, "", kept=() if store is None else tuple(store.places.values()))
 
 
-def _oidn(
-    mode: str,
-    keep: Callable[[str, bool, str], Kept] | None,
-    reason: str,
-    device: str,
-    quicker: Callable[..., Array] | None = None,
-) -> FirstPassSource:
-    device = find_device(device)
-    run: Callable[..., Array] = partial(_run_mode, mode, denoise=quicker or partial(denoise_oidn, device=device))
-    kept = None if keep is None else keep(mode, quicker is not None, device)
-    if kept is not None:
-        run = partial(kept.read_or_run, run=run)
-    most = HOLDS_FAST if mode == "oidn-fast" else HOLDS
-    holds = most if quicker is None else 0  # networks in torch work on a strip at a time
-    estimates = GuideAware(run, holds) if mode == "oidn-clean" else PerFrame(run, holds)
-    places = () if kept is None else tuple(kept.places.values())
-    return FirstPassSource(mode, estimates, reason, kept=places, device=device)
-
-
-class Kept:
+class _KeptPictures:
     """OIDN's pictures on disk, each with a record of what it was made from.
 
     Parameters
@@ -307,51 +308,51 @@ class Kept:
     shot : Shot
         The noisy shot.
     spec : str
-        Where they are: a pattern or a folder; those of one of several pictures in a folder of its own there.
+        A pattern or a folder; for one of several views, a folder of its own there.
     forced : str
         As for `find_first_pass`.
     mode : str
         A key of `OIDN_MODES`.
-    quicker : bool
-        Whether OIDN's networks run elsewhere, less exactly.
+    in_torch : bool
+        Whether OIDN's networks run in torch, less exactly.
     device : str
-        What they run on.
+        OIDN's device.
 
     Raises
     ------
     ValueError
-        If it is one name for several frames, neighbours among them, or would overwrite an input.
+        If `spec` is one name for several frames, neighbours among them, or would overwrite an input.
     """
 
-    def __init__(self, shot: Shot, spec: str, forced: str, mode: str, quicker: bool, device: str) -> None:
-        # Of neighbours too that were not asked for.
+    def __init__(self, shot: Shot, spec: str, forced: str, mode: str, in_torch: bool, device: str) -> None:
         path = Path(spec)
         if shot.view:
             name = _folder_name(shot.view)
             path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
+        # Neighbours of the requested frames are kept too.
         self.places = {number: output_path(path, shot, number, include_context=True) for number in shot.files}
         self._shot = shot
-        self._facts = {"estimate": mode, "quicker": quicker, "device": device, "forced": forced, **versions("pyoidn")}
-        # Frames on each side that fireflies are told by, and those that tell whether guides hold noise.
-        self._reach = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
+        self._facts = {"estimate": mode, "quicker": in_torch, "device": device, "forced": forced, **versions("pyoidn")}
+        # Frames on each side by which fireflies are found, and those that show whether guides hold noise.
+        self._support = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
 
-    def read_or_run(self, frame: Frame, *known: bool, run: Callable[..., Array]) -> Array:
-        """What an earlier run has left of this frame, if it would be the same now; else what is left there now.
+    def read_or_run(self, frame: Frame, *noisy_guides: bool, run: Callable[..., Array]) -> Array:
+        """Read the picture that an earlier run has kept, if it would be the same now; else make and keep it.
 
         Raises
         ------
         ValueError
-            If another file is there, which no run has left as an estimate.
+            If another file is there, which no run has kept as a first pass.
         """
         path, shot = self.places[frame.number], self._shot
-        files = shot.sources(shot.neighbours(frame.number, self._reach))
+        files = shot.sources(shot.neighbours(frame.number, self._support))
         made_from = describe_sources(files, frame=frame.number, layers=shot.layer_summary(frame.number), **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
                 raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")
             path.parent.mkdir(parents=True, exist_ok=True)
-            shot.write(path, frame.number, {"color": run(frame, *known)}, attributes={MADE_FROM: made_from})
-        # Read back also what was just written, half as it may be: every run then sees the same.
+            shot.write(path, frame.number, {"color": run(frame, *noisy_guides)}, attributes={MADE_FROM: made_from})
+        # Also a picture just written is read back, as it may be half: every run then sees the same.
         return shot.reopened({frame.number: path}).read(frame.number).color
 
 
@@ -388,10 +389,6 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
     return filled
 
 
-def _from_file(frame: Frame) -> Array | None:
-    return frame.estimate
-
-
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
     """Run OIDN, or what stands for it, on a frame with what guides it has.
 
@@ -412,14 +409,6 @@ def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
     return (denoise or denoise_oidn)(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
-
-
-def _read_sequence(sequence: Shot, factors: tuple[float, float, float] | None, frame: Frame) -> Array | None:
-    # Neighbours outside the frames that were asked for may be missing: they then count for nothing.
-    if not sequence.has(frame.number):
-        return None
-    picture = read_denoised(sequence, frame.number)
-    return picture if factors is None else picture * np.array(factors, np.float32)
 
 
 def read_denoised(sequence: Shot, number: int) -> Array:

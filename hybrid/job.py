@@ -315,16 +315,14 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
     if not denoiser.needs_first_pass:
         return FirstPassSource("none", None, "the denoiser takes none")
     support = temporal_support(None, denoiser.radius, options.rules)
-    quicker, bundled = denoiser.backends
     return find_first_pass(
         "nlm" if options.first_pass == "none" else options.first_pass,
         view.with_neighbours(support * (options.passes - 1)),
-        own=CLASSICAL_PRESETS.get(options.preset, FINAL),
+        classical=CLASSICAL_PRESETS.get(options.preset, FINAL),
         kept=options.keep_first_pass,
         mode=options.oidn_mode,
         forced=options.rules.forced,
-        quicker=quicker,
-        bundled=bundled,
+        backends=denoiser.backends,
         device=options.device,
     )
 

@@ -10,11 +10,11 @@ import math
 import re
 from collections.abc import Collection
 
-from hybrid.alignment.align import MARGIN
-from hybrid.files.layers import Layers
+from hybrid.alignment.align import MARGIN, aligned_planes
+from hybrid.alignment.prepare import prepared_planes
 from hybrid.files.shots import Shot
 from hybrid.oidn import HOLDS, HOLDS_FAST
-from hybrid.stream import FirstPass
+from hybrid.stream import FirstPass, can_refine, kept_planes
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
@@ -55,7 +55,7 @@ def plan_rows(
     limit: int,
     shot: Shot,
     stages: Collection[str],
-    estimates: FirstPass | None = None,
+    first_pass: FirstPass | None = None,
     *,
     radius: int = 2,
     network: int | None = None,
@@ -71,8 +71,8 @@ def plan_rows(
         Its headers are read.
     stages : collection of str
         Which may run on some frame.
-    estimates : FirstPass, optional
-        Where the estimates of single frames come from.
+    first_pass : FirstPass, optional
+        Of the shot.
     radius : int
         Frames on each side of the centre.
     network : int, optional
@@ -96,10 +96,17 @@ def plan_rows(
     is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
     """
     height, width = shot.shape
-    kept, passing, worked = _planes(shot, stages, estimates, radius, network is not None)
+    layers, neural = shot.layers(shot.numbers[0]), network is not None
+    kept = kept_planes(shot, stages, first_pass, radius)
+    # Reading: the file as it is, the frame as read, and the planes of its preparation.
+    reading = len(shot.header(shot.numbers[0]).channel_names) + prepared_planes(layers) + PREPARING
+    passing = max(reading, REFINING if can_refine(stages) else 0)
+    # A first pass made of windows is filtered beside a network too.
+    filtered = not neural or (first_pass is not None and first_pass.from_noisy)
+    worked = 2.0 * (2 * radius + 1) * aligned_planes(layers) + (FILTERING if filtered else GIVING)
     plane = 4 * height * width
     base, code = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
-    holds = 0 if estimates is None else estimates.holds
+    holds = 0 if first_pass is None else first_pass.holds
     if gathers:
         holds = max(holds, HOLDS_FAST)
         worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
@@ -123,76 +130,3 @@ def plan_rows(
     while needed(rows + STRIP) <= budget:
         rows += STRIP
     return rows
-
-
-def _planes(
-    shot: Shot, stages: Collection[str], estimates: FirstPass | None, radius: int, neural: bool
-) -> tuple[float, float, float]:
-    """Planes that are kept for a window; that come and go with a frame; and that are worked on for each row."""
-    header, layers = shot.header(shot.numbers[0]), shot.layers(shot.numbers[0])
-    frame = _planes_prepared(layers)
-    reach = radius if estimates is None else estimates.reach(radius)
-    frames = min(2 * reach + 1, shot.count)
-    window = (2 * radius + 1) * _planes_aligned(layers)
-    pictures = 3 if "stabilize" in stages else 1
-    kept = frames * frame + _planes_of_flows(layers, stages, frames, radius) + pictures * _planes_written(layers)
-    # Reading: the file as it is, the frame as read, and what its preparation takes. Writing: the file again.
-    passing = max(len(header.channel_names) + frame + PREPARING, REFINING if _can_refine(stages) else 0)
-    # Estimates that come from windows are filtered beside a network too.
-    filtered = not neural or (estimates is not None and estimates.from_noisy)
-    worked = 2.0 * window + (FILTERING if filtered else GIVING)
-    return kept, passing, worked
-
-
-def _planes_prepared(layers: Layers) -> float:
-    """Count the float32 planes that a `PreparedFrame` of these layers holds, with its light."""
-    given = (layers.albedo, layers.normal, layers.variance)
-    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
-    one_way = layers.motion_convention is not None and not layers.motion_convention.pair
-    single = (layers.depth is not None and one_way) + (layers.alpha is not None)
-    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.pass_colors.values()))
-    return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
-
-
-def _planes_aligned(layers: Layers) -> float:
-    """Count the float32 planes that each frame of an `AlignedWindow` of these layers takes, with its estimate."""
-    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
-    return 3 + 3 + guides + _planes_written(layers) - 3 + 1
-
-
-def _planes_written(layers: Layers) -> float:
-    """Count the float32 planes that are made of a window: the color, and what is filtered along."""
-    aovs = sum(len(layer.channels) for layer in layers.aovs.values())
-    return 3 + aovs + (layers.alpha is not None)
-
-
-def _planes_of_flows(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
-    """Count the float32 planes of the flows that a `FrameStream` keeps.
-
-    Parameters
-    ----------
-    layers : Layers
-        Of the shot: whether they have vectors.
-    stages : collection of str
-        That may run.
-    frames : int
-        Over which windows slide.
-    radius : int
-        Of the windows.
-
-    Returns
-    -------
-    float
-        Planes of the size of a frame, of four bytes a pixel.
-    """
-    if "warp" not in stages:
-        return 0.0
-    made = _can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
-    steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
-    chains = 2 * (radius + 1) * max(radius - 1, 0)
-    return (2 + 0.25) * (chains + steps)
-
-
-def _can_refine(stages: Collection[str]) -> bool:
-    """Whether flow may be solved for."""
-    return bool({"refine", "dense-flow"} & {*stages})

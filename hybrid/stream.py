@@ -19,10 +19,11 @@ from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
-from hybrid.alignment.prepare import PreparedFrame, prepare
+from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
 from hybrid.files.frame import Frame, Frames
+from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
 from hybrid.runtime.timing import Timings
@@ -323,6 +324,49 @@ class FrameStream:
         frame = self.frame(number)
         assert frame is not None
         return frame
+
+
+def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int) -> float:
+    """Count the float32 planes that stay in memory while windows slide: frames, flows and results.
+
+    Parameters
+    ----------
+    shot : Shot
+        Its headers are read.
+    stages : collection of str
+        The stages that may run.
+    first_pass : FirstPass or None
+        Of the shot.
+    radius : int
+        Frames on each side of the centre.
+    """
+    layers = shot.layers(shot.numbers[0])
+    support = radius if first_pass is None else first_pass.reach(radius)
+    frames = min(2 * support + 1, shot.count)
+    results = 3 if "stabilize" in stages else 1
+    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
+    return frames * prepared_planes(layers) + _flow_planes(layers, stages, frames, radius) + results * written
+
+
+def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:
+    """Count the planes of flows: two of vectors, and a byte of validity, for each pair and each composed flow."""
+    if "warp" not in stages:
+        return 0.0
+    made = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
+    steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
+    composed = 2 * (radius + 1) * max(radius - 1, 0)
+    return (2 + 0.25) * (composed + steps)
+
+
+def can_refine(stages: Collection[str]) -> bool:
+    """Whether TV-L1 may run.
+
+    Parameters
+    ----------
+    stages : collection of str
+        The stages that may run.
+    """
+    return bool({"refine", "dense-flow"} & {*stages})
 
 
 def _link(forward: Flow | None, backward: Flow | None) -> Link | None:

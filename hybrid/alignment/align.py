@@ -17,6 +17,7 @@ from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, tr
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import remodulate
 from hybrid.alignment.window import AlignedWindow, Trust, WarpSources, Window, clean_guide
+from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
@@ -225,6 +226,19 @@ def align_results(
         relight(results, alike, confidence, exposure, first_row=padded.start)
         confidence[[0, 2]] *= stillness.whole * (1 + local) / 2
     return results[:, inner], confidence[:, inner]
+
+
+def aligned_planes(layers: Layers) -> float:
+    """Count the float32 planes of each frame of an `AlignedWindow` of these layers, with its first pass.
+
+    Parameters
+    ----------
+    layers : Layers
+        Of a file.
+    """
+    guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
+    aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
+    return 3 + 3 + guides + aovs + 1
 
 
 def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:

@@ -13,6 +13,7 @@ from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
 from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
 from hybrid.files.frame import Frame
+from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
@@ -223,6 +224,22 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         pass_colors=pass_colors,
         passes=passes,
     )
+
+
+def prepared_planes(layers: Layers) -> float:
+    """Count the float32 planes of a `PreparedFrame` of these layers, with its light.
+
+    Parameters
+    ----------
+    layers : Layers
+        Of a file.
+    """
+    given = (layers.albedo, layers.normal, layers.variance)
+    motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
+    one_way = layers.motion_convention is not None and not layers.motion_convention.pair
+    single = (layers.depth is not None and one_way) + (layers.alpha is not None)
+    aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.pass_colors.values()))
+    return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
 
 
 def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:

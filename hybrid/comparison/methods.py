@@ -18,7 +18,7 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
-from hybrid.first_pass import OIDN_MODE_OF_PRESET, denoise_frame_oidn, find_first_pass, read_denoised
+from hybrid.first_pass import OIDN_MODE_OF_PRESET, Backends, denoise_frame_oidn, find_first_pass, read_denoised
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
@@ -122,7 +122,9 @@ class WindowSettings:
         rules = replace(self.rules, on=self.rules.on | {"refine"}) if self.solver else self.rules
         bundled = _bundled_network() if self.source == "bundled" else None
         # Sources that methods name do not read the shot's files.
-        chosen = find_first_pass(self.source, cast(Shot, shot), mode=OIDN_MODE_OF_PRESET["fast"], bundled=bundled)
+        chosen = find_first_pass(
+            self.source, cast(Shot, shot), mode=OIDN_MODE_OF_PRESET["fast"], backends=Backends(bundled=bundled)
+        )
         refine = partial(refine_flow, **self.solver)
         return FrameStream(frames, rules, chosen.first_pass, radius=self.radius, refine=refine)
 

@@ -236,7 +236,7 @@ def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeyp
     assert find_first_pass("auto", cycles).name == "file"
     assert find_first_pass("auto", plain).name == "oidn-clean"
     monkeypatch.setattr(first_pass, "why_no_oidn", lambda: "pyoidn is not installed")
-    source = find_first_pass("auto", plain, own=STANDARD)
+    source = find_first_pass("auto", plain, classical=STANDARD)
     assert (source.name, source.first_pass) == ("nlm", Classical(STANDARD))
     assert find_first_pass("none", plain).first_pass is None
     with pytest.raises(ImportError, match="pyoidn is not installed"):

@@ -81,9 +81,7 @@ def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
     shot, reference = make_shots((1, 2, 4))
     methods = NOISY | ways(perfect=perfect)
     results = compare_shot(shot, reference, methods, CompareOptions(exposure=2.0), folder=tmp_path).results
-    expected = [
-        flip_maps([2 * shot.read(n).color], 2 * reference.read(n).color)[0].mean() for n in shot.numbers
-    ]
+    expected = [flip_maps([2 * shot.read(n).color], 2 * reference.read(n).color)[0].mean() for n in shot.numbers]
     assert results[0].metrics["flip"].values == pytest.approx(expected, rel=1e-5)  # means of float32
     assert results[1].metrics["flip"].mean == 0
     store = FrameStore(tmp_path)

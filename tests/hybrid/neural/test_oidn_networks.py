@@ -15,7 +15,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import OIDN_MODES, denoise_frame_oidn, find_first_pass
+from hybrid.first_pass import OIDN_MODES, Backends, denoise_frame_oidn, find_first_pass
 from hybrid.neural import oidn_networks
 from hybrid.neural.oidn_networks import denoise_bundled, denoise_unet
 from hybrid.stream import FrameStream
@@ -82,11 +82,11 @@ def test_auto_takes_what_is_quicker_and_a_name_what_it_names(tmp_path) -> None:
         calls.append(mode)
         return color
 
-    source = find_first_pass("auto", shot, mode="oidn-fast", quicker=quicker)
+    source = find_first_pass("auto", shot, mode="oidn-fast", backends=Backends(quicker))
     assert "torch" in source.reason
     FrameStream(shot, only({"demodulate"}), radius=0, first_pass=source.first_pass).align(1002)
     assert calls == [{"quality": "fast"}]
-    named = find_first_pass("oidn-fast", shot, quicker=quicker)
+    named = find_first_pass("oidn-fast", shot, backends=Backends(quicker))
     FrameStream(shot, only({"demodulate"}), radius=0, first_pass=named.first_pass).align(1002)
     assert len(calls) == 1
 
