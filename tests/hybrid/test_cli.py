@@ -85,6 +85,7 @@ SAID_BY_EACH = {
     "--resume",
     "--beside",
     "--frames",
+    "--window",
 }
 
 
