@@ -1,12 +1,12 @@
 """A training of the final stage from OIDN's weights: render shots, make clips of them, train each preset.
 
     python examples/train_weights.py OUT --blender-python blender/bin/python
-    python examples/train_weights.py OUT --untrained    # as the trainings begin, which is what ships
+    python examples/train_weights.py OUT --untrained    # the initial weights, which ship
 
-The shots are drawn from seeds (`ravg simulate random` and `hard`), so that the same come out again; none of those that
-ravg is judged or tuned on is among them. Each has a render of many samples, whose pseudo-references the others are
-trained towards. All of it goes on where it was stopped, shot by shot, and trainings from their last checkpoint.
-docs/experiments.md has what it gains.
+The shots are drawn from seeds (`ravg simulate random` and `hard`) and reproducible; no shot of the evaluation or of the
+tuning of ravg is among them. Each has a render of many samples, whose pseudo-references are the targets of the others.
+An interrupted run continues at the same shot, and trainings continue from their last checkpoint. docs/experiments.md
+lists the gains.
 """
 
 from __future__ import annotations

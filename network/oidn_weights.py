@@ -126,12 +126,8 @@ def build_unet(tensors: dict[str, Tensor], where: str = "TZA") -> OidnUNet:
 def load_oidn(name: str) -> OidnUNet:
     """Load a network of OIDN, one of `OIDN_WEIGHTS`, in float32.
 
-    Raises
-    ------
-    ValueError
-        If there is no such network, or the library does not hold its weights.
-    FileNotFoundError
-        If there is no such library.
+    Raises ValueError if there is no such network, or the library does not hold its weights; FileNotFoundError if there
+    is no such library.
     """
     if name not in OIDN_WEIGHTS:
         raise ValueError(f"OIDN's weights: expected one of {', '.join(OIDN_WEIGHTS)}, got {name!r}")

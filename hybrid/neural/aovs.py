@@ -77,10 +77,6 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
         The denoised centre.
     add : bool
         Whether the color becomes the sum of its parts; otherwise the parts are scaled to it.
-
-    Returns
-    -------
-    SharedLight
     """
     sums, exposure = aligned.passes.sums, aligned.exposure
     aovs = {name: layer for name, layer in filtered.items() if name != BEAUTY}

@@ -1,4 +1,4 @@
-"""What all networks share when they run on aligned windows: device, precision, tiles, breakdown."""
+"""Shared parts of running networks on aligned windows: device, precision, tiles, breakdown."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class NetworkDenoiser(WindowDenoiser):
 
     @property
     def precision(self) -> str:
-        """Of the weights."""
+        """Precision of the weights."""
         return "bfloat16" if self.setup.bfloat16 else "float32"
 
     @property

@@ -41,10 +41,6 @@ def torch_backend(device: str, *, exact: bool) -> Callable[..., Array] | None:
         Of the networks: a GPU is left to OIDN.
     exact : bool
         Whether float32 was asked for: then first passes are OIDN's own.
-
-    Returns
-    -------
-    callable or None
     """
     return denoise_unet if device == "cpu" and not exact and has_oidn_networks() else None
 
@@ -90,10 +86,6 @@ def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced")
         "albedo" and "normal", or one of them.
     quality : str
         "high" runs the large networks.
-
-    Returns
-    -------
-    dict of str to (H, W, 3) array of float32
     """
     size = "_large" if quality == "high" else ""
     filters: dict[str, tuple[str, Callable[..., Tensor]]] = {

@@ -50,10 +50,6 @@ def open_network(
     timings : Timings, optional
         Counts the stage "network".
 
-    Returns
-    -------
-    NetworkDenoiser
-
     Raises
     ------
     ValueError

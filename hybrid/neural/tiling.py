@@ -21,10 +21,6 @@ def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
         Layers.
     copied : bool
         Whether planes become contiguous; otherwise the tensor is a view of the array.
-
-    Returns
-    -------
-    Tensor
     """
     planes = window.transpose(0, 3, 1, 2)
     return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
@@ -44,10 +40,6 @@ def pad(window: Array, multiple: int) -> Array:
         Layers.
     multiple : int
         Of height and width.
-
-    Returns
-    -------
-    (T, H', W', C) array
     """
     bottom, right = (-size % multiple for size in window.shape[1:3])
     return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window

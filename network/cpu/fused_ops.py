@@ -33,10 +33,6 @@ def can_blend(x: Tensor, frames: int) -> bool:
         Features.
     frames : int
         T.
-
-    Returns
-    -------
-    bool
     """
     supported = x.dtype in (torch.float32, torch.bfloat16) and frames in _UNROLLED
     return supported and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu")

@@ -437,23 +437,15 @@ class Clips:
 def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Clips:
     """Open all shards of a folder and its subfolders, in the order of their paths.
 
+    Raises FileNotFoundError if there are none; ValueError if one is no shard of clips, or of another version, or their
+    windows differ in length, or are shorter.
+
     Parameters
     ----------
     folder : path
         Output of `write_shards`.
     frames : int, optional
         Length of the windows, as for `Clips`.
-
-    Returns
-    -------
-    Clips
-
-    Raises
-    ------
-    FileNotFoundError
-        If there are none.
-    ValueError
-        If one is no shard of clips, or of another version, or their windows differ in length, or are shorter.
     """
     paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:

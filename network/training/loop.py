@@ -87,10 +87,6 @@ def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
         Its terms, "temporal" by default, and the weight of the whole window.
     frames : int
         Length of the window.
-
-    Returns
-    -------
-    list of Term
     """
     if config.terms in (None, "temporal"):
         return losses.temporal_terms(frames, config.whole)
@@ -208,7 +204,9 @@ def train(
 ) -> list[float]:
     """Train a model and write the moving average of its weights.
 
-    Returns the loss of each step of this run; of several processes, of this one's share.
+    Returns the loss of each step of this run; of several processes, of this one's share. Raises ValueError if the
+    state to resume is cut short or of another training, the batch cannot be shared evenly, or crops or terms do not
+    fit the model; FileNotFoundError if there is no state to resume.
 
     Parameters
     ----------
@@ -227,14 +225,6 @@ def train(
         Called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
         ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with
         its values, as ``validation/psnr`` and so on.
-
-    Raises
-    ------
-    ValueError
-        If the state to resume is cut short or of another training, the batch cannot be shared evenly, or crops or terms
-        do not fit the model.
-    FileNotFoundError
-        If there is no state to resume.
 
     Notes
     -----
