@@ -26,6 +26,7 @@ from hybrid.comparison.tables import column_title, format_bytes, format_seconds
 # invisible on white. Seven colors and nine markers: families repeat neither until the 64th.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6b6b")
 MARKERS = "os^D*vXhP"
+SIZES = (1.0, 0.95, 1.1, 0.85, 1.6, 1.1, 1.15, 1.05, 1.15)  # of the markers, for about equal areas
 WIDTH, HEIGHT, PNG_DPI = 10.0, 5.4, 160  # inches, and dots per inch
 GUTTER = 0.09  # of the cost axis: the columns of methods that cost nothing, and of those whose cost is unknown
 LEGEND_COLUMNS, LEGEND_ROW = 4, 0.3  # the height of a row in inches
@@ -160,7 +161,7 @@ def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
         [point.y],
         linestyle="none",
         marker=MARKERS[point.family % len(MARKERS)],
-        markersize=(6 if result.sweep else 8) + point.on_front,
+        markersize=((6 if result.sweep else 8) + point.on_front) * SIZES[point.family % len(SIZES)],
         markerfacecolor=point.color if point.on_front else "white",
         markeredgecolor="white" if point.on_front else point.color,
         markeredgewidth=0.8 if point.on_front else 1.4,
@@ -212,10 +213,10 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point]) -> None:
 
 
 def _draw_legend(figure: Figure, names: Sequence[str]) -> None:
-    handles = [
-        Line2D([], [], color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)], linestyle="", markersize=8)
-        for i in range(len(names))
-    ]
+    handles = []
+    for i in range(len(names)):
+        color, kind, size = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], 8 * SIZES[i % len(SIZES)]
+        handles.append(Line2D([], [], color=color, marker=kind, linestyle="", markersize=size))
     legend = figure.legend(handles, ["-"] * len(names), loc=(0.05, 0), ncols=LEGEND_COLUMNS, frameon=False)
     for text, name in zip(legend.get_texts(), names, strict=True):  # given as labels, names with a leading "_" are lost
         text.set(text=" ".join(name.split()), parse_math=False, fontsize=9)
@@ -260,5 +261,6 @@ def marker(family: int, size: float = 6.5) -> str:
         About the radius.
     """
     style = MarkerStyle(MARKERS[family % len(MARKERS)])
-    path = style.get_path().transformed(style.get_transform() + Affine2D().scale(2 * size, -2 * size))
+    scale = 2 * size * SIZES[family % len(SIZES)]
+    path = style.get_path().transformed(style.get_transform() + Affine2D().scale(scale, -scale))
     return " ".join(f"{x:.2f},{y:.2f}" for x, y in np.asarray(path.to_polygons()[0]))
