@@ -302,7 +302,7 @@ METHODS: dict[str, Method] = {
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
-    "gathered": _aligned("Gated averages", pool_and_denoise, source="oidn-fast"),
+    "pooled": _aligned("Gated averages", pool_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("fast", "bundled"),
     **{f"network {preset}": _network(preset, mode) for preset, mode in OIDN_MODE_OF_PRESET.items()},
     "tKPCN": _network("tkpcn", "none"),
