@@ -1,6 +1,8 @@
 """Options and results reach what they are for: connections that could be cut without another test noticing."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_matching_sequence, open_shot
 from hybrid.memory import plan_rows
+from hybrid.records import read_records
 from tests.scenes import Scene
+
+ROOT = Path(__file__).parents[2]
 
 
 def color(path):
@@ -96,3 +101,83 @@ def test_the_number_of_threads_is_that_which_was_asked_for(shot_folder, tmp_path
 
 def test_a_matching_sequence_has_the_frames_that_were_asked_for(shot_folder):
     assert open_matching_sequence(shot_folder, open_shot(shot_folder), frames="1002-1003").numbers == (1002, 1003)
+
+
+def test_the_network_has_the_tile_and_the_layers_that_were_asked_for(monkeypatch):
+    """Small tiles where memory is limited; layers to be summed where the beauty is their sum."""
+    fake = SimpleNamespace(
+        SMALL_TILE=384,
+        shipped_weights=lambda preset: preset,
+        open_network=lambda _, **options: SimpleNamespace(needs_first_pass=True, **options),
+    )
+    monkeypatch.setattr(job, "import_neural", lambda: fake)
+    plain, limited, tiled, summed = (
+        job.open_denoiser(job.DenoiseOptions(**options))
+        for options in ({}, {"max_memory": "8G"}, {"max_memory": "8G", "tile": 64}, {"aov_sum": "beauty"})
+    )
+    assert [made.tile for made in (plain, limited, tiled)] == [None, 384, 64]
+    assert [made.add_layers for made in (plain, summed)] == [False, True]
+
+
+@pytest.mark.neural
+def test_only_the_last_pass_resumes_keeps_going_and_counts_weights(shot_folder, tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    runs = []
+
+    def denoise_frames(views, output, denoiser, rules, settings, **options):
+        runs.append((denoiser, settings.resume, settings.keep_going))
+        yield from ()
+
+    monkeypatch.setattr(job, "denoise_frames", denoise_frames)
+    monkeypatch.setattr(job, "write_breakdown", lambda *_: None)
+    asked = {"first_pass": "nlm", "passes": 2, "resume": True, "keep_going": True, "breakdown": tmp_path / "b.png"}
+    opened = job.Job.open(open_shot(shot_folder), tmp_path / "out", job.DenoiseOptions(**asked))
+    assert list(opened.run()) == []
+    assert [run[1:] for run in runs] == [(False, False), (True, True)]
+    assert [run[0] is opened.denoiser for run in runs] == [False, True]
+
+
+def test_a_strict_run_refuses_holes(tmp_path):
+    folder = Scene(frames=4).write(tmp_path / "in")
+    (folder / "shot.1002.exr").unlink()
+    with pytest.raises(ValueError, match="missing frames 1002"):
+        job.validate_views(open_shot(folder), strict=True)
+
+
+@pytest.mark.neural
+def test_the_weights_of_a_bundled_first_pass_are_in_the_header(shot_folder, tmp_path):
+    pytest.importorskip("torch")
+    options = job.DenoiseOptions(first_pass="bundled")
+    made = job.Job.open(open_shot(shot_folder), tmp_path / "out", options).settings
+    assert len(made["bundled"]) == len(made["weights"]) == 16
+
+
+@pytest.mark.neural
+def test_the_record_names_the_weights(denoise):
+    pytest.importorskip("torch")
+    out = denoise("out", "--weights", ROOT / "tests" / "data" / "small.safetensors")
+    ((_, record),) = read_records(out)
+    assert record["preset"] == "small.safetensors"
+
+
+def test_a_cut_is_said_once(tmp_path, capsys):
+    def edit(index, layers):
+        if index >= 3:
+            layers |= {name: np.ascontiguousarray(layer[::-1, ::-1]) for name, layer in layers.items()}
+
+    folder = Scene(frames=6, step=(0, 0)).write(tmp_path / "in", edit=edit)
+    assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if " cut" in line and "warning" in line]
+    assert len(said) == 1
+
+
+def test_chunks_of_a_cluster_resume_and_pictures_follow(shot_folder, tmp_path, monkeypatch):
+    """A chunk that is run again, after its worker died, skips frames that are finished."""
+    chunks, pictures = {}, []
+    monkeypatch.setattr("hybrid.commands.denoise.run_on_cluster", lambda _, what, found: chunks.update(found))
+    monkeypatch.setattr("hybrid.commands.denoise._write_pictures", lambda *_: pictures.append(dict(chunks)))
+    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--chunk", "2"]
+    assert main([*words, "--scheduler", "tcp://127.0.0.1:1", "--preview", str(tmp_path / "x.png")]) == 0
+    assert len(chunks) == 2
+    assert all("--resume" in chunk.arguments for chunk in chunks.values())
+    assert pictures == [chunks]
