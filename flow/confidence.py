@@ -12,6 +12,8 @@ from loops.parallel import run_bands
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
 
+_Pair = tuple[np.ndarray, np.ndarray]
+
 
 def estimate_confidence(
     flow: np.ndarray,
@@ -70,8 +72,8 @@ def estimate_confidence(
     confidence = np.empty(shape, np.float32)
     absent = np.empty((0, 0, 0), np.float32)
     layers = [
-        absent if layer is None else np.ascontiguousarray(layer, np.float32).reshape(*layer.shape[:2], -1)
-        for layer in (flow, reverse, albedo, warped_albedo, normal, warped_normal)
+        tuple(absent if x is None else np.ascontiguousarray(x, np.float32).reshape(*x.shape[:2], -1) for x in pair)
+        for pair in ((flow, reverse), (albedo, warped_albedo), (normal, warped_normal))
     ]
     run_bands(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
@@ -79,10 +81,13 @@ def estimate_confidence(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _agree(
-    first: int, last: int, inside: np.ndarray, flow: np.ndarray, reverse: np.ndarray, albedo: np.ndarray,
-    warped_albedo: np.ndarray, normal: np.ndarray, warped_normal: np.ndarray, first_row: int, out: np.ndarray,
+    first: int, last: int, inside: np.ndarray, flows: _Pair, albedos: _Pair, normals: _Pair, first_row: int,
+    out: np.ndarray,
 ) -> None:  # fmt: skip
     """Multiply the agreement of motion, albedo and normal; layers of size 0 are left out."""
+    flow, reverse = flows
+    albedo, warped_albedo = albedos
+    normal, warped_normal = normals
     one = np.float32(1)
     for y in range(first, last):
         for x in range(out.shape[1]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +27,12 @@ _BLUR = 0.8
 _TILE, _RIM, _MOST_TILES = 128, 32, 0.5
 # `rough_flow` works on pictures of at most so many pixels.
 _ROUGH_PIXELS = 2**17
+
+
+class _Effort(NamedTuple):
+    warps: int
+    iterations: int
+    attachment: float
 
 
 def refine_flow(
@@ -78,11 +85,11 @@ def refine_flow(
     guides = _blurred(guides)
     pyramid = _build_pyramid(guides, scales)
     base = _smooth_start(start, pyramid)
-    effort = warps, iterations, _REFINE_ATTACHMENT
-    change = _solve(pyramid[1:], base, np.zeros_like(base), *effort)
+    effort = _Effort(warps, iterations, _REFINE_ATTACHMENT)
+    change = _solve(pyramid[1:], base, np.zeros_like(base), effort)
     tiles = _find_tiles(pyramid[1], start, base, change) if pyramid[1:] else None
     if tiles is None:
-        return np.asarray(base + _solve(pyramid[:1], base, change, *effort))
+        return np.asarray(base + _solve(pyramid[:1], base, change, effort))
     change = _rescale(change, *shape[::-1])
     centre, neighbour = _with_gradients(guides.centre), _with_gradients(guides.neighbour)
     flow = start.copy()
@@ -94,7 +101,7 @@ def refine_flow(
         here, noise, near, first = (
             np.ascontiguousarray(layer[rows, columns]) for layer in (centre, guides.noise, base, change)
         )
-        solved = near + _solve_block(neighbour, here, noise, near, first, (rows.start, columns.start), *effort)
+        solved = near + _solve_block(neighbour, here, noise, near, first, (rows.start, columns.start), effort)
         top, left = tile[0].start - rows.start, tile[1].start - columns.start
         flow[tile] = solved[top : top + tile[0].stop - tile[0].start, left : left + tile[1].stop - tile[1].start]
     return flow
@@ -118,7 +125,7 @@ def dense_flow(guides: GuidePair) -> np.ndarray:
         )
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         start = np.asarray(search.calc(first, second, start), np.float32)
-    return _solve(_build_pyramid(guides, 3), np.zeros_like(start), start, 3, 30, _DENSE_ATTACHMENT)
+    return _solve(_build_pyramid(guides, 3), np.zeros_like(start), start, _Effort(3, 30, _DENSE_ATTACHMENT))
 
 
 def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
@@ -188,15 +195,13 @@ def _find_tiles(
     return None if share > _MOST_TILES else tiles
 
 
-def _solve(
-    pyramid: Sequence[GuidePair], base: np.ndarray, change: np.ndarray, warps: int, iterations: int, attachment: float
-) -> np.ndarray:
+def _solve(pyramid: Sequence[GuidePair], base: np.ndarray, change: np.ndarray, effort: _Effort) -> np.ndarray:
     """Solve from coarse to fine for the change from `base`; its size is then that of the finest scale."""
     for level in reversed(pyramid):
         size = level.centre.shape[1::-1]
         centre, neighbour = _with_gradients(level.centre), _with_gradients(level.neighbour)
         part = centre, level.noise, _rescale(base, *size), _rescale(change, *size)
-        change = _solve_block(neighbour, *part, (0, 0), warps, iterations, attachment)
+        change = _solve_block(neighbour, *part, (0, 0), effort)
     return change
 
 
@@ -225,7 +230,7 @@ def _resize(planes: np.ndarray, width: int, height: int, interpolation: int) -> 
 
 def _solve_block(
     neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray, change: np.ndarray,
-    corner: tuple[int, int], warps: int, iterations: int, attachment: float,
+    corner: tuple[int, int], effort: _Effort,
 ) -> np.ndarray:  # fmt: skip
     """Solve TV-L1 at one scale for the change from `base`, starting at `change`.
 
@@ -235,9 +240,9 @@ def _solve_block(
     change = np.ascontiguousarray(change.transpose(2, 0, 1))
     dual = np.zeros((4, height + 1, width + 1), np.float32)
     data = np.empty((5, channels, height, width), np.float32)
-    for _ in range(warps):
-        _linearize(neighbour, centre, noise, base, change, *corner, attachment, data)
-        for _ in range(iterations):
+    for _ in range(effort.warps):
+        _linearize(neighbour, centre, noise, base, change, corner, effort.attachment, data)
+        for _ in range(effort.iterations):
             _step_primal(change, dual, data)
             _step_dual(change, dual)
         # Median: what total variation leaves of single wrong vectors (Wedel 2009, section 3.3).
@@ -265,7 +270,7 @@ def _with_gradients(planes: np.ndarray) -> np.ndarray:
 @njit(parallel=True, nogil=True, cache=True)
 def _linearize(
     neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray, change: np.ndarray,
-    first_row: int, first_column: int, attachment: float, data: np.ndarray,
+    corner: tuple[int, int], attachment: float, data: np.ndarray,
 ) -> None:  # fmt: skip
     """Expand the difference of the guides to first order about base + change.
 
@@ -279,7 +284,7 @@ def _linearize(
     for y in prange(height):
         for x in range(width):
             u, v = change[0, y, x], change[1, y, x]
-            px, py = np.float32(first_column + x) + base[y, x, 0] + u, np.float32(first_row + y) + base[y, x, 1] + v
+            px, py = np.float32(corner[1] + x) + base[y, x, 0] + u, np.float32(corner[0] + y) + base[y, x, 1] + v
             place = locate(px, py, frame_width, frame_height)
             weights = weigh(place)
             for g in range(channels):

@@ -228,7 +228,7 @@ class FrameDenoiser:
             layers.add(band, aligned.inner, {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight})
             layers.add(band, aligned.inner, {("aovs", name): layer for name, layer in denoised.aovs.items()})
             layers.add(band, aligned.inner, {("extra", name): layer for name, layer in denoised.extra.items()})
-            sides = {} if aligned.neighbour_samples is None else vars(aligned.neighbour_samples)
+            sides = {} if aligned.neighbour_samples is None else aligned.neighbour_samples._asdict()
             layers.add(band, aligned.inner, {("sides", name): layer for name, layer in sides.items()})
         assert aligned is not None
         samples = layers.named("sides")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,8 +20,7 @@ Floats = NDArray[np.float32]
 RESIDUAL_LIMIT = np.float32(6)
 
 
-@dataclass(frozen=True)
-class PooledSamples:
+class PooledSamples(NamedTuple):
     """A frame with the samples of its neighbours."""
 
     average: Floats  # (H, W, 3) estimates weighted by confidence
@@ -60,11 +59,10 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     check_exposure(exposure)
     estimates, confidence = check_window(estimates, confidence, "confidence")
     residuals = np.ascontiguousarray(residuals, np.float32)
-    average, image = np.empty(estimates.shape[1:], np.float32), np.empty(estimates.shape[1:], np.float32)
-    samples = np.empty(estimates.shape[1:3], np.float32)
-    given = estimates, residuals, confidence, np.float32(exposure)
-    run_bands(_pool, len(samples), *given, average, image, samples)
-    return PooledSamples(average, image, samples)
+    shape = estimates.shape[1:]
+    pooled = PooledSamples(*(np.empty(size, np.float32) for size in (shape, shape, shape[:2])))
+    run_bands(_pool, len(pooled.samples), estimates, residuals, confidence, np.float32(exposure), pooled)
+    return pooled
 
 
 def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
@@ -85,9 +83,8 @@ def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Fl
 @njit(cache=True, nogil=True)
 def _pool(
     first: int, last: int, estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32,
-    average: Floats, image: Floats, samples: Floats,
+    pooled: PooledSamples,
 ) -> None:  # fmt: skip
-    """Write average, image and number of samples."""
     T, _, W, C = estimates.shape
     for y in range(first, last):
         light, noise = np.empty(C, np.float32), np.empty(C, np.float32)
@@ -112,13 +109,13 @@ def _pool(
                 for c in range(C):
                     light[c] += weight * estimates[t, y, x, c]
                     noise[c] += weight * share * residuals[t, y, x, c]
-            samples[y, x] = total * total / squares if squares > 0 else 0
+            pooled.samples[y, x] = total * total / squares if squares > 0 else 0
             for c in range(C):
                 if total > 0:
-                    average[y, x, c] = light[c] / total
-                    image[y, x, c] = (light[c] + noise[c]) / total
+                    pooled.average[y, x, c] = light[c] / total
+                    pooled.image[y, x, c] = (light[c] + noise[c]) / total
                 else:
-                    average[y, x, c] = image[y, x, c] = estimates[T // 2, y, x, c]
+                    pooled.average[y, x, c] = pooled.image[y, x, c] = estimates[T // 2, y, x, c]
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ of a window show where, as samples of one frame are independent of those of anot
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -54,8 +54,7 @@ _CELLS = 6
 _WARPED = np.float32(0.7)
 
 
-@dataclass(frozen=True)
-class SampleMean:
+class SampleMean(NamedTuple):
     """Samples of neighbouring frames, averaged at the pixels of a frame."""
 
     mean: Floats  # (H, W, 3) radiance; 0 where no frame is trusted
@@ -83,7 +82,7 @@ def average_neighbours(
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
     mean, frames = np.zeros(estimates.shape[1:], np.float32), np.zeros(weight.shape[1:], np.float32)
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
-    run_bands(_average, len(mean), *given, residuals is not None, weight, modulation, mean, frames)
+    run_bands(_average, len(mean), *given, residuals is not None, weight, modulation, (mean, frames))
     middle = len(weight) // 2
     trust = np.minimum(np.maximum(confidence, geometry).sum(axis=0) - np.maximum(confidence, geometry)[middle], 1)
     return SampleMean(mean, frames, np.where(frames > 0, trust, 0))
@@ -129,7 +128,7 @@ def blend_samples(
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
     mean = neighbours.mean * _relative_light(noisy, neighbours, rate)[..., None]
     sums = np.zeros((4, *light.shape), np.float32)
-    run_bands(_compare, len(light), picture, noisy, mean, neighbours.frames, neighbours.trust, rate, sums)
+    run_bands(_compare, len(light), picture, noisy, neighbours._replace(mean=mean), rate, sums)
     together, squares, products, temporal = sums
     # Over as many pixels as a Gaussian averages, 1 / Σ weight².
     noise = gaussian_mean(products, _SIGMA_SHARED) / np.float32(4 * np.pi * _SIGMA_SHARED**2)
@@ -237,8 +236,9 @@ def _gray(image: Floats) -> Floats:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(
     first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, modulation: Floats,
-    mean: Floats, frames: Floats,
+    out: tuple[Floats, Floats],
 ) -> None:  # fmt: skip
+    mean, frames = out
     T, _, W, C = estimates.shape
     for y in range(first, last):
         for x in range(W):
@@ -265,22 +265,21 @@ def _average(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
-    first: int, last: int, picture: Floats, noisy: Floats, neighbours: Floats, frames: Floats, trust: Floats,
-    rate: Floats, sums: Floats,
-) -> None:  # fmt: skip
+    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, rate: Floats, sums: Floats
+) -> None:
     """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
     _, W, C = picture.shape
     for y in range(first, last):
         for x in range(W):
-            if not trust[y, x] > 0:
+            if not neighbours.trust[y, x] > 0:
                 continue
             scale, product = rate[y, x], np.float32(0)
             for c in range(C):
                 n_p = min(max(scale * (noisy[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                m_p = min(max(scale * (neighbours[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                n_m = min(max(scale * (noisy[y, x, c] - neighbours[y, x, c]), -_LIMIT), _LIMIT)
+                m_p = min(max(scale * (neighbours.mean[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
+                n_m = min(max(scale * (noisy[y, x, c] - neighbours.mean[y, x, c]), -_LIMIT), _LIMIT)
                 sums[0, y, x] += n_p * m_p
                 sums[1, y, x] += m_p * m_p
                 product += n_m * m_p
-                sums[3, y, x] += n_m * n_m / (1 + _WARPED / frames[y, x])
+                sums[3, y, x] += n_m * n_m / (1 + _WARPED / neighbours.frames[y, x])
             sums[2, y, x] = product * product
