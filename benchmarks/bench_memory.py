@@ -1,6 +1,6 @@
 """Whether --max-memory is kept at 3840×2160, and that the result does not depend on it.
 
-    python benchmarks/bench_memory.py [--commands "pseudoref --preset draft"] [--limits 6G 8G] [--repeat 12]
+    python benchmarks/bench_memory.py [--commands "denoise --preset draft"] [--limits 6G 8G] [--repeat 12]
         [--frames 3]
 
 The bundled shot is tiled to 3840×2160, and its third frame is denoised with each limit, and with none, in a process of
@@ -66,7 +66,7 @@ def run(command: str, frames: str, folder: Path, out: Path, limit: str | None) -
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--commands", nargs="+", default=["pseudoref --preset draft", "denoise --estimate none"])
+    parser.add_argument("--commands", nargs="+", default=["denoise --preset draft", "denoise --first-pass none"])
     parser.add_argument("--limits", nargs="*", default=["8G", "6G", "4G"])
     parser.add_argument("--frames", default="3", help="of the five that there are, the third among them")
     parser.add_argument(
