@@ -106,7 +106,7 @@ def test_a_picture_that_cannot_be_right_is_not_written(tmp_path, capsys, monkeyp
         image = filter_window(window, CLASSICAL_PRESETS["draft"])
         return image * np.float32(factor) if window.number == MIDDLE else image
 
-    monkeypatch.setattr("hybrid.pseudo_reference.filter_window", spoiled)
+    monkeypatch.setattr("hybrid.denoisers.filter_window", spoiled)
     folder, out = SCENE.write(tmp_path / "in"), tmp_path / "out"
     assert draft(folder, out) == 1
     assert re.search(f"error: frame {MIDDLE}.*{said}", capsys.readouterr().err)

@@ -96,7 +96,7 @@ def render_again(path, note, seconds=None):
         ("a frame that is gone", range(1006, 1010)),
         ("an estimate made again", range(1001, 1009)),
         ("an older estimate", range(1001, 1009)),
-        ("other layers", range(1001, 1011)),
+        ("other vectors", range(1001, 1011)),
         ("another version", range(1001, 1011)),
         ("the project unpacked elsewhere", ()),
     ],
@@ -126,8 +126,8 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
         render_again(estimate, "other")
     elif what == "an older estimate":
         render_again(estimate, "other", 1e9)
-    elif what == "other layers":
-        more = ["--layer", "normal=Denoising Albedo"]
+    elif what == "other vectors":
+        more = ["--motion", "none"]
     elif what == "another version":
         monkeypatch.setattr("hybrid.files.sources.version", lambda package: "1999")
     else:
@@ -170,7 +170,7 @@ def test_a_frame_that_is_rendered_again_while_it_is_used_ends_the_run(tmp_path, 
             render_again(folder / "shot.1003.exr", "again")
         return filter_window(window, CLASSICAL_PRESETS["draft"])
 
-    monkeypatch.setattr("hybrid.pseudo_reference.filter_window", filter_and_render)
+    monkeypatch.setattr("hybrid.denoisers.filter_window", filter_and_render)
     assert draft(folder, out) == 1
     assert "shot.1003.exr has changed since it was read" in capsys.readouterr().err
     assert set(stamps(out)) == {"shot.1001.exr"}
