@@ -40,6 +40,8 @@ def refine_flow(
 ) -> np.ndarray:
     """Refine a flow by TV-L1 from coarse to fine, where the result explains the guides better.
 
+    Returns (H, W, 2) float32 array, finite, pixels.
+
     Parameters
     ----------
     guides : GuidePair, their noise weakens the data term where a gradient is no stronger than the noise
@@ -48,10 +50,6 @@ def refine_flow(
     scales : int
         Number of scales, each half the size of the one before; fewer where the image has not 16 pixels left.
     warps, iterations : int, at each scale: linearisations, and steps of each
-
-    Returns
-    -------
-    (H, W, 2) float32 array, finite, pixels
 
     Notes
     -----

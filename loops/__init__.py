@@ -1,1 +1,1 @@
-"""How compiled loops run."""
+"""Compiled loops on all cores."""

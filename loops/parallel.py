@@ -1,8 +1,8 @@
-"""A compiled loop on all cores.
+"""Run a compiled loop on all cores.
 
-numba's own ``parallel=True`` makes faster loops by nothing, and takes three to six times as long to compile them: each
-``prange`` becomes a function of its own, which goes through the whole compiler again. Here a loop is compiled once, as
-the plain loop it is, and threads run it on bands of what it goes over. It has to let go of the interpreter's lock.
+numba's own ``parallel=True`` makes loops no faster, and takes three to six times as long to compile: each ``prange``
+becomes a function of its own, which passes the whole compiler again. Here a plain loop is compiled once, and threads
+run it on bands of rows.
 """
 
 from __future__ import annotations
@@ -19,31 +19,26 @@ from numba import get_num_threads
 def run_bands(loop: Callable[..., None], count: int, *arguments: object) -> None:
     """Run a loop over `count` steps, most often rows, on as many threads as numba may use.
 
+    An error in a band is raised after all bands have ended.
+
     Parameters
     ----------
     loop : callable
-        Compiled with ``nogil=True``; called as ``loop(first, last, *arguments)`` for bands that together are
-        ``range(count)``. It writes into its arguments, and no two steps may write to the same place.
+        Compiled with ``nogil=True``, called as ``loop(first, last, *arguments)`` for bands that together are
+        ``range(count)``. It writes into its arguments; no two steps may write to the same place.
     count : int
-        How many steps there are.
     *arguments : object
-        What else the loop is given.
-
-    Raises
-    ------
-    Exception
-        What the loop raises, after all bands have ended or raised themselves.
     """
     threads = max(min(get_num_threads(), count), 1)
     edges = [count * n // threads for n in range(threads + 1)]
-    own, *others = pairwise(edges)
-    running = [_threads().submit(loop, *band, *arguments) for band in others]
+    first_band, *other_bands = pairwise(edges)
+    running = [_threads().submit(loop, *band, *arguments) for band in other_bands]
     try:
-        loop(*own, *arguments)
+        loop(*first_band, *arguments)
     finally:
         wait(running)
-    for other in running:
-        other.result()
+    for band in running:
+        band.result()
 
 
 @lru_cache(maxsize=1)
@@ -51,6 +46,6 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="loops")
 
 
-# The threads stay behind in the process that has forked.
+# A forked process has none of its parent's threads.
 if hasattr(os, "register_at_fork"):  # Windows does not fork
     os.register_at_fork(after_in_child=_threads.cache_clear)

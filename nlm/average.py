@@ -36,14 +36,12 @@ def average(window: Floats, weight: Floats) -> Floats:
 def robust_average(window: Floats, weight: Floats) -> Floats:
     """Average an aligned window without each pixel's minimum and maximum.
 
+    Returns (H, W, C) float32, the centre's value where all weights are 0.
+
     Parameters
     ----------
     window : (T, H, W, C) float32
     weight : (T, H, W) float32, at least 0
-
-    Returns
-    -------
-    (H, W, C) float32, the centre's value where all weights are 0
 
     Notes
     -----

@@ -28,6 +28,8 @@ def guided_filter(
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 
+    Returns (H, W, C) float32, within the range of the input in the (4·radius + 1)² box that a pixel depends on.
+
     Parameters
     ----------
     image : (H, W, C) float32, non-finite pixels are left out and filled
@@ -38,10 +40,6 @@ def guided_filter(
     subsample : int, 1, 2 or 4: coefficients are fitted on an image so many times smaller
     moments : (2, G) float64, optional
         Means and deviations of the guide in the whole frame, from `measure_guide`, where the arrays are a part of it.
-
-    Returns
-    -------
-    (H, W, C) float32, within the range of the input in the (4·radius + 1)² box that a pixel depends on
 
     Notes
     -----

@@ -124,16 +124,14 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
 def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[tuple[int, ...]]:
     """Find disjoint sets of layers that add up to a picture, those of the fewest layers first.
 
+    Returns a list of sets, each a tuple of indices of layers.
+
     Parameters
     ----------
     layers : sequence of (..., C) float32
         As for `sums_to`; negative light is allowed.
     whole : (..., C) float32
     exposure : float
-
-    Returns
-    -------
-    list of tuple of int, indices of layers
 
     Notes
     -----
@@ -217,6 +215,8 @@ def split_light(
 ) -> list[Floats]:
     """Distribute a denoised picture over the parts that add up to it.
 
+    Returns a list of (H, W, 3) float32, parts that add up to `denoised` where the bounds allow this.
+
     Parameters
     ----------
     filtered : sequence of (H, W, 3) float32
@@ -227,10 +227,6 @@ def split_light(
         Factor of each part in the sum, at least 0; None: 1.
     bounds : sequence of (H, W, 3) float32 or None, optional
         Layers whose range over 17×17 pixels bounds a part; None: no bounds.
-
-    Returns
-    -------
-    list of (H, W, 3) float32, parts that add up to `denoised` where the bounds allow this
 
     Notes
     -----

@@ -93,6 +93,8 @@ def blend_samples(
 ) -> Floats:
     """Blend samples into a denoised picture where the picture is wrong beyond doubt.
 
+    Returns (H, W, 3) float32, `noisy` where it has no noise, `picture` where the noise exceeds the difference of both.
+
     Parameters
     ----------
     picture : (H, W, 3) float32, denoised, finite
@@ -100,10 +102,6 @@ def blend_samples(
     neighbours : SampleMean
     exposure : float
     variance : (H, W, 3) float32, optional, variance of `noisy` from the renderer, used where no neighbour is trusted
-
-    Returns
-    -------
-    (H, W, 3) float32, `noisy` where it has no noise, `picture` where the noise exceeds the difference of both
 
     Notes
     -----
@@ -175,15 +173,13 @@ def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
 def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     """Give a denoised picture the local means of the samples, as far as these are known.
 
+    Returns (H, W, 3) float32, nowhere below 0 where the picture is not.
+
     Parameters
     ----------
     picture : (H, W, 3) float32, denoised, finite
     noisy : (H, W, 3) float32, the frame as rendered, fireflies included, finite: right in the mean
     exposure : float
-
-    Returns
-    -------
-    (H, W, 3) float32, nowhere below 0 where the picture is not
 
     Notes
     -----

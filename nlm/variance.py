@@ -41,14 +41,12 @@ def variance_from_halves(a: Floats, b: Floats) -> Floats:
 def variance_from_window(window: Floats, confidence: Floats) -> Floats:
     """Variance of the centre frame's pixels, smoothed, from the differences between aligned frames.
 
+    Returns (H, W, C) float32, in squared units.
+
     Parameters
     ----------
     window : (T, H, W, C) float32, finite
     confidence : (T, H, W) float32, in [0, 1]
-
-    Returns
-    -------
-    (H, W, C) float32, in squared units
 
     Notes
     -----
@@ -124,14 +122,12 @@ def smooth_variance(variance: Floats) -> Floats:
 def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     """Denoise the centre frame's guides: albedo and normals under depth of field or behind glass.
 
+    Returns (H, W, F) float32, guides without noise come back as they are, to about 1e-3.
+
     Parameters
     ----------
     guides : (T, H, W, F) float32, aligned, finite, of about unit range
     confidence : (T, H, W) float32, in [0, 1]
-
-    Returns
-    -------
-    (H, W, F) float32, guides without noise come back as they are, to about 1e-3
 
     Notes
     -----

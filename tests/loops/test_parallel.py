@@ -28,13 +28,13 @@ def test_each_step_runs_once(monkeypatch, threads, count):
 
 def test_it_runs_on_as_many_threads_as_numba_may_use(monkeypatch):
     monkeypatch.setattr(loops.parallel, "get_num_threads", lambda: 2)
-    met, names = threading.Barrier(2, timeout=60), set()
+    barrier, names = threading.Barrier(2, timeout=60), set()
 
-    def meet(first: int, last: int) -> None:
+    def wait_for_the_other(first: int, last: int) -> None:
         names.add(threading.current_thread().name)
-        met.wait()  # raises if the other band does not run at the same time
+        barrier.wait()  # raises if the other band does not run at the same time
 
-    run_bands(meet, 2)
+    run_bands(wait_for_the_other, 2)
     assert len(names) == 2
 
 
