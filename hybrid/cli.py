@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from hybrid.commands.log import LOG, RENAMED, end_log, lasting_streams, logged, one_line, start_log
+from hybrid.commands.log import LOG, RENAMED, end_log, logged, one_line, start_log, tolerant_streams
 from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
 from hybrid.runtime.system import expand_home
 from hybrid.runtime.threads import check_thread_counts, prepare_libraries
@@ -165,7 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Arguments; the process's own without.
     """
     prepare_libraries()
-    with lasting_streams():
+    with tolerant_streams():
         start_log()  # until a command has read its options of the log
         try:
             return _run(argv)

@@ -274,7 +274,7 @@ class _ShotDenoiser:
 
     def _write(self, finished: Finished, results: Sequence[FrameResult], header: Mapping[str, str]) -> Finished:
         number = finished.number
-        with self.timings.beside("write"):
+        with self.timings.background("write"):
             for read in (self.shot, *(view.first_pass.files for view in self.views if view.first_pass is not None)):
                 if read is not None:
                     read.check_unchanged(n for n in self.shot.neighbours(number, self.support) if read.has(n))

@@ -62,5 +62,5 @@ class Prefetcher:
             self._begun[following] = self._thread.submit(self._read, following)
 
     def _read(self, number: int) -> Frame:
-        with self._timings.beside("read"):
+        with self._timings.background("read"):
             return self._shot.read(number)

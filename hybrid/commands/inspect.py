@@ -1,4 +1,4 @@
-"""`ravg inspect`: which channels are taken for what, and what the shot calls for."""
+"""`ravg inspect`: which layer has which role, and which stages run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from hybrid.commands.options import (
 from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, rules_of, views_of
 from hybrid.files.layers import Layers, describe_layers
 from hybrid.job import validate_views
-from hybrid.plan import STAGES, Decision, Rules
+from hybrid.plan import STAGES, Decision, Plan, Rules
 from hybrid.stream import plan_shot
 
 
@@ -45,7 +45,7 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object", rich_help_panel=OUTPUT)] = False,
     max_pixels: PixelsOption = None,
 ) -> None:
-    """Show which channels are used as what, and which stages the shot calls for, with figures and reasons.
+    """Show which layer has which role, and which stages run, with measurements and reasons.
 
     Examples:
 
@@ -65,76 +65,70 @@ def inspect(
 
 def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> None:
     """Print layers, findings and plan of a shot."""
-    opened = read.open()
-    pictures, judgement = validate_views(opened, strict=strict)
-    log_findings(judgement, pictures)
-    height, width = opened.shape
-    progress = Progress("look", len(opened) * len(pictures))
-    layers = [picture.layers(picture.numbers[0]) for picture in pictures]
-    rows = [describe_layers(taken) for taken in layers]
-    plans, judged = [], list(judgement.findings)
-    for picture in pictures:
-        plans.append(plan_shot(picture, rules, advance=progress.advance))
-        judged += log_cuts(plans[-1], judged, strict=strict)
+    shot = read.open()
+    views, report = validate_views(shot, strict=strict)
+    log_findings(report, views)
+    height, width = shot.shape
+    progress = Progress("measuring frames", len(shot) * len(views))
+    plans, findings = [], list(report.findings)
+    for view in views:
+        plans.append(plan_shot(view, rules, advance=progress.advance))
+        findings += log_cuts(plans[-1], findings, strict=strict)
+    layers = [view.layers(view.numbers[0]) for view in views]
     if as_json:
-        of_each = [
-            {
-                "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in roles],
-                "plan": [asdict(decision) for decision in plan.decisions],
-            }
-            for roles, plan in zip(rows, plans, strict=True)
-        ]
+        first, *others = (_as_json(found, plan) for found, plan in zip(layers, plans, strict=True))
         document = {
-            "frames": opened.numbers,
+            "frames": shot.numbers,
             "width": width,
             "height": height,
-            "warnings": opened.warnings,
+            "warnings": shot.warnings,
             "profile": layers[0].profile,
             "reason": layers[0].reason,
-            "judged": [asdict(finding) for finding in judged],
-            "motion": judgement.readings(),
-            **of_each[0],
-            **({"others": of_each[1:]} if len(pictures) > 1 else {}),
+            "judged": [asdict(finding) for finding in findings],
+            "motion": report.readings(),
+            **first,
+            **({"others": others} if others else {}),
         }
         typer.echo(json.dumps(document, indent=1))
         return
     console = Console()
-    console.print(f"{len(opened)} frames, {opened.numbers[0]}-{opened.numbers[-1]}, {width}×{height}", highlight=False)
+    console.print(f"{len(shot)} frames, {shot.numbers[0]}-{shot.numbers[-1]}, {width}×{height}", highlight=False)
     profile_line = f"profile: {printable(layers[0].profile)} ({printable(layers[0].reason)})\n"
     console.print(profile_line, highlight=False, markup=False)
-
-    def show(title: str, heads: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
-        table = Table(*heads, title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-        for line in lines:
-            table.add_row(*(Text(printable(words)) for words in line))  # names from a file are no markup
-        console.print(table)
-
-    def named(title: str, taken: Layers) -> str:
-        return f"{title} of {printable(str(taken.color))}" if len(pictures) > 1 else title
-
-    for taken, roles in zip(layers, rows, strict=True):
-        show(named("Layers", taken), ("role", "taken from", "note"), roles)
-    for finding in judgement.findings:
+    names = [f" of {printable(str(found.color))}" if len(views) > 1 else "" for found in layers]
+    for found, name in zip(layers, names, strict=True):
+        _show(console, f"Layers{name}", ("role", "layer", "note"), describe_layers(found))
+    for finding in report.findings:
         if not finding.warning:
             console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
-    if readings := judgement.readings():
-        seen = "surfaces" if judgement.motion is not None and judgement.motion.by_surfaces else "picture"
-        show("Motion: what the vectors leave unexplained", ("", "read as", f"of the {seen}"), readings)
-    for taken, plan in zip(layers, plans, strict=True):
-        lines = [
-            (
-                "on" if decision.on else "off",
-                decision.stage,
-                _measured(decision),
-                f"{decision.reason} ({STAGES[decision.stage]})",
-            )
-            for decision in plan.decisions
+    if readings := report.readings():
+        compared = "surfaces" if report.motion is not None and report.motion.by_surfaces else "picture"
+        _show(console, "Motion: unexplained by the vectors", ("", "convention", f"of the {compared}"), readings)
+    for plan, name in zip(plans, names, strict=True):
+        rows = [
+            ("on" if x.on else "off", x.stage, _measured(x), f"{x.reason} ({STAGES[x.stage]})") for x in plan.decisions
         ]
-        show(named("Plan", taken), ("", "stage", "measured", "why"), lines)
+        _show(console, f"Plan{name}", ("", "stage", "measured", "why"), rows)
+
+
+def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
+    """Layers and plan of a view."""
+    return {
+        "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in describe_layers(layers)],
+        "plan": [asdict(decision) for decision in plan.decisions],
+    }
+
+
+def _show(console: Console, title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    table = Table(*heads, title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
+    console.print(table)
 
 
 def _measured(decision: Decision) -> str:
-    """A figure beside the threshold that it was held against."""
+    """A measurement and its threshold."""
     if decision.figure is None or decision.threshold is None:
         return "–"
     sign = ">" if decision.figure > decision.threshold else "≤"

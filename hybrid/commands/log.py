@@ -1,8 +1,8 @@
-"""What a command tells while it works: on a terminal, in the log of a farm, in a file.
+"""Messages and progress of a command: on a terminal, in the log of a farm, in a file.
 
-All of it are records of one logger. A handler shows each in its own way: as a bar and lines on a terminal, as lines
-where there is none, as JSON, or in the form that Open Job Description reads. Results, such as tables of `ravg compare`,
-are no records and go to standard output.
+All are records of one logger. Handlers print them as a progress bar and lines on a terminal, as lines elsewhere, as
+JSON, or in the format of Open Job Description. Results, such as tables of `ravg compare`, are no records and go to
+standard output.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ LOG = logging.getLogger("ravg")
 LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
-PANEL = "What it tells"
+PANEL = "Messages"
 RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
-# What terminals and files that know only ASCII show in place of some signs that are used here.
+# ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
 
 
 def logged(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options that say how much it tells, in which form, and where to."""
+    """Add the options of verbosity, format and file of messages to a command."""
 
-    own = inspect.signature(command, eval_str=True)
+    signature = inspect.signature(command, eval_str=True)
 
     @wraps(command)
     def run(
@@ -58,16 +58,16 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
         start_log(log_format, log_file, quiet=quiet, verbose=verbose)
         for line in context.meta.get(RENAMED, ()):
             LOG.warning(line)
-        command(**arguments, **({"context": context} if "context" in own.parameters else {}))
+        command(**arguments, **({"context": context} if "context" in signature.parameters else {}))
 
     form = typer.Option(
-        "--log-format", envvar="RAVG_LOG_FORMAT", help="of progress and messages", rich_help_panel=PANEL
+        "--log-format", envvar="RAVG_LOG_FORMAT", help="format of progress and messages", rich_help_panel=PANEL
     )
     file = typer.Option(
-        "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE", help="add them to a file", rich_help_panel=PANEL
+        "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE", help="append messages to a file", rich_help_panel=PANEL
     )
-    less = typer.Option("-q", "--quiet", help="warnings and errors alone", rich_help_panel=PANEL)
-    more = typer.Option("-v", "--verbose", help="details too", rich_help_panel=PANEL)
+    less = typer.Option("-q", "--quiet", help="only warnings and errors", rich_help_panel=PANEL)
+    more = typer.Option("-v", "--verbose", help="also details", rich_help_panel=PANEL)
     options = {
         "log_format": (Annotated[LogFormat, form], "text"),
         "log_file": (Annotated[Path | None, file], None),
@@ -76,37 +76,27 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
     }
     parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
     added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]
-    if "context" not in own.parameters:
+    if "context" not in signature.parameters:
         added.append(parameter("context", keyword, annotation=typer.Context))
-    run.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     return run
 
 
 class Progress:
-    """How far a command has come; every step is a record.
+    """Progress of a command's `task` in `total` steps of `unit`; every step is a record."""
 
-    Parameters
-    ----------
-    what : str
-        What is being done.
-    total : float
-        How many steps there are.
-    unit : str
-        What is counted.
-    """
-
-    def __init__(self, what: str, total: float, unit: str = "frames") -> None:
-        self.what, self.total, self.unit = what, total, unit
+    def __init__(self, task: str, total: float, unit: str = "frames") -> None:
+        self.task, self.total, self.unit = task, total, unit
         self.done = 0.0
         self._start = time.monotonic()
-        self._record(what, {})
+        self._record(task, {})
 
     def advance(self, by: float = 1, message: str = "", **facts: object) -> None:
-        """Tell that so many steps more are done, with a message and facts of them."""
+        """Log that `by` more steps are done, with a message and facts."""
         self.done += by
         elapsed = time.monotonic() - self._start
         left = elapsed / self.done * (self.total - self.done) if self.done else None
-        self._record(message or self.what, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
+        self._record(message or self.task, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
 
     def _record(self, message: str, facts: dict[str, object]) -> None:
         share = self.done / self.total if self.total else 1.0
@@ -117,49 +107,41 @@ class Progress:
 def start_log(
     form: LogFormat = "text", file: Path | None = None, *, quiet: bool = False, verbose: bool = False
 ) -> None:
-    """Say where records go from now on: to standard error, and into a file.
-
-    Raises
-    ------
-    ValueError
-        If the file is there and no text.
-    OSError
-        If it cannot be written to.
-    """
+    """Send records to standard error, and to a file; raise ValueError if the file is no text."""
     handlers = [_on_stderr(form)]
     handlers[0].setLevel(logging.WARNING if quiet else logging.NOTSET)
     if file is not None:
         handlers.append(_into(file, form))
-    end_log()  # not before: what is wrong with the file is told as ever
+    end_log()  # not before: errors of the file go to the old handlers
     LOG.setLevel(logging.DEBUG if verbose else logging.INFO)
     for handler in handlers:
         LOG.addHandler(handler)
 
 
 def log_file() -> Path | None:
-    """The file that records go into, if any."""
-    names = [handler.stream.name for handler in LOG.handlers if isinstance(handler, _Lines) and handler.own]
+    """Return the file of records, if any."""
+    names = [handler.stream.name for handler in LOG.handlers if isinstance(handler, _Lines) and handler.owns_stream]
     return Path(names[0]) if names else None
 
 
 def end_log() -> None:
-    """Take the handlers away; the bar of a terminal goes with them."""
+    """Remove the handlers and the progress bar."""
     for handler in tuple(LOG.handlers):
         LOG.removeHandler(handler)
         handler.close()
 
 
 def print_table(table: Any, **facts: object) -> None:
-    """Tell the rows of a rich table: as a table, or as `facts` where records are JSON."""
+    """Log a rich table: as a table, or as `facts` in JSON."""
     LOG.info("", extra={"table": table, "facts": facts})
 
 
-# Of a message that quotes a file more characters tell nobody more.
+# Most characters of a message, which may quote a file.
 LONGEST = 2000
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, without line breaks and without what would command a terminal."""
+    """Return the message of an error in one printable line."""
     said = str(error)
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         said = f"{error.filename}: {error.strerror}"
@@ -168,7 +150,7 @@ def one_line(error: BaseException) -> str:
 
 
 def printable(words: str) -> str:
-    """What a terminal shows as it is: a name from a file may hold sequences that command it."""
+    """Escape control characters: a name from a file may hold sequences that control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 
 
@@ -186,17 +168,17 @@ def _on_stderr(form: LogFormat) -> logging.Handler:
 def _into(file: Path, form: LogFormat) -> logging.Handler:
     if file.exists() and (not file.is_file() or b"\0" in file.open("rb").read(4096)):
         raise ValueError(f"log-file {str(file)!r} is there and no text, expected a log or a new name")
-    handler = _Lines(file.open("a", encoding="utf-8"), own=True)
+    handler = _Lines(file.open("a", encoding="utf-8"), owns_stream=True)
     handler.setFormatter(_JsonLine() if form == "json" else _TextLine(times=True))
     return handler
 
 
 class _Lines(logging.StreamHandler[Any]):
-    """Records as lines. A bar that moves by less than a percent is no line, but for the end of a frame."""
+    """Records as lines; progress of less than a percent is skipped, except at the end of a frame."""
 
-    def __init__(self, stream: Any, *, own: bool = False) -> None:
+    def __init__(self, stream: Any, *, owns_stream: bool = False) -> None:
         super().__init__(stream)
-        self.own = own
+        self.owns_stream = owns_stream
         self._percent = -1
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -208,16 +190,16 @@ class _Lines(logging.StreamHandler[Any]):
         super().emit(record)
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """A log that cannot be written any more does not end the work."""
+        """Ignore errors of a log that cannot be written."""
 
     def close(self) -> None:
-        if self.own:
+        if self.owns_stream:
             self.stream.close()
         super().close()
 
 
 class _TextLine(logging.Formatter):
-    """What a person reads; with `openjd`, also the lines that a worker of Open Job Description reads."""
+    """Text; with `openjd`, also the lines that a worker of Open Job Description reads."""
 
     def __init__(self, *, times: bool = False, openjd: bool = False) -> None:
         super().__init__()
@@ -243,7 +225,7 @@ class _TextLine(logging.Formatter):
 
 
 class _JsonLine(logging.Formatter):
-    """One JSON object a line: time, level, message, and the facts of the record."""
+    """One JSON object per record: time, level, message, and facts."""
 
     def format(self, record: logging.LogRecord) -> str:
         document = {"time": _time(record), "level": record.levelname.lower(), "message": record.getMessage()}
@@ -251,13 +233,13 @@ class _JsonLine(logging.Formatter):
 
 
 class _Terminal(logging.Handler):
-    """Lines above a bar that moves."""
+    """Lines above a progress bar."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
         self._console = console
         self._bar: Bar | None = None
-        self._of: Progress | None = None
+        self._progress: Progress | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
         progress = getattr(record, "progress", None)
@@ -277,21 +259,21 @@ class _Terminal(logging.Handler):
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        if self._of is not progress:
+        if self._progress is not progress:
             self._stop()
             words = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
             unit = TextColumn(progress.unit, markup=False)
             self._bar = Bar(*words, unit, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
-            self._bar.add_task(progress.what, total=progress.total)
+            self._bar.add_task(progress.task, total=progress.total)
             self._bar.start()
-            self._of = progress
+            self._progress = progress
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=progress.done, description=text)
 
     def _stop(self) -> None:
         if self._bar is not None:
             self._bar.stop()
-        self._bar = self._of = None
+        self._bar = self._progress = None
 
 
 def _message(record: logging.LogRecord) -> str:
@@ -313,18 +295,19 @@ def _time(record: logging.LogRecord) -> str:
 
 
 def duration(seconds: float) -> str:
+    """Return a time in s, min or h."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 @contextmanager
-def lasting_streams() -> Iterator[None]:
-    """Let the work go on where standard output or error is closed or knows only ASCII."""
+def tolerant_streams() -> Iterator[None]:
+    """Let the command continue if standard output or error is closed or takes only ASCII."""
     open_standard_streams()
     before = sys.stdout, sys.stderr
     codecs.register_error("plain", _replace_sign)
-    sys.stdout, sys.stderr = _Lasting.of(sys.stdout), _Lasting.of(sys.stderr)
+    sys.stdout, sys.stderr = _TolerantStream.of(sys.stdout), _TolerantStream.of(sys.stderr)
     try:
         yield
     finally:
@@ -339,8 +322,8 @@ def _replace_sign(error: UnicodeError) -> tuple[str, int]:
     return "".join(_PLAIN.get(sign, "?") for sign in error.object[error.start : error.end]), error.end
 
 
-class _Lasting:
-    """A stream that what it cannot write does not concern."""
+class _TolerantStream:
+    """A stream that ignores errors of writing."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -348,33 +331,33 @@ class _Lasting:
 
     @classmethod
     def of(cls, stream: Any) -> Any:
-        if stream is None:  # what Python makes of a standard stream that was closed before it started
-            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+        if stream is None:  # the stream was closed before Python started
+            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - open until the process ends
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="plain")
         return cls(stream)
 
     def write(self, text: str) -> int:
         if not self._closed:
-            with self._enduring():
+            with self._ignoring_errors():
                 self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         if not self._closed:
-            with self._enduring():
+            with self._ignoring_errors():
                 self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     @contextmanager
-    def _enduring(self) -> Iterator[None]:
+    def _ignoring_errors(self) -> Iterator[None]:
         try:
             yield
-        except OSError:  # the reader has gone: a pipe that is closed, a terminal that was hung up
+        except OSError:  # closed pipe, terminal hung up
             self._closed = True
-            # What is still in Python's buffer would be written, in vain, when the process ends.
+            # Python's buffer would be written to the closed stream when the process ends.
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())
             os.close(null)

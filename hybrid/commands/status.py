@@ -1,4 +1,4 @@
-"""`ravg status`: how far the runs have come that write into a folder."""
+"""`ravg status`: the frames that runs have finished, and that are left."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hybrid.records import Status, gather_status, is_running, sequence_name
 
 
 def status(
-    output: Annotated[str, typer.Argument(metavar="OUT", help="where frames are written: OUT.####.exr, or a folder")],
+    output: Annotated[str, typer.Argument(metavar="OUT", help="output of the runs: OUT.####.exr, or a folder")],
     frames: FramesOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object", rich_help_panel=OUTPUT)] = False,
 ) -> None:
     """Show which frames are finished, running, missing and failed.
 
-    Reads the records that runs leave beside their frames. The exit code is 0 if all frames that were asked for are
+    Reads the records that runs write next to their frames. The exit code is 0 if all frames that were asked for are
     finished, else 1.
 
     Example:
@@ -38,8 +38,8 @@ def status(
         pattern, _ = parse_pattern(output)
         folder, name = pattern.folder, sequence_name(pattern.path(1))
     with usage():
-        numbers = None if frames is None else parse_frames(frames)
-    found = gather_status(folder, name, numbers)
+        asked = None if frames is None else parse_frames(frames)
+    found = gather_status(folder, name, asked)
     left = found.asked - found.finished
     if as_json:
         document = {
@@ -56,16 +56,17 @@ def status(
         typer.echo(json.dumps(document, indent=1))
     else:
         _show(found)
-        for what, of in (("finished", found.finished), ("running", found.running), ("missing", found.missing)):
-            if of:
-                typer.echo(f"{what}: {len(of)} of {len(found.asked)} frames, {format_frames(of)}")
+        for state, numbers in (("finished", found.finished), ("running", found.running), ("missing", found.missing)):
+            if numbers:
+                typer.echo(f"{state}: {len(numbers)} of {len(found.asked)} frames, {format_frames(numbers)}")
         for error in dict.fromkeys(found.failed.values()):
-            of = {number for number, other in found.failed.items() if other == error}
-            typer.echo(f"failed: {len(of)} of {len(found.asked)} frames, {format_frames(of)}: {printable(error)}")
+            numbers = {number for number, other in found.failed.items() if other == error}
+            listed = f"{len(numbers)} of {len(found.asked)} frames, {format_frames(numbers)}"
+            typer.echo(f"failed: {listed}: {printable(error)}")
         if found.seconds_per_frame is not None:
             words = f"{found.seconds_per_frame:.2f} s a frame"
             if left and found.seconds_left is not None:
-                words += f"; about {duration(found.seconds_left)} left with {max(found.workers, 1)} at work"
+                words += f"; about {duration(found.seconds_left)} left with {max(found.workers, 1)} running"
             typer.echo(words)
     if left:
         raise typer.Exit(1)
@@ -73,7 +74,7 @@ def status(
 
 def _show(found: Status) -> None:
     """Print one row for each run."""
-    heads = "frames", "state", "made", "s a frame", "peak", "host", "last heard of"
+    heads = "frames", "state", "made", "s a frame", "peak", "host", "last update"
     table = Table(*heads, box=SIMPLE_HEAD, pad_edge=False)
     for record in found.records:
         made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]

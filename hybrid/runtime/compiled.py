@@ -1,10 +1,10 @@
-"""Where compiled loops are kept, and what becomes of them where that fails.
+"""Cache of compiled loops, with a fallback where no folder can be written to.
 
-numba asks this module because `hybrid.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
-neither the package's folder nor the user's can be written to, as on a render farm, and whatever unpickling raises where
-a file was cut short.
+numba loads this module because `hybrid.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
+neither the package's folder nor the user's can be written to, as on a render farm, and any error of unpickling a
+truncated file.
 
-As a program it compiles the loop that takes longest, for the process that has started it beside its own work.
+As a program it compiles the slowest loop, for the process that has started it as a helper.
 """
 
 from __future__ import annotations
@@ -28,40 +28,38 @@ from numba.core.caching import Cache, UserWideCacheLocator
 
 LOG = logging.getLogger("ravg")
 
-# Of all that a first run compiles, non-local means take a third of the time, and are called for last.
+# Non-local means take a third of the compilation time of a first run, and are needed last.
 _LONGEST = "nlm.nonlocal_means"
 
 
 class _FirstRun(event.Listener):
-    """Where a loop is compiled, that is said, and another core compiles the longest one meanwhile."""
+    """Logs that loops are compiled, and starts a helper process that compiles the slowest one."""
 
     begun = False
-    beside: subprocess.Popen[bytes] | None = None
+    helper: subprocess.Popen[bytes] | None = None
 
     def on_start(self, event: Any) -> None:
         if self.begun:
             return
         self.begun = True
         LOG.info("compiling for this processor, once: some ten seconds, and kept for later runs")
-        kept = (
-            getattr(event.data["dispatcher"]._cache, "cache_path", None) or os.devnull
-        )  # a loop that is not kept has none
-        if not kept.startswith(os.devnull):
+        folder = getattr(event.data["dispatcher"]._cache, "cache_path", None)  # None without a cache
+        if folder and not folder.startswith(os.devnull):
             options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-            if sys.platform == "win32":  # no console window of its own where this process has none
+            if sys.platform == "win32":  # no console window if this process has none
                 options["creationflags"] = subprocess.CREATE_NO_WINDOW
             with suppress(OSError):
-                self.beside = subprocess.Popen([sys.executable, "-m", "hybrid.runtime.compiled"], **options)
+                self.helper = subprocess.Popen([sys.executable, "-m", "hybrid.runtime.compiled"], **options)
 
     def on_end(self, event: Any) -> None:
         pass
 
-    def has_made(self, loop: Any) -> bool:
-        """Whether that other process was to make a loop; it has ended then."""
-        if self.beside is None or loop.__module__ != _LONGEST:
+    def waited_for(self, loop: Any) -> bool:
+        """Whether the helper process compiles a loop; wait for its end."""
+        if self.helper is None or loop.__module__ != _LONGEST:
             return False
         with suppress(subprocess.TimeoutExpired):
-            self.beside.wait(60)
+            self.helper.wait(60)
         return True
 
 
@@ -70,32 +68,32 @@ _FIRST_RUN = _FirstRun()
 
 @lru_cache(maxsize=1)
 def watch_compiling() -> None:
-    """Say so, once, where loops are compiled, and use two cores for it; later runs find them."""
+    """Log once that loops are compiled, and use two processes; later runs find them in the cache."""
     event.register("numba:compile", _FIRST_RUN)  # type: ignore[no-untyped-call]
 
 
 class Fallback(UserWideCacheLocator):
-    """A folder among temporary files, where no other can be written to; none at all, where not even that can."""
+    """A folder among temporary files, if no other can be written to; no cache if this cannot either."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         super().__init__(py_func, py_file)  # type: ignore[no-untyped-call]
         folder = _temporary_folder()
-        # A name that cannot be made: nothing is found there, and what cannot be written is done without.
+        # A path below the null device cannot be made: nothing is read from it or written to it.
         within = self.get_suitable_cache_subpath(py_file)  # type: ignore[no-untyped-call]
         self._cache_path = os.path.join(folder or os.devnull, within)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Fallback:
-        """Take any function: this is the last place that is asked."""
+        """Accept any function: this is the last locator."""
         return cls(py_func, py_file)
 
 
 @lru_cache(maxsize=1)
 def _temporary_folder() -> str | None:
-    """A folder of this user's own; what is read from it is run, so nobody else may have written it."""
+    """A private folder of this user: its content is executed, so no other user may write to it."""
     try:
         folder = Path(tempfile.gettempdir()) / "ravg-compiled"
-        if sys.platform != "win32":  # where the folder of temporary files is the user's own
+        if sys.platform != "win32":  # whose folder of temporary files is the user's own
             folder = folder.with_name(f"ravg-compiled-{os.geteuid()}")
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
@@ -111,7 +109,7 @@ def _temporary_folder() -> str | None:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether this is a folder that only this user can write to."""
+    """Whether only this user can write to a folder."""
     status = folder.lstat()
     if sys.platform != "win32" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077):
         return False
@@ -123,11 +121,11 @@ def _load(load: Any) -> Any:
     def load_or_forget(self: Any, *args: Any) -> Any:
         try:
             found = load(self, *args)
-            if found is None and _FIRST_RUN.has_made(self._py_func):
+            if found is None and _FIRST_RUN.waited_for(self._py_func):
                 found = load(self, *args)
             return found
-        except Exception as error:  # unpickling half a file raises whatever it likes
-            LOG.debug(f"compiled loops in {self.cache_path} cannot be read, and are made again: {error!r}")
+        except Exception as error:  # unpickling half a file may raise any error
+            LOG.debug(f"compiled loops in {self.cache_path} cannot be read, and are compiled again: {error!r}")
             with suppress(OSError):
                 self.flush()
             return None

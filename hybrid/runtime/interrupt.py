@@ -1,4 +1,4 @@
-"""Ctrl-C that is heard at once, also in the middle of a long computation."""
+"""Ctrl-C that ends the process within a second, also during a long computation."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from hybrid.files.replace import remove_unfinished
 from hybrid.runtime.system import INTERRUPTS
 
 INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
-# How long Python is given to come back from compiled code and to unwind by itself, seconds.
+# Seconds for Python to return from compiled code and to unwind.
 PATIENCE = 1.0
-# A program that has started ravg asks for its end by closing its standard input where this variable is 1. On Windows no
-# signal reaches a process without a console of its own.
+# If this variable is 1, the program that started ravg stops it by closing its standard input. On Windows no signal
+# reaches a process without a console of its own.
 STOP_WITH_STDIN = "RAVG_STOP_WITH_STDIN"
 
 
 def stop_with_stdin() -> None:
-    """Take the end of standard input for Ctrl-C, where `STOP_WITH_STDIN` is 1.
+    """Treat the end of standard input as Ctrl-C if `STOP_WITH_STDIN` is 1.
 
-    Processes that this one starts inherit neither the variable nor its standard input.
+    Child processes inherit neither the variable nor the standard input.
     """
     if os.environ.pop(STOP_WITH_STDIN, "") != "1":
         return
-    # Windows lets nobody ask about a pipe while a thread reads from it, as a child would that inherits it.
-    own = os.dup(0)
+    # Windows blocks queries of a pipe while a thread reads from it; a child that inherits the pipe would query it.
+    stdin = os.dup(0)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.close(null)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # who starts it may have it ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the parent process may have set it to be ignored
 
     def wait() -> None:
-        while os.read(own, 4096):
+        while os.read(stdin, 4096):
             pass
         interrupt_main()
 
@@ -45,7 +45,7 @@ def stop_with_stdin() -> None:
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Whether this is Ctrl-C. Within numba's dispatcher it comes as a SystemError, or several, that it has caused."""
+    """Whether an error is Ctrl-C: numba's dispatcher raises SystemError, or several, caused by KeyboardInterrupt."""
     while isinstance(error, SystemError):
         error = error.__cause__
     return isinstance(error, KeyboardInterrupt)
@@ -53,18 +53,13 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 @contextmanager
 def interruptible(report: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM, or Ctrl-Break end the process within about a second, whatever it is doing.
+    """Let Ctrl-C, SIGTERM, or Ctrl-Break end the process within about a second.
 
-    Python sees a signal only when compiled code returns, which may take many seconds for one stage of a large frame.
-    Where no KeyboardInterrupt has left the block in `PATIENCE` seconds, a thread removes what was being written, calls
-    `report` and ends the process.
-
-    Parameters
-    ----------
-    report : callable
-        Says what is finished. Called once, here or by this thread, and then KeyboardInterrupt goes on.
+    Python handles a signal only when compiled code returns, which may take many seconds for one stage of a large frame.
+    If no KeyboardInterrupt has left the block in `PATIENCE` seconds, a thread removes unfinished files, calls `report`
+    and ends the process. `report` logs what is finished; it is called once, and KeyboardInterrupt is raised again.
     """
-    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
     ours, theirs = socket.socketpair()
@@ -74,7 +69,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     def say() -> None:
         from hybrid.files.exr import hold_library
 
-        with hold_library(PATIENCE):  # or the report would go where the library's messages do
+        with hold_library(PATIENCE):  # else the report would be captured with the library's messages
             report()
             sys.stderr.flush()
 
@@ -83,11 +78,11 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
         if not left.wait(PATIENCE):
             remove_unfinished()
             say()
-            remove_unfinished()  # what a thread has begun to write while that was said
+            remove_unfinished()  # files that a thread began to write during the report
             os._exit(INTERRUPTED)
 
     before = {number: signal.signal(number, signal.default_int_handler) for number in INTERRUPTS}
-    # Written to by the handler in C, at once.
+    # The C-level signal handler writes to it at once.
     previous = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -104,7 +99,7 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
         signal.set_wakeup_fd(previous)
         for number, handler in before.items():
             signal.signal(number, handler)
-        theirs.send(b"\0")  # wakes a watcher that nothing has woken
+        theirs.send(b"\0")  # ends the watcher
         watcher.join()
         ours.close()
         theirs.close()

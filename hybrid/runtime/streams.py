@@ -6,12 +6,12 @@ import os
 
 
 def open_standard_streams() -> None:
-    """Open the null device on each standard descriptor that is closed, as after ``2>&-``.
+    """Open the null device on each closed standard descriptor, as after ``2>&-``.
 
-    Otherwise the next file that is opened takes that number, and what libraries print goes into it.
+    Otherwise the next opened file would get that number, and libraries would print into it.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free, which is this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one

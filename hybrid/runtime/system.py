@@ -20,7 +20,7 @@ if sys.platform == "win32":
 else:
     INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
-# Another program may have a frame open for a moment: a viewer, a virus scanner, an indexer. Seconds.
+# Seconds to wait while another program has a frame open: a viewer, a virus scanner, an indexer.
 _PATIENCE = 2.0
 _INTERVAL = 0.05
 
@@ -68,33 +68,17 @@ if sys.platform == "win32":
     _FILE_FLAG_OPEN_REPARSE_POINT = 0x00200000
     _LOCKFILE_EXCLUSIVE_NOW = 0x3
     _ERROR_LOCK_VIOLATION = 33
-    # The path is not found, the name is too long: whatever the reason. MAX_PATH less the zero at its end.
+    # Path not found, name too long: Windows reports either for a long path. MAX_PATH less its terminating zero.
     _ERRORS_OF_LENGTH, _LONGEST_PATH = (3, 206), 259
-    # High half of the position of the byte that is locked. Locks of Windows are mandatory: a byte far behind the end
-    # leaves the content to the libraries that open the same file by its name.
+    # High half of the position of the locked byte. Locks of Windows are mandatory: with a byte far behind the end,
+    # libraries can still open the same file by its name.
     _LOCKED_HIGH = 2**30
 
     def open_file(path: Path, *, new: bool) -> int:
-        """Open a file for reading and writing; never follow a link.
+        """Open or create a file for reading and writing, and return its descriptor; never follow a link.
 
         Other processes may read, write, rename and delete the file while it is open. Child processes do not inherit it.
-
-        Parameters
-        ----------
-        path : Path
-            The file.
-        new : bool
-            Create it. Otherwise it is there.
-
-        Returns
-        -------
-        int
-            A file descriptor.
-
-        Raises
-        ------
-        OSError
-            If it is there and `new`, if it is not there otherwise, or if it cannot be opened.
+        Raises OSError if a `new` file exists, or another one does not.
         """
         handle = _KERNEL.CreateFileW(
             str(path),
@@ -116,17 +100,7 @@ if sys.platform == "win32":
     def lock_file(descriptor: int) -> None:
         """Lock an open file until it is closed, without waiting.
 
-        Parameters
-        ----------
-        descriptor : int
-            Of `open_file`.
-
-        Raises
-        ------
-        BlockingIOError
-            If somebody else holds the lock.
-        OSError
-            If the file system has no locks.
+        Raises BlockingIOError if another process holds the lock, OSError if the file system has no locks.
         """
         place = _Overlapped(offset_high=_LOCKED_HIGH)
         handle = msvcrt.get_osfhandle(descriptor)
@@ -150,7 +124,7 @@ else:
 
 
 def sync_file(descriptor: int) -> None:
-    """Wait until the content of an open file is on the disk."""
+    """Wait until the content of an open file is on disk."""
     if sys.platform == "darwin":  # fsync of macOS leaves it in the disk's own cache
         try:
             fcntl.fcntl(descriptor, fcntl.F_FULLFSYNC)
@@ -161,19 +135,12 @@ def sync_file(descriptor: int) -> None:
 
 
 def replace_path(source: Path, target: Path) -> None:
-    """Rename a file to a name that may be there.
-
-    Windows refuses this while another program has `target` open. It is tried for `_PATIENCE` seconds then.
+    """Rename a file, replacing `target`; on Windows retry for `_PATIENCE` seconds while a program has it open.
 
     Parameters
     ----------
     source, target : Path
         In one folder.
-
-    Raises
-    ------
-    OSError
-        If that fails.
     """
     end = time.monotonic() + (_PATIENCE if sys.platform == "win32" else 0.0)
     while True:
@@ -189,7 +156,7 @@ def replace_path(source: Path, target: Path) -> None:
 
 
 def is_read_only(path: Path) -> bool:
-    """Whether Windows keeps a file from being replaced by its read-only attribute; never so on other systems."""
+    """Whether Windows protects a file by its read-only attribute; False on other systems."""
     if sys.platform != "win32":
         return False
     try:
@@ -199,33 +166,32 @@ def is_read_only(path: Path) -> bool:
 
 
 def is_reserved(path: Path) -> bool:
-    """Whether Windows does not take the name for a file: aux, con, nul, a dot at the end; never so on other systems."""
+    """Whether Windows reserves the file's name: aux, con, nul, a dot at the end; False on other systems."""
     if sys.platform != "win32":
         return False
-    reserved = getattr(os.path, "isreserved", None)  # of Python 3.13, where the other is deprecated
+    reserved = getattr(os.path, "isreserved", None)  # since Python 3.13, which deprecates is_reserved
     return bool(reserved(path.name) if reserved else PureWindowsPath(path.name).is_reserved())
 
 
 def expand_home(words: Sequence[str]) -> list[str]:
-    """Put the user's folder in the place of ``~`` at the beginning of words, which no shell of Windows does."""
+    """Replace ``~`` at the beginning of words by the user's folder, on Windows, whose shells do not."""
     if sys.platform != "win32":
         return [*words]
     return [os.path.expanduser(word) if word == "~" or word.startswith(("~/", "~\\")) else word for word in words]
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:
-    """Whether two statuses are of one file, as far as its file system numbers files; network drives may not.
+    """Return whether two statuses are of one file; True if the file system has no inodes, as some network drives.
 
     Parameters
     ----------
     one, other : os.stat_result
-        Of two paths.
     """
     return not (one.st_ino and other.st_ino) or os.path.samestat(one, other)
 
 
 def process_lives(number: int) -> bool:
-    """Whether a process of this machine lives. Unlike ``os.kill(number, 0)``, which is Ctrl-C on Windows."""
+    """Whether a process of this machine is alive. ``os.kill(number, 0)`` would be Ctrl-C on Windows."""
     return bool(psutil.pid_exists(number))
 
 
@@ -244,17 +210,10 @@ def peak_memory() -> int:
 
 
 def start_context(preloaded: str) -> BaseContext:
-    """Return how fresh processes are started.
+    """Return the context that starts fresh processes, which need the module `preloaded`.
 
-    Parameters
-    ----------
-    preloaded : str
-        Module that the processes need. On Linux a server imports it once, and they are forked from there. Windows has
-        no fork, and libraries of macOS forbid it after their import: a process begins anew there.
-
-    Returns
-    -------
-    multiprocessing.context.BaseContext
+    On Linux a server imports it once, and processes are forked from the server. Windows has no fork, and libraries of
+    macOS forbid it after their import: processes are spawned there.
     """
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
@@ -264,7 +223,7 @@ def start_context(preloaded: str) -> BaseContext:
 
 
 def load_average() -> float | None:
-    """Return the load average of the last minute; None where the system has none (Windows)."""
+    """Return the load average of the last minute; None on Windows, which has none."""
     if sys.platform == "win32":
         return None
     else:

@@ -1,4 +1,4 @@
-"""How many threads the libraries use, and what those do that wait.
+"""Thread counts of the libraries, and their waiting policy.
 
 numba and torch (OpenMP), OpenCV and OIDN (TBB) each have a pool of their own.
 """
@@ -10,23 +10,19 @@ import sys
 
 #: Where numba looks for a folder for compiled loops: its own list, and after that ours (`hybrid.runtime.compiled`).
 CACHE_LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.runtime.compiled.Fallback"
-#: Turns that a waiting thread makes before it sleeps, of GNU's OpenMP: 1,000 and 10,000 do nearly as well.
+#: Spins of a waiting thread of GNU's OpenMP before it sleeps: 1,000 and 10,000 are nearly as good.
 SPINS = 3000
 
 
-#: numba ends with a segmentation fault where it is to start a hundred thousand.
+#: numba ends with a segmentation fault if it is to start a hundred thousand.
 MOST_THREADS = 1024
 
 
 def check_thread_counts() -> None:
-    """Refuse numbers of threads in the environment that the libraries warn about, ignore, or crash with.
+    """Raise ValueError for thread counts in the environment that the libraries warn about, ignore, or crash with.
 
-    OpenMP takes several, one for each level of nesting. An empty variable is removed: it asks for nothing.
-
-    Raises
-    ------
-    ValueError
-        If one is no whole number from 1 to `MOST_THREADS`; names the variable.
+    They must be whole numbers from 1 to `MOST_THREADS`; OpenMP takes several, one for each level of nesting. An empty
+    variable is removed.
     """
     for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         said = os.environ.get(name, "")
@@ -40,14 +36,13 @@ def check_thread_counts() -> None:
 
 
 def let_waiting_threads_sleep() -> None:
-    """Let OpenMP's threads sleep where they wait long for each other, unless the environment says otherwise.
+    """Let OpenMP's threads sleep after `SPINS` spins of waiting, unless the environment states a policy.
 
-    By default they wait in a loop, which takes a core from whatever else runs: on two cores under six times their load
+    By default they spin for long, which takes a core from other processes: on two cores under six times their load
     `denoise` at 960×540 took 2.4 times the CPU time of a run whose threads slept, and 2.2 times the wall time. Most
-    waits are shorter than falling asleep and waking up: with `SPINS` turns in the loop first, ten frames of 1920×1080
-    took 0.97 of the CPU time and 0.92 of the wall time. Under five times the load of the machine they cost 13 % more.
-    To be called before numba or torch is imported, which read these variables once; processes started later take them
-    over.
+    waits are shorter than falling asleep and waking up: with `SPINS` spins first, ten frames of 1920×1080 took 0.97 of
+    the CPU time and 0.92 of the wall time. Under five times the load of the machine they cost 13 % more. Must be called
+    before numba or torch is imported, which read these variables once; child processes inherit them.
     """
     if os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE").upper() == "PASSIVE":
         os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
@@ -60,17 +55,14 @@ def prepare_libraries() -> None:
 
 
 def limit_threads(count: int) -> None:
-    """Let numba, OpenCV and torch use so many threads; OIDN is told with each picture (`hybrid.oidn`).
+    """Limit numba, OpenCV and torch to `count` threads; OIDN's limit is set with each picture (`hybrid.oidn`).
 
-    Parameters
-    ----------
-    count : int
-        At least 1. numba uses no more than it was started with.
+    numba uses no more threads than it was started with.
     """
     import cv2
     import numba
 
-    # Where torch is imported later: it takes the number of MKL, which else is what numba has told OpenMP.
+    # If torch is imported later, it takes MKL's number; without one it would take the number numba set for OpenMP.
     os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = str(count)
     cv2.setNumThreads(count)
     numba.set_num_threads(min(count, numba.get_num_threads()))

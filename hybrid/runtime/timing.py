@@ -1,4 +1,4 @@
-"""Seconds and peak memory of each stage of a run."""
+"""Time and peak memory of each stage of a run."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from hybrid.runtime.system import peak_memory
 
 @dataclass
 class Stage:
-    """What one stage has cost so far: wall and CPU seconds, calls, and the process's peak memory after it.
+    """Wall and CPU seconds and calls of one stage, and the process's peak memory after it.
 
-    What goes on in a thread beside the work (`Timings.beside`) costs CPU seconds, and wall seconds only where it is
-    waited for.
+    Background work (`Timings.background`) costs CPU seconds, and wall seconds only while it is waited for.
     """
 
     seconds: float = 0.0
@@ -26,26 +25,23 @@ class Stage:
     peak_bytes: int = 0
 
 
-# The CPU time of another thread. Where the system does not have it (macOS, Windows) it counts when its work has ended.
+# CPU clock of another thread. Without it (macOS, Windows) background work is counted when it has ended.
 _CLOCK_OF: Callable[[int], int] | None = getattr(time, "pthread_getcpuclockid", None)
 
 
 class Timings:
-    """Adds up the cost of named stages.
-
-    Stages may not nest: the sum over stages is the time of the run that is accounted for.
-    """
+    """Adds up the cost of named stages, which may not nest."""
 
     def __init__(self) -> None:
         self.stages: dict[str, Stage] = {}
         self._lock = threading.Lock()
-        # CPU seconds of what goes on beside the work: of what has ended, and the clocks of what has not.
+        # CPU seconds of background work that has ended, and the clocks of work that has not.
         self._ended = 0.0
         self._running: dict[int, tuple[int, float]] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count what happens inside the ``with`` block as stage `name`, less what goes on beside it."""
+        """Count the ``with`` block as stage `name`, without background work."""
         wall, cpu = time.perf_counter(), self._cpu_time()
         try:
             yield
@@ -53,10 +49,10 @@ class Timings:
             self._add(name, time.perf_counter() - wall, self._cpu_time() - cpu, calls=1)
 
     @contextmanager
-    def beside(self, name: str) -> Iterator[None]:
-        """Count the CPU time of the ``with`` block, in a thread beside the work that takes it alone, as stage `name`'s.
+    def background(self, name: str) -> Iterator[None]:
+        """Count the CPU time of the ``with`` block, in a background thread, as stage `name`.
 
-        Libraries that would start threads of their own in it are counted with the stage of the work.
+        Threads that libraries start in the block are counted with the stage of the main thread.
         """
         thread, start = threading.get_ident(), time.thread_time()
         if _CLOCK_OF is not None:
@@ -72,12 +68,12 @@ class Timings:
             self._add(name, 0.0, spent, calls=0)
 
     def _cpu_time(self) -> float:
-        """CPU seconds of the process, but for what has gone on beside the work."""
+        """CPU seconds of the process without background work."""
         with self._lock:
-            beside = 0.0
+            running = 0.0
             if sys.platform != "win32":  # which has no such clocks
-                beside = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
-            return time.process_time() - self._ended - beside
+                running = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
+            return time.process_time() - self._ended - running
 
     def _add(self, name: str, wall: float, cpu: float, *, calls: int) -> None:
         with self._lock:
@@ -88,7 +84,7 @@ class Timings:
             entry.peak_bytes = max(entry.peak_bytes, peak_memory())
 
     def rows(self, pixels: int) -> list[tuple[str, str, str, str]]:
-        """Rows (stage, seconds, seconds per megapixel-frame, peak memory) for `pixels` pixels in all frames."""
+        """Return rows (stage, seconds, seconds per megapixel, peak memory); `pixels` is the number in all frames."""
         megapixels = max(pixels, 1) / 1e6
         return [
             (

@@ -67,7 +67,7 @@ def test_completion_can_be_had_and_completes(capsys, monkeypatch):
 def test_options_have_one_name_and_one_group_everywhere(command, capsys):
     code, out, _ = run(capsys, command, "-h")
     assert code == 0
-    assert "What it tells" in out
+    assert "Messages" in out
     assert "--output" in out or command == "inspect"
     groups = [line for line in out.splitlines() if line.startswith("╭")]
     assert len(groups) >= 4

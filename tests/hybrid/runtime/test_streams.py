@@ -44,8 +44,8 @@ def test_what_libraries_print_is_never_written_into_a_file_that_was_opened_later
     """The first file that was opened took the number of the closed standard error."""
     path = tmp_path / "log"
     run = f"""
-from hybrid.commands.log import lasting_streams
-with lasting_streams(), open({str(path)!r}, "w") as file:
+from hybrid.commands.log import tolerant_streams
+with tolerant_streams(), open({str(path)!r}, "w") as file:
     os.write(2, b"printed")
 """
     assert run_without(closed, run) == 0

@@ -42,7 +42,7 @@ def test_what_goes_on_beside_the_work_is_counted_there_and_not_with_the_work():
     timings, half = Timings(), threading.Event()
 
     def read():
-        with timings.beside("read"):
+        with timings.background("read"):
             burn(0.25)
             half.set()
             burn(0.25)
