@@ -1,6 +1,6 @@
 """Cache of compiled loops, with a fallback where no folder can be written to.
 
-numba loads this module because `hybrid.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
+numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
 neither the package's folder nor the user's can be written to, as on a render farm, and any error of unpickling a
 truncated file.
 

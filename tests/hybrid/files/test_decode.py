@@ -90,3 +90,5 @@ def test_frames_cropped_differently_are_read_onto_one_window_and_written_as_they
     np.testing.assert_array_equal(again.pixels(tuple(f"color.{c}" for c in "RGB")), 2 * pixels[1])
     # The last column of depth lies outside of every color window: it was not read, and stays.
     np.testing.assert_array_equal(again.channel("depth.Z"), source.channel("depth.Z"))
+    reopened = shot.reopened({1: tmp_path / "out.exr"})
+    np.testing.assert_array_equal(reopened.read(1).color, 2 * first.color)  # on the canvas of both frames still

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import OpenEXR
 import pytest
 
 from flow.motion import CYCLES
 from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot, open_shot, output_path
 from hybrid.plan import Rules
 from hybrid.stream import FrameStream
@@ -258,3 +262,59 @@ def test_output_of_several_frames_needs_a_placeholder_and_may_not_be_the_input(t
             output_path(tmp_path / pattern, shot, 8)
     with pytest.raises(ValueError, match="overwrite"):  # a neighbour, not the frame itself
         output_path(tmp_path / "shot.0009.exr", open_shot(tmp_path, frames="8"), 8)
+
+
+# --- shots made from a shot
+
+
+def exchange(path: Path) -> None:
+    """Put a copy of a file in its place."""
+    Path(shutil.copy2(path, path.with_name("spare"))).replace(path)
+
+
+def test_a_file_that_changes_after_validation_is_seen(tmp_path):
+    shot = open_shot(save_frames(tmp_path, [1, 2]))
+    shot.read(1)
+    validated = shot.reinterpreted(Interpretation(variance_scale=2.0))
+    exchange(shot.path(1))
+    with pytest.raises(OSError, match="has changed since it was read"):
+        validated.check_unchanged([1])
+
+
+def test_a_file_that_changes_between_two_views_is_seen(tmp_path):
+    layers = {f"{name}.Combined": flat_image(1) for name in ("Front", "Back")}
+    write_layers(tmp_path / "a.0001.exr", layers)
+    first, second = open_shot(tmp_path).views
+    first.read(1)
+    exchange(first.path(1))
+    with pytest.raises(OSError, match="has changed since it was read"):
+        second.read(1)
+
+
+def test_motion_that_is_ignored_stays_ignored_after_validation(tmp_path):
+    shot = open_shot(save_frames(tmp_path, [1]), motion="none")
+    assert shot.layers(1).motion is None
+    assert shot.reinterpreted(Interpretation(frozenset({"albedo"}))).layers(1).motion is None
+
+
+def test_a_shot_with_neighbours_holds_the_frames_that_were_read(tmp_path):
+    shot = open_shot(save_frames(tmp_path, [1, 2, 3]), frames="2")
+    frame = shot.read(2)
+    wider = shot.with_neighbours(1)
+    assert wider.numbers == (1, 2, 3)
+    assert wider.read(2) is frame
+    assert shot.reinterpreted(Interpretation()).read(2) is not frame
+
+
+def test_a_reopened_shot_leaves_out_the_same_layers(tmp_path):
+    shot = open_shot(save_frames(tmp_path, [1])).reinterpreted(Interpretation(frozenset({"motion"})))
+    assert shot.reopened({1: shot.path(1)}).layers(1).motion is None
+
+
+def test_a_file_that_changed_since_it_was_read_is_not_written_over_with_its_picture(tmp_path):
+    shot = open_shot(save_frames(tmp_path, [1]))
+    color = shot.read(1).color
+    exchange(shot.path(1))
+    with pytest.raises(OSError, match="has changed since it was read"):
+        shot.write(tmp_path / "out.exr", 1, {"color": color})
+    assert not (tmp_path / "out.exr").exists()
