@@ -1,8 +1,8 @@
 """Cache of compiled loops, with a fallback where no folder can be written to.
 
-numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it. It would raise "cannot cache function" where
-neither the package's folder nor the user's can be written to, as on a render farm, and any error of unpickling a
-truncated file.
+numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it. It would raise "cannot cache
+function" where neither the package's folder nor the user's can be written to, as on a render farm, and any error of
+unpickling a truncated file.
 
 As a program it compiles the slowest loop, for the process that has started it as a helper.
 """
