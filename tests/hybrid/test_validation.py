@@ -169,8 +169,8 @@ IMPLAUSIBLE = {
     "constant depth": (fill("Depth", "Z", lambda t, i: 7), "Depth", "depth (ViewLayer.Depth.Z) is constant"),
     "no variance": (fill("variance", "RGB", lambda t, i: 0), "variance", "is 0 everywhere: left out"),
     "negative variance": (fill("variance", "RGB", lambda t, i: t.normal), "variance", "is negative in"),
-    "variance times 500": (fill("variance", "RGB", lambda t, i: 500 * t.variance), "variance", "times what"),
-    "variance over 20": (fill("variance", "RGB", lambda t, i: t.variance / 20), "variance", "times what"),
+    "variance times 500": (fill("variance", "RGB", lambda t, i: 500 * t.variance), "variance", "times that of"),
+    "variance over 20": (fill("variance", "RGB", lambda t, i: t.variance / 20), "variance", "times that of"),
 }  # fmt: skip
 
 
