@@ -29,7 +29,7 @@ COMMANDS = {
     "inspect": Entry(
         "inspect:inspect",
         "Frames",
-        "Show which channels are used as what, and which stages the shot calls for, with figures and reasons.",
+        "Show which layer has which role, and which stages run, with measurements and reasons.",
     ),
     "denoise": Entry(
         "denoise:denoise",
