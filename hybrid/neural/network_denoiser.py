@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,14 +74,10 @@ class NetworkDenoiser(WindowDenoiser):
         return int(self.model.frames // 2)
 
     @property
-    def precision(self) -> str:
-        """Precision of the weights."""
-        return "bfloat16" if self.setup.bfloat16 else "float32"
-
-    @property
     def settings(self) -> Mapping[str, object]:
         """JSON values that pixels depend on."""
-        return {"tile": self.tile, "threshold": self.threshold, "precision": self.precision}
+        precision = "bfloat16" if self.setup.bfloat16 else "float32"
+        return {"tile": self.tile, "threshold": self.threshold, "precision": precision}
 
     @property
     def devices(self) -> Mapping[str, str]:
@@ -98,12 +93,6 @@ class NetworkDenoiser(WindowDenoiser):
         """Bytes that the network takes while it runs on frames of this height and width, beside its weights."""
         height, width = (min(side, self.tile + 2 * self.halo) for side in shape)
         return self._bytes_per_pixel * height * width * (1 if self.setup.bfloat16 else 2)
-
-    def counting(self, breakdown: Breakdown) -> NetworkDenoiser:
-        """The same denoiser with a breakdown."""
-        other = copy(self)
-        other.setup = replace(self.setup, breakdown=breakdown)
-        return other
 
     @abstractmethod
     def _run_tile(self, aligned: AlignedWindow, window: Any, outer: Block) -> Tile:
