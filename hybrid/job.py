@@ -569,7 +569,7 @@ class Job:
             self.first_passes[0].first_pass,
             radius=self.denoiser.radius,
             network=self.denoiser.memory(self.views[0].shape),
-            gathers=self.denoiser.pools,
+            pools=self.denoiser.pools,
         )
 
     def margins(self) -> list[int]:

@@ -1,7 +1,7 @@
-"""How much of a frame may be worked on at a time, for a given amount of memory.
+"""How many rows of a frame may be worked on at a time, for a given amount of memory.
 
-The frames of a window are held as a whole; what is made of them while they are aligned and filtered, which is several
-times as much, only for some rows. So memory has a lower bound, and what is asked for below it is refused.
+The frames of a window are held as a whole; the planes of alignment and filters, several times as many, only for some
+rows. Memory therefore has a lower bound, below which a run is refused.
 """
 
 from __future__ import annotations
@@ -18,19 +18,17 @@ from hybrid.stream import FirstPass, can_refine, kept_planes
 
 # Rows are taken in whole strips of the guided filter.
 STRIP = 64
-# What a process takes before it has read anything: Python, the libraries, the compiled code; and with torch.
+# Bytes of a process that has read nothing: Python, the libraries, the compiled code; and with torch.
 BASE, BASE_NEURAL = 220 * 2**20, 470 * 2**20
-# What OIDN takes: its code, most of which is there beside torch anyway; and for each pixel, up to its limit, while it
-# runs in its slowest mode.
+# Bytes of OIDN: its code, most of which torch loads anyway; and for each pixel, up to its limit, in its slowest mode.
 OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 230 * 2**20, 80 * 2**20, 750
-# And of that, what stays when it has run.
+# The part of it that stays when OIDN has run.
 CODE = 64 * 2**20
-# Of the memory that was asked for; the allocator rounds up, and does not give all back at once.
+# Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once.
 SHARE = 0.97
-# Planes that come and go while a frame is prepared, while rows of a window are filtered, and while they are given to a
-# network.
+# Temporary planes while a frame is prepared, while rows of a window are filtered, and while a network reads them.
 PREPARING, FILTERING, GIVING = 14, 40, 12
-# And while TV-L1 solves for a flow.
+# Temporary planes while TV-L1 solves for a flow.
 REFINING = 45
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
@@ -59,7 +57,7 @@ def plan_rows(
     *,
     radius: int = 2,
     network: int | None = None,
-    gathers: bool = False,
+    pools: bool = False,
 ) -> int | None:
     """Find how many rows of a frame may be worked on at a time.
 
@@ -70,15 +68,15 @@ def plan_rows(
     shot : Shot
         Its headers are read.
     stages : collection of str
-        Which may run on some frame.
+        The stages that may run on some frame.
     first_pass : FirstPass, optional
-        Of the shot.
+        The first pass of the shot.
     radius : int
         Frames on each side of the centre.
     network : int, optional
-        Bytes that the network takes while it runs; None where none does.
-    gathers : bool
-        Whether samples are gathered, and denoised by OIDN.
+        Bytes that a network takes while it runs; None without a network.
+    pools : bool
+        Whether samples are pooled and denoised by OIDN.
 
     Returns
     -------
@@ -92,8 +90,8 @@ def plan_rows(
 
     Notes
     -----
-    Counted in planes, one float32 for each pixel: what is kept of each frame, and what there is at once while a frame
-    is prepared, written, or worked on. `benchmarks/bench_memory.py` measures whether it is kept.
+    Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
+    prepared, written or worked on. `benchmarks/bench_memory.py` measures the true peak.
     """
     height, width = shot.shape
     layers, neural = shot.layers(shot.numbers[0]), network is not None
@@ -107,15 +105,15 @@ def plan_rows(
     plane = 4 * height * width
     base, code = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
     holds = 0 if first_pass is None else first_pass.holds
-    if gathers:
+    if pools:
         holds = max(holds, HOLDS_FAST)
-        worked += 3 * (2 * radius + 1) + 18  # residuals, and what is gathered and made of it
+        worked += 3 * (2 * radius + 1) + 18  # residuals, pooled samples and their average
     oidn = min(holds, code + OIDN_OF_PIXEL * height * width * holds // HOLDS)
 
     def needed(rows: int) -> int:
         share = min(rows + 2 * MARGIN, height) / height
-        # Estimates are made while frames are prepared; what is gathered is denoised while rows are worked on.
-        at_once = max(plane * passing + oidn, plane * worked * share + (oidn if gathers else min(oidn, CODE)))
+        # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
+        at_once = max(plane * passing + oidn, plane * worked * share + (oidn if pools else min(oidn, CODE)))
         return base + round(plane * kept + at_once)
 
     budget = round(SHARE * limit)

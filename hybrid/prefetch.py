@@ -1,4 +1,4 @@
-"""Reading the next frame and writing the last one while this one is worked on."""
+"""Read the next frame of a shot in a thread while the current one is worked on."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from hybrid.runtime.timing import Timings
 
 
 class Prefetcher:
-    """The frames of a shot, of which one is read ahead in a thread.
+    """The frames of a shot, one of which is read ahead.
 
     Parameters
     ----------
     shot : Frames
-        Where they come from; read in the thread alone.
+        The frames; only the thread reads them.
     thread : Executor
-        Of one thread.
+        One thread.
     timings : Timings
-        Where to count what the thread costs, as "read".
+        Counts the CPU time of the thread as "read".
     """
 
     def __init__(self, shot: Frames, thread: Executor, timings: Timings) -> None:
@@ -37,18 +37,12 @@ class Prefetcher:
         return self._shot.shape
 
     def expect(self, numbers: Iterable[int]) -> None:
-        """Say which frames will be asked for; the first of them after the last one that was asked for is begun."""
+        """Set the frames that will be read, and begin the first of them beyond the last one read."""
         self._expected = sorted(numbers)
         self._begin()
 
     def read(self, number: int) -> Frame:
-        """A frame; the next one that is expected is begun.
-
-        Raises
-        ------
-        Exception
-            What reading it has raised, as if it had been read now.
-        """
+        """Return a frame, and begin the next expected one; raises the error of reading it."""
         wanted = self._begun.pop(number, None) or self._thread.submit(self._read, number)
         frame = wanted.result()
         self._last = max(self._last, number)

@@ -1,4 +1,4 @@
-"""What a neighbour shows of the centre of a window, and how far it is to be trusted."""
+"""Warp the layers of a neighbour to the centre of a window, and measure how far they can be trusted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hybrid.alignment.prepare import ALPHA, PreparedFrame
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Of estimates that agree in color, geometry can take away no more than all but this: outlines, whose albedo and normals
+# The confidence that geometry leaves at least to denoised frames of one color: outlines, whose albedo and normals
 # are mixed anew in each frame, flicker most. Worth 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB
 # at 6 to 10, where more (0.5) would be better yet.
 AGREEING = 0.3
@@ -24,16 +24,16 @@ SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 
 
 def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:
-    """Name all layers of a frame that are warped.
+    """Layers of a frame that are warped, by name.
 
     Parameters
     ----------
     frame : PreparedFrame
         The frame.
     light : bool
-        Whether its light is among them, which the gate compares where there are no estimates.
+        Whether its light is among them, which the gate compares where there is no first pass.
     alpha : bool
-        Whether alpha is.
+        Whether alpha is among them.
     """
     named = {
         "color": frame.irradiance,
@@ -54,16 +54,16 @@ def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str
     there : PreparedFrame
         The neighbour.
     flow : (h, W, 2) array
-        To it, from these rows.
+        From these rows to the neighbour, pixels.
     rows : slice
-        Of the centre.
+        Rows of the centre.
     warped : dict of str to (h, W, C) array
-        Where to, by the names of `layers_of`.
+        Results, by the names of `layers_of`.
 
     Returns
     -------
     (h, W) bool array
-        Where they show its color.
+        Where the warped color was measured.
     """
     layers = layers_of(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
     if not flow.any():
@@ -75,7 +75,7 @@ def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str
         _, inside = warp(layers[name], flow, first_row=rows.start, out=out)
     if inside is not None and there.valid.all():
         return inside
-    # The share of finite color in the mix of each warped pixel: less than all of it is no measurement.
+    # The share of finite color in each warped pixel: a pixel with less than all of it is not measured.
     share, inside = warp(there.valid.astype(np.float32), flow, first_row=rows.start)
     return np.asarray(inside & (share > 0.999))
 
@@ -95,9 +95,9 @@ def trust_geometry(
     centre, warped : dict of str to (h, W, C) array
         Layers of the centre and the neighbour.
     flow : (h, W, 2) array
-        To the neighbour, from these rows of the centre.
+        From these rows of the centre to the neighbour, pixels.
     measured : (h, W) bool array
-        Where the neighbour shows anything.
+        Where the neighbour shows a measured color.
     back : (H, W, 2) array
         The neighbour's flow to the centre.
     first_row : int
@@ -121,38 +121,38 @@ def trust_geometry(
 
 
 def novelty_of(flow: Array) -> Array:
-    """Say how much of a neighbour's noise is its own where one seed makes the noise of all frames, in [0, 1]."""
+    """Share of a neighbour's noise that is its own where all frames have one seed, in [0, 1], by its motion."""
     distance = np.hypot(flow[..., 0], flow[..., 1])
     return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
 
 
 def trust_light(
     confidence: Array,
-    seen: Array,
+    coverage: Array,
     gate: Array,
     stages: Collection[str],
     *,
     agreeing: float = AGREEING,
 ) -> Array:
-    """Measure how far aligned estimates are to be trusted.
+    """Combine the confidence of geometry with the gate.
 
     Parameters
     ----------
     confidence : (T, h, W) array
-        By geometry.
-    seen : (T, h, W) array
-        What it could be at most: 0 where a frame shows nothing.
+        By geometry, in [0, 1].
+    coverage : (T, h, W) array
+        Coverage: an upper bound of the confidence.
     gate : (T, h, W) array
-        How far they show the centre's light (`nlm.gate`).
+        How far frames show the centre's light (`nlm.gate`), in [0, 1].
     stages : collection of str
-        Without "gate" what geometry trusts is trusted.
+        Without "gate" the confidence of geometry stands.
     agreeing : float
-        What geometry leaves at least to those that show the same light.
+        The confidence that geometry leaves at least where the light agrees.
 
     Returns
     -------
     (T, h, W) array
-        Confidence, in [0, 1]: by geometry and by whether they show the same light, or by that alone.
+        max(c g, min(coverage, agreeing) g), in [0, 1].
     """
-    floor = np.minimum(seen, agreeing) * gate
-    return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (seen > 0)
+    floor = np.minimum(coverage, agreeing) * gate
+    return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (coverage > 0)
