@@ -13,7 +13,10 @@ from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_matching_sequence, open_shot
 from hybrid.memory import plan_rows
+from hybrid.pipeline import View, denoise_frames
+from hybrid.plan import Rules
 from hybrid.records import read_records
+from hybrid.stabilize import Denoised
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -181,3 +184,22 @@ def test_chunks_of_a_cluster_resume_and_pictures_follow(shot_folder, tmp_path, m
     assert len(chunks) == 2
     assert all("--resume" in chunk.arguments for chunk in chunks.values())
     assert pictures == [chunks]
+
+
+@pytest.mark.parametrize("where", ["the color of the second view", "another layer"])
+def test_nothing_that_is_not_finite_is_written_of_any_view(tmp_path, where):
+    def edit(index, layers):
+        for name in list(layers):
+            layers[name.replace("ViewLayer", "Zenith")] = layers[name] * np.float32(9 if "Combined" in name else 1)
+
+    def denoise(aligned):
+        color = aligned.color[aligned.centre] * aligned.modulation
+        if where == "another layer":
+            return Denoised(color, {"shadow": np.full(color.shape, np.nan, np.float32)})
+        return Denoised(color * np.float32(np.nan) if color.mean() > 3 else color)
+
+    views = [View(view) for view in open_shot(Scene(noise=0.1).write(tmp_path / "in", edit=edit)).views]
+    assert len(views) == 2
+    with pytest.raises(ValueError, match="it was not written"):
+        list(denoise_frames(views, tmp_path / "out", denoise, Rules(off=frozenset({"stabilize"}))))
+    assert not list((tmp_path / "out").glob("*.exr"))
