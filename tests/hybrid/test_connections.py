@@ -10,8 +10,10 @@ import pytest
 import hybrid
 from hybrid import budget, job
 from hybrid.cli import main
+from hybrid.commands.shots import open_input
+from hybrid.comparison.results import Comparison
 from hybrid.files.exr import read_exr
-from hybrid.files.shots import open_matching_sequence, open_shot
+from hybrid.files.shots import open_matching_sequence, open_shot, output_path
 from hybrid.memory import plan_rows
 from hybrid.pipeline import View, denoise_frames
 from hybrid.plan import Rules
@@ -203,3 +205,43 @@ def test_nothing_that_is_not_finite_is_written_of_any_view(tmp_path, where):
     with pytest.raises(ValueError, match="it was not written"):
         list(denoise_frames(views, tmp_path / "out", denoise, Rules(off=frozenset({"stabilize"}))))
     assert not list((tmp_path / "out").glob("*.exr"))
+
+
+@pytest.mark.parametrize("keep_context", [False, True])
+def test_one_name_for_several_frames_is_refused_with_those_beside_them(shot_folder, tmp_path, keep_context):
+    """A first pass is kept of neighbours too."""
+    shot = open_shot(shot_folder, frames="1002")
+    if keep_context:
+        with pytest.raises(ValueError, match="names one file for 3 frames"):
+            output_path(tmp_path / "x.exr", shot, 1002, include_context=True)
+    else:
+        assert output_path(tmp_path / "x.exr", shot, 1002) == tmp_path / "x.exr"
+
+
+def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch):
+    pytest.importorskip("jinja2")
+    pytest.importorskip("matplotlib")
+    pages, asked, profiles = [], [], []
+
+    def open_noted(*args, profile, **options):
+        profiles.append(profile)
+        return open_input(*args, profile=profile, **options)
+
+    def compare_shot(shot, reference, methods, options, **more):
+        asked.append(options)
+        return Comparison(options.title, (), {})
+
+    monkeypatch.setattr("hybrid.commands.compare.compare_shot", compare_shot)
+    monkeypatch.setattr("hybrid.comparison.report.report_images", lambda *_: None)
+    monkeypatch.setattr("hybrid.comparison.report.write_report", lambda _, report: pages.append(report))
+    monkeypatch.setattr("hybrid.commands.compare.read_comparison", lambda path: Comparison(path.parent.name, (), {}))
+    monkeypatch.setattr("hybrid.commands.compare.open_input", open_noted)
+    folder, other = str(shot_folder), str(tmp_path / "other")
+    words = ["compare", folder, "--reference", folder, "--methods", "draft", "-o", str(tmp_path / "report")]
+    words += ["--rounds", "7", "--name", "title", "--clock", "cpu", "--fps", "5", "--with-report", other]
+    main([*words, "--profile", "cycles", "--level", f"{folder}=8"])
+    assert profiles == ["cycles", "cycles"]
+    assert (asked[0].title, asked[0].rounds) == ("title", 7)
+    assert pages[0].cost == "cpu_seconds_per_megapixel"
+    assert [other.shot for other in pages[0].others] == ["other"]
+    assert pages[0].rate == 5
