@@ -1,1 +1,1 @@
-"""Accuracy against time: methods run, judged and shown side by side."""
+"""Comparison of denoisers: accuracy against time, with a report."""

@@ -204,20 +204,20 @@ class Evaluator:
         str
             Description of the reference's noise.
         """
-        known = [(samples or 1.0, error_of(noisy))]
+        errors = [(samples or 1.0, error_of(noisy))]
         for shot, count in levels:
             common = [number for number in self.numbers if shot.has(number)]
             references = map(self.store.load_reference, common)
             pairs = zip(common, references, strict=True)
-            known.append((count, _mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
-        known.sort()
-        floor, words = self._find_floor(known, samples, reference_samples)
-        return NoiseLaw(tuple(known), samples or 1.0, floor), words
+            errors.append((count, _mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
+        errors.sort()
+        floor, words = self._find_floor(errors, samples, reference_samples)
+        return NoiseLaw(tuple(errors), samples or 1.0, floor), words
 
     def _find_floor(
-        self, known: Sequence[tuple[float, float]], samples: float | None, reference_samples: float | None
+        self, errors: Sequence[tuple[float, float]], samples: float | None, reference_samples: float | None
     ) -> tuple[float, str]:
-        """The reference's part in the errors of `known`, and a description of its noise."""
+        """The reference's part in the errors of the levels, and a description of its noise."""
         if isinstance(self.store.load_reference(self.numbers[0]), tuple):
             level = decibels(np.mean([self._error_of_halves(number) for number in self.numbers]))
             return 0.0, (
@@ -225,10 +225,10 @@ class Evaluator:
                 "products of the errors against both halves, free of that noise; the other measures use their mean."
             )
         if samples is not None and reference_samples is not None:
-            floor = reference_floor(known[-1][1], known[-1][0], reference_samples)
+            floor = reference_floor(errors[-1][1], errors[-1][0], reference_samples)
             source = f"by the 1/n law of its {reference_samples:g} samples per pixel"
-        elif len(known) > 1:
-            floor = fit_floor(known)
+        elif len(errors) > 1:
+            floor = fit_floor(errors)
             source = "from the common part of the measured levels"
         else:
             return 0.0, "One render; its noise is unknown and counts as error of the methods."
@@ -345,13 +345,13 @@ def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.b
     Sundaram et al. 2010, doi:10.1007/978-3-642-15549-9_32, eq. 5
     """
     current_flows, previous_flows = current.flows(), previous.flows()
-    known = current_flows and current_flows.to_previous
+    forward = current_flows and current_flows.to_previous
     back = previous_flows and previous_flows.to_next
-    if known is None and back is not None:
-        known = Vectors(*invert_flow(back.flow, valid=back.valid, depth=previous.depth))
-    if known is None:
+    if forward is None and back is not None:
+        forward = Vectors(*invert_flow(back.flow, valid=back.valid, depth=previous.depth))
+    if forward is None:
         return None
-    flow, valid = known
+    flow, valid = forward
     if back is not None:
         warped_back, inside = warp(back.flow, flow)
         lengths = np.sum(flow**2, axis=-1) + np.sum(warped_back**2, axis=-1)

@@ -45,7 +45,7 @@ COLOR_POWER, FEATURE_POWER = 0.7, 0.5
 KNEE, BELOW = 0.4, 0.95  # color errors up to KNEE of the greatest are spread over [0, BELOW]
 BORDER = cv2.BORDER_REPLICATE
 ROWS = 128  # processed at a time: they stay in the processor's cache from filter to filter
-# Of the widest Gaussian, three deviations, pixels; the filters of features are narrower.
+# Pixels: three deviations of the widest Gaussian; the filters of features are narrower.
 _REACH = int(np.ceil(3 * np.sqrt(0.04 / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
 BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes radiance around 1
 
@@ -123,8 +123,8 @@ def _perceive(image: Array, exposure: float) -> _Perceived:
     shown = np.minimum(((k[0] * scaled + k[1]) * scaled + k[2]) / ((k[3] * scaled + k[4]) * scaled + k[5]), 1)
     # The 16 missing in Y cancel: color filters preserve constants, filters of edges and points remove them.
     opponent = _mix(shown, OPPONENT @ RELATIVE)
-    seen = np.dstack([_blur(opponent[..., i], gaussians) for i, gaussians in enumerate(SENSITIVITY)])
-    light = np.clip(_mix(seen, np.linalg.inv(OPPONENT @ RELATIVE)), 0, 1)
+    filtered = np.dstack([_blur(opponent[..., i], gaussians) for i, gaussians in enumerate(SENSITIVITY)])
+    light = np.clip(_mix(filtered, np.linalg.inv(OPPONENT @ RELATIVE)), 0, 1)
     wide, edge, point = _feature_filters()
     gray = opponent[..., 0] * np.float32(1 / 116)
     return _Perceived(_hunt(light), _strength(gray, edge, wide), _strength(gray, point, wide))

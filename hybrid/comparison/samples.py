@@ -39,10 +39,10 @@ class NoiseLaw:
     @property
     def slope(self) -> float | None:
         """Exponent of the error, without the floor, in the samples: −1 by theory; None for one level."""
-        known = [(math.log(n), math.log(e - self.floor)) for n, e in self.levels if e > self.floor]
-        if len(known) < 2:
+        above_floor = [(math.log(n), math.log(e - self.floor)) for n, e in self.levels if e > self.floor]
+        if len(above_floor) < 2:
             return None
-        x, y = np.transpose(known)
+        x, y = np.transpose(above_floor)
         return float(np.polyfit(x, y, 1)[0])
 
     def worth(self, error: float) -> float:
@@ -51,17 +51,17 @@ class NoiseLaw:
         Interpolated linearly in the logarithms between levels, extrapolated by 1/n. Infinite where the error is within
         the reference's noise; NaN where the noisy render has no error.
         """
-        known = [(n, e - self.floor) for n, e in self.levels if e > self.floor]
+        levels = [(n, e - self.floor) for n, e in self.levels if e > self.floor]
         rest = error - self.floor
-        if not known or math.isnan(rest):
+        if not levels or math.isnan(rest):
             return float("nan")
         if rest <= 0:
             return float("inf")
-        for (n0, e0), (n1, e1) in pairwise(known):
+        for (n0, e0), (n1, e1) in pairwise(levels):
             if min(e0, e1) <= rest <= max(e0, e1) and e0 != e1:
                 share = math.log(rest / e0) / math.log(e1 / e0)
                 return float(n0 * (n1 / n0) ** share / self.samples)
-        n, e = known[-1] if rest < known[-1][1] else known[0]
+        n, e = levels[-1] if rest < levels[-1][1] else levels[0]
         return n * e / rest / self.samples
 
     def describe(self) -> str:

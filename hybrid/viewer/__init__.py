@@ -1,1 +1,1 @@
-"""A local page that plays sequences, finished or still being made, beside each other."""
+"""A local page that plays sequences side by side, also while they are being written."""

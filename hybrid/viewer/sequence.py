@@ -120,8 +120,8 @@ class Sequence:
         path = self._path(number)
         image = read_exr(path, pixels=False)
         header = image.parts[0].header
-        own = {key: value for key, value in header.items() if key.startswith("ravg/") and key != MADE_FROM}
-        made = {key.removeprefix("ravg/"): str(value) for key, value in own.items()}
+        ours = [key for key in header if key.startswith("ravg/") and key != MADE_FROM]
+        made = {key.removeprefix("ravg/"): str(header[key]) for key in ours}
         # The given options are one attribute, as JSON.
         with suppress(ValueError, AttributeError, RecursionError):
             settings = json.loads(made.get("settings", "{}")).items()
