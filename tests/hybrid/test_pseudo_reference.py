@@ -54,7 +54,7 @@ def test_a_hole_in_the_sequence_is_a_narrower_window(tmp_path):
 def test_frames_are_read_once_while_the_window_slides(tmp_path, monkeypatch):
     shot = open_shot(SCENE.write(tmp_path))
     read = []
-    monkeypatch.setattr("hybrid.files.frames.read_exr", _counting(read))
+    monkeypatch.setattr("hybrid.files.reader.read_exr", _counting(read))
     aligner = FrameStream(shot, only(MOVING))
     for number in shot.numbers:
         aligner.align(number)
