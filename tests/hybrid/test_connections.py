@@ -9,6 +9,7 @@ import pytest
 
 import hybrid
 from hybrid import budget, job
+from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
 from hybrid.commands.shots import open_input
 from hybrid.comparison.results import Comparison
@@ -18,7 +19,8 @@ from hybrid.memory import plan_rows
 from hybrid.pipeline import View, denoise_frames
 from hybrid.plan import Rules
 from hybrid.records import read_records
-from hybrid.stabilize import Denoised
+from hybrid.stabilize import Denoised, FrameResult
+from hybrid.stream import FrameStream
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -245,3 +247,51 @@ def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch)
     assert pages[0].cost == "cpu_seconds_per_megapixel"
     assert [other.shot for other in pages[0].others] == ["other"]
     assert pages[0].rate == 5
+
+
+def test_a_frame_that_is_not_to_be_demodulated_is_not(shot_folder):
+    frame = FrameStream(open_shot(shot_folder), Rules(off=frozenset({"demodulate"}))).frame(1002)
+    np.testing.assert_array_equal(frame.irradiance, frame.radiance)
+
+
+def test_measurements_of_frames_that_have_passed_are_dropped(shot_folder, monkeypatch):
+    measured = []
+
+    def measure_frame(frame, small):
+        measured.append(frame.number)
+        return measure(frame, small)
+
+    monkeypatch.setattr("hybrid.stream.measure_frame", measure_frame)
+    stream = FrameStream(open_shot(shot_folder), Rules())
+    stream.measurements([1001, 1002])
+    stream.keep([1002, 1003])
+    stream.measurements([1001, 1002])
+    assert measured == [1001, 1002, 1001]
+
+
+def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(tmp_path, monkeypatch):
+    def edit(index, layers):
+        layers |= {name.replace("ViewLayer", "Zenith"): layer for name, layer in layers.items()}
+
+    fakes = []
+
+    class Fake:
+        def __init__(self, stream, denoise, **options):
+            self.stream, self.first = stream, not fakes
+            fakes.append(self)
+
+        def neighbours(self, number):
+            return [number]
+
+        def make(self, number):
+            plan = SimpleNamespace(stages={"gate" if self.first else "warp"})
+            color = self.stream.frame(number).radiance
+            averaged = (number, number + 1) if self.first else (number,)
+            return FrameResult(Denoised(color), plan, averaged, 0.0, 0.0, 0, 0, 0, 0)
+
+    monkeypatch.setattr("hybrid.pipeline.FrameDenoiser", Fake)
+    views = open_shot(Scene(frames=2).write(tmp_path / "in", edit=edit)).views
+    assert len(list(denoise_frames([View(view) for view in views], tmp_path / "out", Denoised, Rules()))) == 2
+    header = read_exr(tmp_path / "out" / "shot.1001.exr").parts[0].header
+    assert header["ravg/stages"] == "gate"
+    assert header["ravg/beside"] == ""
