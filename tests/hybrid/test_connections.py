@@ -1,6 +1,7 @@
 """Options and results reach what they are for: connections that could be cut without another test noticing."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import pytest
 
 import hybrid
 from hybrid import budget, job
+from hybrid.alignment.align import align
 from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
 from hybrid.commands.shots import open_input
@@ -19,7 +21,7 @@ from hybrid.memory import plan_rows
 from hybrid.pipeline import View, denoise_frames
 from hybrid.plan import Rules
 from hybrid.records import read_records
-from hybrid.stabilize import Denoised, FrameResult
+from hybrid.stabilize import Denoised, FrameDenoiser, FrameResult
 from hybrid.stream import FrameStream
 from tests.scenes import Scene
 
@@ -295,3 +297,14 @@ def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(t
     header = read_exr(tmp_path / "out" / "shot.1001.exr").parts[0].header
     assert header["ravg/stages"] == "gate"
     assert header["ravg/beside"] == ""
+
+
+def test_the_outliers_of_all_bands_are_counted(shot_folder, monkeypatch):
+    monkeypatch.setattr("hybrid.stabilize.align", lambda *args, **options: replace(align(*args, **options), outliers=3))
+    stream = FrameStream(open_shot(shot_folder), Rules(off=frozenset({"stabilize"})))
+
+    def denoise(aligned):
+        return Denoised(aligned.color[aligned.centre] * aligned.modulation)
+
+    denoiser = FrameDenoiser(stream, denoise, rows=20)
+    assert denoiser.make(1002).outliers == 3 * Scene.height // 20
