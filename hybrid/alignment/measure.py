@@ -147,6 +147,10 @@ class SmallFrame:
         return SmallFrame(self.factor, irradiance, light, None, self.valid)
 
 
+# `cv2.remap`, faster than `flow.warp`, refuses images of more pixels on a side.
+REMAPPED = 32766
+
+
 def shrink(frame: PreparedFrame) -> SmallFrame:
     """Reduce a frame to about `SHORT_SIDE` rows."""
     height, width = frame.irradiance.shape[:2]
@@ -437,6 +441,8 @@ def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Arra
 
 def _warp_block(image: Array, flow: Array, block: tuple[slice, slice]) -> Array:
     """A block of an image, warped along a flow of the whole frame; outside, the value of the border."""
+    if max(image.shape[:2]) > REMAPPED:
+        return np.asarray(warp(image, flow)[0][block], np.float32)
     rows, columns = (np.arange(size, dtype=np.float32)[part] for size, part in zip(flow.shape, block, strict=False))
     moved = flow[block]
     x, y = columns[None, :] + moved[..., 0], rows[:, None] + moved[..., 1]

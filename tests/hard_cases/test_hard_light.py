@@ -96,7 +96,7 @@ def test_identical_frames_are_one_frame():
     one = frame(MIDDLE)
     still = spoil(one, motion=np.zeros_like(one.motion))
     window, image = denoise([spoil(still, number=n) for n in range(5)])
-    assert window.confidence.min() > 1 - 1e-6  # the cosine of a normal with itself, in float32
+    assert (window.confidence[[0, 1, 3, 4]] == 0).all()  # equal samples count once
     assert within_range(window, image)
 
 
