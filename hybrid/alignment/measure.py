@@ -440,14 +440,27 @@ def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Arra
 
 
 def _warp_block(image: Array, flow: Array, block: tuple[slice, slice]) -> Array:
-    """A block of an image, warped along a flow of the whole frame; outside, the value of the border."""
-    if max(image.shape[:2]) > REMAPPED:
-        return np.asarray(warp(image, flow)[0][block], np.float32)
+    """Warp a block of an image along a flow of the whole frame; outside, the value of the border."""
     rows, columns = (np.arange(size, dtype=np.float32)[part] for size, part in zip(flow.shape, block, strict=False))
     moved = flow[block]
     x, y = columns[None, :] + moved[..., 0], rows[:, None] + moved[..., 1]
+    if max(image.shape[:2]) > REMAPPED:
+        top, bottom = _needed(y, image.shape[0])
+        left, right = _needed(x, image.shape[1])
+        whole, image, x, y = image, image[top:bottom, left:right], x - np.float32(left), y - np.float32(top)
+        if max(image.shape[:2]) > REMAPPED:
+            return np.asarray(warp(whole, flow)[0][block], np.float32)
     sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(sampled, np.float32).reshape(*moved.shape[:2], image.shape[-1])
+
+
+def _needed(places: Array, size: int) -> tuple[int, int]:
+    """First and last row or column of an image that bilinear samples at these places read."""
+    finite = places[np.isfinite(places)]
+    if not finite.size:
+        return 0, 1
+    first, last = np.clip([np.floor(finite.min()), np.ceil(finite.max()) + 1], 0, size - 1)
+    return int(first), int(last) + 1
 
 
 def _level(image: Array) -> Array:
