@@ -1,4 +1,4 @@
-"""The walls of the house: who may import whom, and what starts without torch."""
+"""The structure of the code: which package imports which, documented names, and what starts without torch."""
 
 import ast
 import re
@@ -183,6 +183,24 @@ def test_names_of_the_glossary_exist():
     assert defines("flow")
     assert not defines("hybrid.plan.NOTHING")
     assert not defines("hybrid.nothing")
+
+
+def test_names_of_the_architecture_exist():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## The calls of a frame")[2]
+    files = [path for package in sorted(OURS) for path in (ROOT / package).rglob("*.py")]
+    top: dict[str, list[ast.stmt]] = {}
+    for path in files:
+        top |= members(ast.parse(path.read_text(encoding="utf-8")).body)
+
+    def known(name: str) -> bool:
+        owner, _, member = name.partition(".")
+        inside = owner in top and (not member or member in members(top[owner]))
+        return inside or any(defines(f"{prefix}{name}") for prefix in ("", "hybrid.", "hybrid.alignment."))
+
+    names = re.findall(r"`([A-Za-z_][\w.]*)`", page)
+    assert len(names) > 40
+    assert [name for name in names if not known(name)] == []
+    assert not known("stream.FrameStream.lose")
 
 
 def public_functions(package: str) -> list[tuple[str, ast.FunctionDef]]:
