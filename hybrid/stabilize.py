@@ -80,6 +80,8 @@ class WindowResult:
         Of the centre's irradiance as rendered, or of the nearest frame with light.
     brightest : float
         The greatest mean radiance of the frames of the window.
+    excess : (H, W) array or None
+        By how much the centre as rendered exceeds the denoised one, relative to the light; with "blend-samples".
     repaired, fireflies, outliers : int
         As `AlignedWindow` has them, over all bands.
     """
@@ -91,6 +93,7 @@ class WindowResult:
     drift_weight: Array | None
     exposure: float
     brightest: float
+    excess: Array | None
     repaired: int
     fireflies: int
     outliers: int
@@ -232,14 +235,20 @@ class FrameDenoiser:
             layers.add(band, aligned.inner, {("sides", name): layer for name, layer in sides.items()})
         assert aligned is not None
         samples = layers.named("sides")
+        color = layers.named("color")[""]
+        frame, excess = stream.frame(number), None
+        if "blend-samples" in plan.stages and frame is not None:
+            with stream.timings.stage("blend-samples"):
+                excess = _excess(frame, color)
         return WindowResult(
-            Denoised(layers.named("color")[""], layers.named("aovs"), layers.named("extra"), denoised.parts),
+            Denoised(color, layers.named("aovs"), layers.named("extra"), denoised.parts),
             replace(plan, shares=aligned.shares),
             SampleMean(**samples) if samples else None,
             trust,
             layers.named("drift").get(""),
             exposure,
             brightest,
+            excess,
             aligned.repaired,
             aligned.fireflies,
             outliers,
@@ -289,15 +298,16 @@ class FrameDenoiser:
         step = self.stream.shot.step
         others = [n for n in (frame.number - step, frame.number + step) if n in self._results]
         with self.stream.timings.stage("blend-samples"):
-            excess = _excess(frame, self._results[frame.number].denoised.color)
+            excess = self._results[frame.number].excess
+            assert excess is not None
             bright = find_bright(excess)
             if not (others and bright.any()):
                 return denoised
             seen = np.zeros_like(bright)
             for n in others:
-                there = self.stream.frame(n)
-                assert there is not None
-                other = _excess(there, self._results[n].denoised.color)
+                other = self._results[n].excess
+                if other is None:
+                    continue
                 flow = self.stream.flow(frame.number, n)
                 seen |= confirmed_by_neighbour(
                     excess, bright, other, find_bright(other), None if flow is None else flow.vectors
