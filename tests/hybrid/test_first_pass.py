@@ -323,7 +323,7 @@ def test_pictures_are_not_kept_where_others_are_read_or_written(tmp_path, monkey
     words = ["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "oidn", "--keep-first-pass"]
     for place in (out, tmp_path / "noisy" / ".." / "out", out / "shot.%04d.exr"):
         assert main([*words, str(place)]) == 1
-        assert re.search("keep-estimates .* would overwrite output", capfd.readouterr().err)
+        assert re.search("keep-first-pass .* would overwrite output", capfd.readouterr().err)
     assert main([*words, str(folder)]) == 1
     assert "would overwrite an input" in capfd.readouterr().err
     assert not out.exists()

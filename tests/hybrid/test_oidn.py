@@ -73,7 +73,7 @@ def test_where_its_library_is_missing_auto_does_without_and_says_so(monkeypatch,
     assert "first pass: nlm (no denoised picture in the file, and " in said
     assert expected.get(how, "pyoidn does not work here: Device") in said
     assert main([*words, "oidn"]) == 1
-    assert "error: estimate oidn: pyoidn" in capsys.readouterr().err
+    assert "error: first pass oidn: pyoidn" in capsys.readouterr().err
 
 
 class TestDenoise:

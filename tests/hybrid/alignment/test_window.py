@@ -53,7 +53,7 @@ def test_colors_beside_estimates_are_those_without(tmp_path):
     assert "outliers" not in beside.stages
     assert (beside.confidence[2, 10:14, 20:24] == 0).all()
     np.testing.assert_array_equal(beside.color, without.color)
-    np.testing.assert_array_equal(beside.own, without.color[2])
+    np.testing.assert_array_equal(beside.centre_irradiance, without.color[2])
 
 
 def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
