@@ -1,6 +1,8 @@
 """Options and results reach what they are for: connections that could be cut without another test noticing."""
 
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +17,9 @@ from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
 from hybrid.commands.shots import open_input
 from hybrid.comparison.results import Comparison
+from hybrid.files.decode import decode_frame
 from hybrid.files.exr import read_exr
+from hybrid.files.replace import replace_file
 from hybrid.files.shots import open_matching_sequence, open_shot, output_path
 from hybrid.memory import plan_rows
 from hybrid.pipeline import View, denoise_frames
@@ -308,3 +312,37 @@ def test_the_outliers_of_all_bands_are_counted(shot_folder, monkeypatch):
 
     denoiser = FrameDenoiser(stream, denoise, rows=20)
     assert denoiser.make(1002).outliers == 3 * Scene.height // 20
+
+
+def test_a_frame_that_changes_while_it_is_read_is_an_error(shot_folder, monkeypatch):
+    """Half of it would be of the old file."""
+    shot = open_shot(shot_folder)
+
+    def decode_and_render(*args):
+        os.utime(shot.path(1002), (1, 1))
+        return decode_frame(*args)
+
+    monkeypatch.setattr("hybrid.files.reader.decode_frame", decode_and_render)
+    with pytest.raises(OSError, match="has changed since it was read"):
+        shot.read(1002)
+
+
+@pytest.mark.posix
+def test_a_run_removes_what_a_killed_one_has_left(denoise, tmp_path):
+    (tmp_path / "out").mkdir()
+    with replace_file(tmp_path / "out" / "shot.1002.exr") as temporary:
+        temporary.write_bytes(b"half")
+        shutil.copy(temporary, tmp_path / "half")
+        name = temporary.name
+    shutil.copy(tmp_path / "half", tmp_path / "out" / name)
+    denoise("out", "--preset", "draft")
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")] == []
+
+
+def test_the_status_of_a_sequence_is_not_that_of_its_folder(shot_folder, tmp_path, capsys):
+    for name, frames in (("a", "1001-1003"), ("b", "1002")):
+        words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out" / f"{name}.####.exr"), "--frames", frames]
+        assert main([*words, "--preset", "draft"]) == 0
+    capsys.readouterr()
+    assert main(["status", str(tmp_path / "out" / "b.####.exr"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["asked"] == [1002]

@@ -580,7 +580,7 @@ out, options = sys.argv[1], json.loads(sys.argv[2])
 print(sum(not frame.resumed for frame in denoise_shot(open_shot("in"), out, resume=True, **options)))
 """
 
-NETWORK_OPTIONS = {"preset": "fast", "first_pass": "nlm", "weights": "w.safetensors"}
+NETWORK_OPTIONS = {"preset": "fast", "weights": "w.safetensors"}
 
 
 @cases(({"no_stages": ["warp"]}, {"stages": ["refine"]}, {"first_pass": "nlm"}, NETWORK_OPTIONS), "then")
