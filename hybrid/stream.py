@@ -164,7 +164,9 @@ class FrameStream:
 
     def plan(self, numbers: Sequence[int], context: Context = NOISY) -> Plan:
         """Decide which stages run on these frames."""
-        return self.rules.decide(*self.measurements(numbers), context)
+        return self._cached(
+            f"plan {context}", tuple(numbers), lambda *n: self.rules.decide(*self.measurements(n), context)
+        )
 
     def flow(self, start: int, end: int) -> Flow | None:
         """Flow between neighbouring frames; None at a gap or a cut."""
