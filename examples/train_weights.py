@@ -5,8 +5,8 @@
 
 The shots are drawn from seeds (`ravg simulate random` and `hard`) and reproducible; no shot of the evaluation or of the
 tuning of ravg is among them. Each has a render of many samples, whose pseudo-references are the targets of the others.
-An interrupted run continues at the same shot, and trainings continue from their last checkpoint. docs/experiments.md
-lists the gains.
+An interrupted run continues at the same shot, and trainings continue from their last checkpoint.
+docs/dev/experiments.md lists the gains.
 """
 
 from __future__ import annotations

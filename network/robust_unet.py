@@ -36,7 +36,7 @@ AUX_CHANNELS = 5
 #: Initial weight of the robust average in an RA block.
 BLEND = 0.8
 #: Initial share of the average of first passes in the image, by the size of the backbone: less for better backbones.
-#: Found on four shots at two noise levels (docs/experiments.md).
+#: Found on four shots at two noise levels (docs/dev/experiments.md).
 AVERAGE_BLEND = {"small": 0.5, "base": 0.4, "large": 0.25}
 #: Networks of OIDN that a model of each size starts from. The first two accept noisy guides; the third, the only large
 #: one, needs clean guides.

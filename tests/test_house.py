@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+DEVELOPERS = ROOT / "docs" / "dev"
 OURS = {"loops", "flow", "nlm", "network", "hybrid", "ravg"}
 
 
@@ -67,7 +68,7 @@ def room_of(module: str) -> str:
 
 
 def test_the_map_shows_who_imports_whom():
-    rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", (ROOT / "docs" / "architecture.md").read_text(), re.M)
+    rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", (DEVELOPERS / "architecture.md").read_text(), re.M)
     drawn = {room: set() if names == "–" else set(names.split(", ")) for room, names in rows}
     built: dict[str, set[str]] = {}
     for path in (path for package in sorted(OURS) for path in (ROOT / package).rglob("*.py")):
@@ -173,7 +174,7 @@ def members(body: list[ast.stmt]) -> dict[str, list[ast.stmt]]:
 
 
 def test_names_of_the_glossary_exist():
-    page = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    page = (DEVELOPERS / "conventions.md").read_text(encoding="utf-8")
     glossary = page.partition("## Glossary")[2].partition("## Words")[0]
     cells = [line.strip("|").split("|")[-1] for line in glossary.splitlines() if line.startswith("| ")]
     cells = [cell for cell in cells if cell.strip() != "code"]
@@ -186,7 +187,7 @@ def test_names_of_the_glossary_exist():
 
 
 def test_names_of_the_architecture_exist():
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## The calls of a frame")[2]
+    page = (DEVELOPERS / "architecture.md").read_text(encoding="utf-8").partition("## The calls of a frame")[2]
     files = [path for package in sorted(OURS) for path in (ROOT / package).rglob("*.py")]
     top: dict[str, list[ast.stmt]] = {}
     for path in files:

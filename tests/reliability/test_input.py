@@ -1,4 +1,4 @@
-"""Odd, hostile and damaged input: rows 3, 11, 12, 13, 17, 18 and 20 of docs/reliability.md."""
+"""Odd, hostile and damaged input: rows 3, 11, 12, 13, 17, 18 and 20 of docs/dev/reliability.md."""
 
 # ruff: noqa: E501 - tables of cases, one a line
 

@@ -1,4 +1,4 @@
-"""No picture is silently wrong: rows 1, 2, 4, 5, 14 and 21 of docs/reliability.md."""
+"""No picture is silently wrong: rows 1, 2, 4, 5, 14 and 21 of docs/dev/reliability.md."""
 
 # ruff: noqa: E501 - tables of cases, one a line
 

@@ -1,4 +1,4 @@
-"""Nobody else's file is touched: rows 8, 9, 10 and 19 of docs/reliability.md."""
+"""Nobody else's file is touched: rows 8, 9, 10 and 19 of docs/dev/reliability.md."""
 
 # ruff: noqa: E501 - tables of cases, one a line
 

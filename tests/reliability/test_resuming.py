@@ -1,4 +1,4 @@
-"""A run makes what a fresh one would: rows 6, 7, 15, 16, 22, 23 and 24 of docs/reliability.md."""
+"""A run makes what a fresh one would: rows 6, 7, 15, 16, 22, 23 and 24 of docs/dev/reliability.md."""
 
 # ruff: noqa: E501 - tables of cases, one a line
 
