@@ -32,11 +32,7 @@ def median_luminance(color: np.ndarray) -> float:
 def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
     """Luminance on Reinhard's curve, L / (L + exposure), (H, W) float32 in [0, 1].
 
-    Parameters
-    ----------
-    color : (H, W, 3) float array
-        Linear radiance. Negative and NaN count as 0, Inf as white.
-    exposure : float, the radiance that maps to 0.5, positive
+    Negative and NaN count as 0, Inf as white.
     """
     if not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a positive number")
@@ -47,20 +43,12 @@ def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
 def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:
     """Estimate the local noise of an image from the image alone: standard deviation, float32, of its shape and unit.
 
-    Parameters
-    ----------
-    image : (H, W) or (H, W, C) float array, finite
-    spacing : int, distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter
+    `spacing` is the distance, pixels, at which the noise is independent: 1, or the diameter of an earlier filter.
 
-    Notes
-    -----
     The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, is blind to slopes and
-    to straight edges and has the noise's own deviation. Its magnitude is averaged over 15 x 15 pixels by the square of
+    to straight edges and has the noise's own deviation (Immerkær: Fast noise variance estimation. 1996.
+    doi:10.1006/cviu.1996.0060). Its magnitude is averaged over 15 x 15 pixels by the square of
     the mean root, to which outliers (corners, fireflies) add little. Texture of the size of a pixel counts as noise.
-
-    References
-    ----------
-    Immerkær: Fast noise variance estimation. 1996. doi:10.1006/cviu.1996.0060
     """
     if image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"image has shape {image.shape}, expected a non-empty (H, W) or (H, W, C)")
@@ -90,10 +78,7 @@ class GuidePair(NamedTuple):
 def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
     """Combine the guides of two frames for `flow.tvl1` and `flow.selection`; the greater noise counts.
 
-    Parameters
-    ----------
-    centre, neighbour : Guide
-        Of one shape. Non-finite values become 0 (+Inf: 1).
+    Non-finite values become 0 (+Inf: 1).
     """
     shape = centre.planes.shape
     if centre.planes.ndim != 3 or centre.planes.size == 0:
@@ -146,13 +131,7 @@ def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure:
 
 
 def smooth_tones(tone: np.ndarray, steer: np.ndarray | None = None) -> Guide:
-    """Smooth tone-mapped luminance within the surfaces of a steering image, or of itself: a guide of one plane.
-
-    Parameters
-    ----------
-    tone : (H, W) float32 array, in [0, 1]
-    steer : (H, W, up to 3) float32 array, optional, of a range of about 1
-    """
+    """Smooth tones (H, W) in [0, 1] within the surfaces of a steering image of a range of about 1, or of themselves."""
     # Contrasts of the steering image below the root of this are smoothed over. A picture's own noise is strong.
     tolerance = 1e-2 if steer is None else 1e-3
     smooth = np.clip(cv2.ximgproc.guidedFilter(tone if steer is None else steer, tone, _RADIUS, tolerance), 0, 1)

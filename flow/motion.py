@@ -38,10 +38,7 @@ ENCODINGS = {
 class MotionConvention:
     """The meaning of a renderer's motion vectors: v = scale · unit · (decode(c) + offset), y turned to point down.
 
-    Raises
-    ------
-    ValueError
-        If a word is unknown or a number is not finite.
+    Raises ValueError if a word is unknown or a number is not finite.
     """
 
     direction: str = "previous"  # a key of `DIRECTIONS`
@@ -147,10 +144,7 @@ def normalize_motion(
 def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Decode motion vectors into two-channel flows to the previous and the next frame, without unit, scale and y.
 
-    Parameters
-    ----------
-    vectors : (H, W, C) array of float, as rendered, C at least `convention.channels`
-    convention : MotionConvention, `MotionConvention.factors` makes pixels of the result
+    `MotionConvention.factors` makes pixels of the result.
     """
     size = convention.channels // (2 if convention.pair else 1)
     first = _decode(vectors[..., :size], convention)
@@ -300,12 +294,7 @@ def invert_flow(
 def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: int = 0) -> np.ndarray:
     """Measure the distance from start to end of a round trip, (H, W) float32, pixels: |f(x) + r(x + f(x))|.
 
-    Parameters
-    ----------
-    flow, reverse : (H, W, 2) array of float
-        Pixels, finite: centre to neighbour, possibly of some rows only, and back. Outside the frame r has its edge
-        value.
-    first_row : int, the frame's row that the first row of `flow` belongs to
+    The flow may be of the rows from `first_row` on; outside the frame r has its edge value.
     """
     loop, _ = warp(reverse, flow, first_row=first_row)
     loop += flow

@@ -228,23 +228,12 @@ def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:
 
 
 def keeps_change(inside: np.ndarray, still: np.ndarray) -> bool:
-    """Return whether most of the change without motion is inside.
-
-    Parameters
-    ----------
-    inside : (P,) bool array
-    still : (P,) float array, costs without motion
-    """
+    """Return whether most of the change without motion, of costs (P,), is inside."""
     return bool(inside.any()) and float(still[inside].sum()) >= INSIDE * float(still.sum())
 
 
 def mean_cost(costs: np.ndarray, still: np.ndarray) -> float:
-    """Return the mean cost; a patch outside costs as large a share of its cost without motion as those inside do.
-
-    Parameters
-    ----------
-    costs, still : (P,) float array, with a motion, NaN outside, and without
-    """
+    """Return the mean cost; patches outside (NaN) cost as large a share of their cost without motion as others."""
     inside = ~np.isnan(costs)
     if not keeps_change(inside, still):
         return float(still.mean())

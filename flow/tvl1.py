@@ -129,9 +129,7 @@ def dense_flow(guides: GuidePair) -> np.ndarray:
 def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
     """Estimate a flow (H, W, 2), pixels from later to earlier, on pictures reduced to `_ROUGH_PIXELS` pixels.
 
-    Parameters
-    ----------
-    earlier, later : (H, W) array, from `flow.guide.tone_map`
+    Both are from `flow.guide.tone_map`.
     """
     height, width = later.shape
     factor = min(1.0, float(np.sqrt(_ROUGH_PIXELS / (height * width))))

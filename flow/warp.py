@@ -27,13 +27,9 @@ class Place(NamedTuple):
 
 @njit(inline="always")
 def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
-    """Find the four pixels around a position; outside the frame those of its edge.
+    """Find the four pixels around a position, from the centre of the first pixel; outside the frame those of its edge.
 
-    Parameters
-    ----------
-    px, py : float32
-        Pixels, from the centre of the first pixel; NaN and infinities are outside.
-    width, height : int
+    NaN and infinities are outside.
     """
     # Written so that a NaN or infinite position fails the test.
     inside = px >= -0.5 and px <= width - 0.5 and py >= -0.5 and py <= height - 0.5
@@ -60,15 +56,7 @@ def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]
 def interpolate(
     image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
 ) -> np.float32:
-    """Sample a channel bilinearly.
-
-    Parameters
-    ----------
-    image : (H, W, C) float32 array
-    channel : int
-    place : Place, from `locate`
-    weights : tuple of float32, from `weigh`
-    """
+    """Sample a channel bilinearly at a place of `locate` with the weights of `weigh`."""
     # Unsigned: of a signed index numba asks each time whether it counts from the end.
     x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
     value: np.float32 = (

@@ -19,15 +19,9 @@ from numba import get_num_threads
 def run_bands(loop: Callable[..., None], count: int, *arguments: object) -> None:
     """Run a loop over `count` steps, most often rows, on as many threads as numba may use.
 
-    An error in a band is raised after all bands have ended.
-
-    Parameters
-    ----------
-    loop : callable
-        Compiled with ``nogil=True``, called as ``loop(first, last, *arguments)`` for bands that together are
-        ``range(count)``. It writes into its arguments; no two steps may write to the same place.
-    count : int
-    *arguments : object
+    The loop, compiled with ``nogil=True``, is called as ``loop(first, last, *arguments)`` for bands that together are
+    ``range(count)``. It writes into its arguments; no two steps may write to the same place. An error in a band is
+    raised after all bands have ended.
     """
     threads = max(min(get_num_threads(), count), 1)
     edges = [count * n // threads for n in range(threads + 1)]

@@ -97,18 +97,9 @@ def _configure(kind: type[Config], values: Mapping[str, Any]) -> Config:
 
 
 def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, Any] | None = None) -> None:
-    """Write a model in half precision; the file appears whole or not at all.
+    """Write a model in half precision, with JSON notes on its origin; the file appears whole or not at all.
 
     Raises ValueError if a weight is not finite, or more than `HEAVIEST`.
-
-    Parameters
-    ----------
-    path : path
-        The safetensors file.
-    model : Model
-        The model, in any precision.
-    notes : mapping, optional
-        Origin of the weights (training configuration, validation), as JSON values.
     """
     tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in model.state_dict().items()}
     for name, value in tensors.items():
@@ -147,15 +138,6 @@ def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Map
     """Write tensors over an empty file of `new_partial`, and keep its mode.
 
     safetensors replaces the file by one that only its owner may read, whatever the umask.
-
-    Parameters
-    ----------
-    path : Path
-        The empty file.
-    tensors : mapping of str to Tensor
-        By name.
-    metadata : mapping of str to str
-        For the header of the file.
     """
     mode = stat.S_IMODE(path.stat().st_mode)
     save_file(dict(tensors), path, dict(metadata))

@@ -1,8 +1,6 @@
 """Weights of Intel Open Image Denoise (OIDN), read from the library that the package ``pyoidn`` installs.
 
-References
-----------
-The weights are those of RenderKit/oidn-weights, Apache-2.0 (see NOTICE). None of them is part of this module.
+They are those of RenderKit/oidn-weights, Apache-2.0 (see NOTICE). None of them is part of this module.
 """
 
 from __future__ import annotations
@@ -41,23 +39,12 @@ _TZA = struct.pack("<HBB", 0x41D7, 2, 0)
 
 
 def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
-    """Read the tensors of a TZA file, OIDN's archive of weights.
+    """Read the tensors of a TZA file, OIDN's archive of weights: float32, in the order of the file, that of the layers.
 
-    Returns float32 tensors in the order of the file, which is the order of the layers. Raises ValueError if data is no
-    TZA file, is cut short, or holds numbers that are not finite.
-
-    Parameters
-    ----------
-    data : bytes
-        The file, of version 2.
-    where : str
-        Name of the file in error messages.
-
-    Notes
-    -----
-    All little-endian. Magic 0x41D7 (uint16), version (2 × uint8), offset of the table (uint64); in the table the number
-    of tensors (uint32), and for each the length of its name (uint16), the name, the number of dimensions (uint8), sizes
-    (uint32), layout (a letter each), type (``f`` or ``h``), offset of the values (uint64).
+    All little-endian. Magic 0x41D7 (uint16), version (2 × uint8, 2.0), offset of the table (uint64); in the table the
+    number of tensors (uint32), and for each the length of its name (uint16), the name, the number of dimensions
+    (uint8), sizes (uint32), layout (a letter each), type (``f`` or ``h``), offset of the values (uint64). `where` names
+    the file in errors: ValueError if data is no TZA file, is cut short, or holds numbers that are not finite.
     """
     position = 0
 
@@ -98,17 +85,9 @@ def read_tza(data: bytes | memoryview, where: str = "TZA") -> dict[str, Tensor]:
 
 
 def build_unet(tensors: dict[str, Tensor], where: str = "TZA") -> OidnUNet:
-    """Build the U-Net that the tensors of a TZA file belong to.
+    """Build the U-Net, in float32, that the tensors of a TZA file belong to.
 
-    Returns a float32 network with these weights. Raises ValueError if the shapes are not those of a small, base or
-    large U-Net.
-
-    Parameters
-    ----------
-    tensors : dict of Tensor
-        From `read_tza`.
-    where : str
-        Name of the file in error messages.
+    Raises ValueError if the shapes are not those of a small, base or large U-Net.
     """
     found = [tuple(value.shape) for value in tensors.values()]
     inputs = found[0][1] if found and len(found[0]) == 4 else 1

@@ -51,18 +51,9 @@ PRESETS: dict[str, Preset] = {
 
 
 def build_preset(name: str, frames: int | None = None, seed: int = 0) -> Model:
-    """Build a network of `PRESETS` with initial weights; the global generator is left as it was.
+    """Build a network of `PRESETS` with initial weights, in training mode; the global generator is left as it was.
 
-    The network is in training mode. Raises ValueError if there is no such preset.
-
-    Parameters
-    ----------
-    name : str
-        Of `PRESETS`.
-    frames : int, optional
-        Length of the windows, odd. Default: the preset's.
-    seed : int
-        Of the initial weights.
+    Raises ValueError if there is no such preset.
     """
     if name not in PRESETS:
         raise ValueError(f"preset is {name!r}, expected one of {', '.join(PRESETS)}")

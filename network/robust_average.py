@@ -20,16 +20,10 @@ def ravg(frames: Sequence[Tensor]) -> Tensor:
     """Mean of tensors of one shape after discarding the minimum and the maximum of each element.
 
     Returns the mean of two frames, and a single frame itself. Raises ValueError without frames.
-
-    Notes
-    -----
     ``ravg(S) = (Σ x − max(S) − min(S)) / (|S| − 2)`` for ``|S| ≥ 3``, computed without forming ``Σ x``: beside
     an outlier of 1e6 the subtraction would leave nothing of the other values in half precision. Where several
-    values are equally extreme, one of them gets the gradient.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, "Robust Average Networks for Monte Carlo Denoising", section 3, equation 1.
+    values are equally extreme, one of them gets the gradient. Kalojanov and Thurston 2023, "Robust Average Networks for
+    Monte Carlo Denoising", section 3, equation 1.
     """
     if len(frames) == 0:
         raise ValueError("frames: expected at least one tensor, got none")
@@ -108,17 +102,8 @@ class _MeanOfMiddleTwo(torch.autograd.Function):
 
 
 class ChannelAverage(nn.Module):
-    """Robust Average block with one weight per channel, the same in all pixels.
+    """Robust Average block with one weight per channel, at first `blend`, the same in all pixels.
 
-    Parameters
-    ----------
-    channels : int
-        Width of the features.
-    blend : float
-        In (0, 1): initial weight of the robust average.
-
-    Notes
-    -----
     For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place:
     ``a = ravg(x_j, j ≠ i)``, ``x_i ← (1 − w) x_i + w a``, with ``w = sigmoid(b)``, b learned. Without gradients, on a
     CPU, the block is one pass over memory (`network.cpu.fused_ops`), where torch needs one for each of forty

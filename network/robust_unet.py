@@ -161,13 +161,6 @@ class UNetOutput:
 class RobustUNet(nn.Module):
     """OIDN's U-Net over a window of frames, fused by RA blocks.
 
-    Parameters
-    ----------
-    config : RobustUNetConfig
-        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large"), and some thousands beside the backbone.
-
-    Notes
-    -----
     The frames share the encoder up to the last RA block; all later layers see the centre alone. The first block stands
     *before* the first ReLU: a convolution of an average is the average of convolutions, so that before any training
     the network gives the same as on samples that were pooled beforehand. The skip connection from the input to the last
@@ -175,7 +168,8 @@ class RobustUNet(nn.Module):
 
     Further input channels (`AUX_CHANNELS`) enter the first convolution with weights of 0. RA blocks start at `BLEND`,
     learned for each channel. The image is blended with the average of first passes, whose errors are different
-    (`AVERAGE_BLEND`), by a share that training can make vary by pixel.
+    (`AVERAGE_BLEND`), by a share that training can make vary by pixel. There are some thousands of parameters beside
+    the backbone's 0.32 M ("small"), 0.92 M ("base") or 3.85 M ("large").
     """
 
     def __init__(self, config: RobustUNetConfig) -> None:
@@ -204,21 +198,10 @@ class RobustUNet(nn.Module):
         return self.config.frames
 
     def forward(self, frames: Tensor, shared: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
-        """Make the image of the centre.
+        """Make the image of the centre from `PackedInputs`: ``(N, 3, H, W)`` on the transfer curve, and ``(N, 1, H,
+        W)`` in (0, 1), the share of the average of first passes.
 
         Raises ValueError if frames are not the model's, or height or width is no multiple of 16.
-
-        Parameters
-        ----------
-        frames, shared, static : Tensor
-            Of `PackedInputs`.
-
-        Returns
-        -------
-        image : Tensor
-            ``(N, 3, H, W)`` on the transfer curve.
-        blend : Tensor
-            ``(N, 1, H, W)`` in (0, 1): share of the average of first passes.
         """
         self.expect_frames(len(frames) // len(shared))
         check_size("frames", static, self.multiple)
@@ -238,12 +221,7 @@ class RobustUNet(nn.Module):
         """Run the finest scale of the encoder and its RA block; a row depends on two rows on each side.
 
         Returns the input of the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all
-        frames are fused.
-
-        Parameters
-        ----------
-        frames, shared : Tensor
-            Of `PackedInputs`, of any even height.
+        frames are fused. The height may be any even one.
         """
         count, last = self.frames, self._last_fused
         first, aux, layout = self.backbone.first, self.aux_conv.weight, torch.channels_last
@@ -260,20 +238,7 @@ class RobustUNet(nn.Module):
         return functional.max_pool2d(cast(Stage, self.backbone.encoder[0]).after_first(x), 2)
 
     def decode(self, x: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
-        """Run all layers behind `encode_and_fuse`.
-
-        Parameters
-        ----------
-        x : Tensor
-            From `encode_and_fuse`.
-        static : Tensor
-            Of `PackedInputs`.
-
-        Returns
-        -------
-        image, blend : Tensor
-            As of `forward`.
-        """
+        """Run all layers behind `encode_and_fuse`; the image and the share as of `forward`."""
         count, coarsest = self.frames, len(self.backbone.encoder) - 1
         skips = [static]
         for scale in range(1, coarsest + 1):
@@ -308,25 +273,12 @@ def denoise_window(
     *,
     borders: Borders = ((0, 0), (0, 0)),
 ) -> UNetOutput:
-    """Run a model on an aligned window.
+    """Run a model, or with gradients `run` where it is wrapped, on an aligned window; the output has the window's size.
 
-    The output has the size of the window. Raises ValueError if the window has another number of frames.
-
-    Parameters
-    ----------
-    model : RobustUNet
-        The model.
-    window : UNetWindow
-        Of the model's number of frames.
-    run : callable, optional
-        Called with gradients instead of the model, where it is wrapped (distributed, compiled).
-    borders : pairs of int
-        Pixels by which the window is mirrored beyond its borders.
-
-    Notes
-    -----
-    Without gradients all work at full size runs in strips (`network.strips`), so that the features of all frames are
-    never in memory at once; on a CPU the inputs are packed in one pass (`network.cpu.input_packing`).
+    `borders` are the pixels by which the window is mirrored beyond its borders. Without gradients all work at full size
+    runs in strips (`network.strips`), so that the features of all frames are never in memory at once; on a CPU the
+    inputs are packed in one pass (`network.cpu.input_packing`). Raises ValueError if the window has another number of
+    frames.
     """
     model.expect_frames(window.confidence.shape[1])
     height, width = window.modulation.shape[-2:]
@@ -382,12 +334,7 @@ def start_from_oidn(model: RobustUNet) -> RobustUNet:
 def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
     """Prepare a model for running: channels last, no gradients; changes and returns it.
 
-    Parameters
-    ----------
-    model : RobustUNet
-        Changed in place.
-    bfloat16 : bool
-        Round weights (`network.bfloat16.round_unet`); pays only on processors that compute in bfloat16.
+    `bfloat16` rounds weights (`network.bfloat16.round_unet`); it pays only on processors that compute in bfloat16.
     """
     model.eval().requires_grad_(False)
     if bfloat16:

@@ -16,21 +16,8 @@ def in_strips(
 ) -> list[Tensor]:
     """Run a local function strip by strip and join the results; with gradients, on all rows at once.
 
-    Returns the results for all rows.
-
-    Parameters
-    ----------
-    run : callable
-        From layers to layers.
-    margin : int
-        Rows of the finest layer that an output row depends on, on each side.
-    *layers : Tensor
-        ``(..., H, W)``; coarser layers have H / 2, H / 4, ... rows.
-    all_frames : bool
-        Whether the layers hold all frames of a window; strips then have half as many rows.
-
-    Notes
-    -----
+    `margin` is how many rows of the finest layer an output row depends on, on each side; layers are ``(..., H, W)``,
+    coarser ones with H / 2, H / 4, ... rows. With layers of all frames of a window strips have half as many rows.
     Convolutions of 32 channels take 0.6 of the time that they take on a whole frame, and no more than the features of a
     strip is in memory.
     """

@@ -45,13 +45,5 @@ def srgb_inverse(encoded: Tensor) -> Tensor:
 
 
 def clip(x: Tensor, low: float, high: float) -> Tensor:
-    """Clip to [low, high]; NaN becomes 0.
-
-    Parameters
-    ----------
-    x : Tensor
-        Any shape.
-    low, high : float
-        Bounds.
-    """
+    """Clip to [low, high]; NaN becomes 0."""
     return x.nan_to_num(0, high, low).clamp(low, high)

@@ -1,7 +1,5 @@
 """The U-Net of Intel Open Image Denoise (OIDN): the network, and denoising of single frames as OIDN does it.
 
-References
-----------
 Áfra 2025, "Intel Open Image Denoise", https://www.openimagedenoise.org. Network, exposure and transfer curve are those
 of ``training/`` in RenderKit/oidn, Apache-2.0 (see NOTICE).
 """
@@ -52,13 +50,7 @@ class OidnUNetConfig:
 
 
 class OidnUNet(nn.Module):
-    """OIDN's U-Net: 3×3 convolutions at five scales, with skip connections from the input of each encoder scale.
-
-    Parameters
-    ----------
-    config : OidnUNetConfig
-        0.32 M parameters ("small"), 0.92 M ("base") or 3.85 M ("large").
-    """
+    """OIDN's U-Net: 3×3 convolutions at five scales, with skip connections from the input of each encoder scale."""
 
     #: Height and width must be multiples of this.
     multiple = 16
@@ -109,15 +101,8 @@ class OidnUNet(nn.Module):
     def decode(self, x: Tensor, skips: Sequence[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
         """Run the decoder, and a head on its finest features. Returns the head's outputs.
 
-        Parameters
-        ----------
-        x : Tensor
-            Features of the coarsest scale, from `encode`.
-        skips : sequence of Tensor
-            Inputs of the finer scales, from `encode`; the first is the input of the network, not rounded.
-        head : callable
-            From ``(N, width, H, W)`` features of the finest scale, or some of their rows, to ``(N, ., H, W)`` outputs
-            that depend on one further row at most.
+        `x` and `skips` are those of `encode`; the first skip is the input of the network, not rounded. The head maps
+        ``(N, width, H, W)`` features, or some of their rows, to outputs that depend on one further row at most.
         """
         stages = (cast(Stage, stage) for stage in self.decoder)
         *coarse, (finest, network_input) = zip(stages, reversed(skips), strict=True)
@@ -194,17 +179,7 @@ def _convolve_and_halve(stage: Stage, x: Tensor) -> list[Tensor]:
 
 
 def check_size(name: str, layer: Tensor, multiple: int) -> None:
-    """Raise ValueError unless height and width are positive multiples of a number.
-
-    Parameters
-    ----------
-    name : str
-        Name of the layer in the message.
-    layer : Tensor
-        ``(..., H, W)``.
-    multiple : int
-        The number.
-    """
+    """Raise ValueError unless height and width of a named layer ``(..., H, W)`` are positive multiples of a number."""
     for axis, length in zip(("height", "width"), layer.shape[-2:], strict=True):
         if length == 0 or length % multiple:
             raise ValueError(f"{name}: expected a {axis} that is a multiple of {multiple}, got {length}")
@@ -214,21 +189,11 @@ def check_size(name: str, layer: Tensor, multiple: int) -> None:
 def denoise_color(
     unet: OidnUNet, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None, *, exposure: float
 ) -> Tensor:
-    """Denoise images as OIDN does.
+    """Denoise images as OIDN does: ``(N, 3, H, W)`` linear radiance, float32, at least 0.
 
-    Returns ``(N, 3, H, W)`` linear radiance, float32, at least 0. Raises ValueError if the inputs are not as many as
-    the network's, or differ in shape.
-
-    Parameters
-    ----------
-    unet : OidnUNet
-        With weights for these inputs, in any precision.
-    color : Tensor
-        ``(N, 3, H, W)`` linear radiance, float32; NaN and negative values count as 0.
-    albedo, normal : Tensor, optional
-        Likewise; albedo in [0, 1], normals in [−1, 1] in any fixed space, clipped to these ranges.
-    exposure : float
-        Factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`).
+    NaN and negative values of the color count as 0; albedo is clipped to [0, 1], normals in any fixed space to [−1, 1].
+    The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`). Raises
+    ValueError if the inputs are not as many as the network's, or differ in shape.
     """
     layers = [(color, lambda x: pu_forward(clip(x * exposure, 0, LARGEST)))]
     if albedo is not None:
@@ -240,29 +205,13 @@ def denoise_color(
 
 @torch.inference_mode()
 def denoise_albedo(unet: OidnUNet, albedo: Tensor) -> Tensor:
-    """Denoise albedo by itself.
-
-    Parameters
-    ----------
-    unet : OidnUNet
-        With OIDN's weights for albedo.
-    albedo : Tensor
-        ``(N, 3, H, W)`` in [0, 1].
-    """
+    """Denoise albedo ``(N, 3, H, W)`` in [0, 1] by itself, with OIDN's weights for albedo."""
     return _run(unet, [(albedo, lambda x: srgb_forward(clip(x, 0, 1)))], lambda x: srgb_inverse(x.clamp(0, 1)))
 
 
 @torch.inference_mode()
 def denoise_normal(unet: OidnUNet, normal: Tensor) -> Tensor:
-    """Denoise normals by themselves.
-
-    Parameters
-    ----------
-    unet : OidnUNet
-        With OIDN's weights for normals.
-    normal : Tensor
-        ``(N, 3, H, W)`` in [−1, 1].
-    """
+    """Denoise normals ``(N, 3, H, W)`` in [−1, 1] by themselves, with OIDN's weights for normals."""
     return _run(unet, [(normal, normal_to_unit)], lambda x: x.clamp(0, 1) * 2 - 1)
 
 

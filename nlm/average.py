@@ -20,13 +20,7 @@ _SPARK = np.float32(100)
 
 
 def average(window: Floats, weight: Floats) -> Floats:
-    """Average an aligned window (T, H, W, C) by weight; the centre's value (H, W, C) where all weights are 0.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) float32
-    weight : (T, H, W) float32, at least 0
-    """
+    """Average an aligned window (T, H, W, C) by weight; the centre's value (H, W, C) where all weights are 0."""
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
     run_bands(_average, len(out), window, weight, out)
@@ -34,28 +28,16 @@ def average(window: Floats, weight: Floats) -> Floats:
 
 
 def robust_average(window: Floats, weight: Floats) -> Floats:
-    """Average an aligned window without each pixel's minimum and maximum.
+    """Average an aligned window without each pixel's minimum and maximum; the centre's value where all weights are 0.
 
-    Returns (H, W, C) float32, the centre's value where all weights are 0.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) float32
-    weight : (T, H, W) float32, at least 0
-
-    Notes
-    -----
-    For n ≥ 3 equal weights: ravg(S) = (Σ S − min S − max S) / (n − 2). With unequal weights the minimum and the maximum
+    For n ≥ 3 equal weights: ravg(S) = (Σ S − min S − max S) / (n − 2), the "Robust Average Blocks" of Kalojanov and
+    Thurston, Robust Average Networks for Monte Carlo Denoising. With unequal weights the minimum and the maximum
     lose the share clamp(Σw / max w − 2, 0, 1) of their weight, so that a trusted centre is never discarded in favour of
     frames of little weight. Values are ordered channel by channel, as in the paper; ordering whole pixels by luminance
     costs 0.02 dB on Cycles renders and biases the colour as much.
 
     The noise of path tracing is skewed, so the result is darker than the mean: by 1.5 to 7 % at 10 to 30 samples a
     pixel, by a third where most samples are 0. `average` after `reject_outliers` keeps the energy.
-
-    References
-    ----------
-    Kalojanov and Thurston, Robust Average Networks for Monte Carlo Denoising, "Robust Average Blocks".
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
@@ -64,17 +46,9 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
 
 
 def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
-    """Replace fireflies: values far above all neighbours in space and time.
+    """Replace fireflies, values far above all neighbours in space and time: a cleaned copy, and where it was replaced.
 
-    Parameters
-    ----------
-    window : (T, H, W, C) float32
-    weight : (T, H, W) float32, a pixel of weight 0 is neither evidence nor replaced
-
-    Returns
-    -------
-    cleaned : (T, H, W, C) float32, a copy of the window with outliers replaced
-    mask : (T, H, W) bool, True where a value was replaced
+    A pixel of weight 0 is neither evidence nor replaced.
 
     Notes
     -----
@@ -99,17 +73,10 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
 
 
 def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
-    """Fill pixels that hold NaN or infinities from the nearest finite pixels.
+    """Fill pixels that hold NaN or infinities in any channel; return a finite copy, and where (H, W) it was filled.
 
-    Parameters
-    ----------
-    image : (H, W, C) float32, a pixel counts as non-finite if any of its channels is
-
-    Returns
-    -------
-    filled : (H, W, C) float32
-        A finite copy, filled by a normalised box filter whose radius doubles; 0 if no pixel is finite.
-    mask : (H, W) bool, True where a pixel was replaced
+    Values come from the nearest finite pixels, by a normalised box filter whose radius doubles; 0 if no pixel is
+    finite.
     """
     if image.ndim != 3:
         raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
@@ -136,14 +103,7 @@ def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
 
 
 def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[Floats, Floats]:
-    """Return window and weights as contiguous float32; ValueError if shapes do not fit or T is even.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) array
-    weight : (T, H, W) array
-    name : str, name of the weights in the error
-    """
+    """Return window and weights as contiguous float32; ValueError, with their name, if shapes differ or T is even."""
     if window.ndim != 4 or window.shape[0] % 2 == 0:
         raise ValueError(f"window: expected (frames, height, width, channels) with odd frames, got {window.shape}")
     if weight.shape != window.shape[:3]:

@@ -84,19 +84,9 @@ def drift_weights(
 
 
 def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats) -> None:
-    """Pull estimates towards the centre's, in place, so that their average is as if confidence were multiplied by
-    `weight`.
+    """Pull estimates (T, H, W, 3) to the centre's, in place, so that their average is as if confidence were multiplied.
 
-    Samples and all else that is averaged keep their confidence.
-
-    Parameters
-    ----------
-    estimates : (T, H, W, 3) float32
-    confidence : (T, H, W) float32
-    weight : (T, H, W) float32, from `drift_weights`
-
-    Notes
-    -----
+    The factor `weight` is that of `drift_weights`. Samples and all else that is averaged keep their confidence:
     e_s becomes e_t + m_s (e_s − e_t), m_s = w_s Σ c / Σ c w. This moves near frames away from the centre by a third at
     most in windows of seven; only the average matters.
     """

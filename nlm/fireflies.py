@@ -66,17 +66,8 @@ def nearest_pixel(points: Points) -> Places:
 def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
     """Find fireflies, and pixels that would be fireflies but for one pixel of the ring: candidates for highlights.
 
-    Parameters
-    ----------
-    color : (H, W, C) float32, radiance or irradiance, finite
+    Returns row and column (K, 2) of the brightest pixel of each, and (K,) True for a firefly. The color is finite.
 
-    Returns
-    -------
-    places : (K, 2) intp, row and column of the brightest pixel of each
-    isolated : (K,) bool, True for a firefly
-
-    Notes
-    -----
     In the mean over channels, a pixel that no other of its 3×3 exceeds is a firefly where it is above 16 times the
     brightest and 64 times the mean of the 5×5 ring around these: a renderer's pixel filter may spread a sample over 3×3
     pixels. Where the ring is black nothing is found: there a spark may be all the light.
@@ -118,28 +109,14 @@ def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = No
 
 
 def follow_motion(lights: Highlights, moved: Points) -> Places:
-    """Return the pixels (K, 2) that highlights reach with the motion.
-
-    Parameters
-    ----------
-    lights : Highlights
-    moved : (K, 2) float64, rows and columns
-    """
+    """Return the pixels (K, 2) that highlights reach with the motion to (K, 2) rows and columns."""
     straight = lights.pixels + nearest_pixel(moved)
     return np.where(_same_phase(moved)[:, None], straight, nearest_pixel(lights.points + moved))
 
 
 def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask:
-    """Return where a neighbouring frame shows the same highlight (K,).
+    """Return where (K,) a neighbouring frame shows the same highlight as the first, which `moved` leads to.
 
-    Parameters
-    ----------
-    first : Highlights, of the frame
-    moved : (K, 2) float64, motion to the neighbour, rows and columns
-    second : Highlights, measured in the neighbour at the moved position
-
-    Notes
-    -----
     Within 0.75 pixels of the moved position, with 0.6 to 1.7 times the light: Σ |a − b| ≤ Σ (a + b) / 4 over channels.
     """
     far = np.hypot(*(second.points - first.points - moved).T)
@@ -148,17 +125,8 @@ def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask
 
 
 def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: Floats) -> Mask:
-    """Return around which highlights (K,) the neighbouring frame has no bright samples of its lights.
+    """Return around which highlights (K,) of a frame the other frame has no bright samples of its lights at `pixels`.
 
-    Parameters
-    ----------
-    lights : Highlights, of the frame, within it
-    color : (H, W, C) float32, the frame, finite
-    pixels : (K, 2) intp, moved positions in the neighbour
-    other : (H, W, C) float32, the neighbour, finite
-
-    Notes
-    -----
     At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
     frame has no pixel above an eighth within a pixel's distance.
     """
@@ -172,14 +140,8 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
 
 
 def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
-    """Return which bright samples (K,) recur: the neighbour has a quarter of the brightness within 3 pixels.
-
-    Parameters
-    ----------
-    places : (K, 2) intp, from `find_bright_samples` on `color`
-    color : (H, W, C) float32, the frame, finite
-    pixels : (K, 2) intp, moved positions in the neighbour
-    other : (H, W, C) float32, the neighbour, finite
+    """Return which bright samples (K,) recur: at `pixels` the other frame has a quarter of the brightness within 3
+    pixels.
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
     brightest = cv2.dilate(_level(other), np.ones((SPREAD, SPREAD), np.uint8))
@@ -188,18 +150,10 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
 
 
 def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Points, Mask]]) -> Highlights:
-    """Average the light of highlights over the frames that show them, with equal weights.
+    """Average the light of highlights over the frames that show them, with equal weights, at the positions of `lights`.
 
-    Parameters
-    ----------
-    lights : Highlights, of the frame
-    others : sequence of (Highlights, (K, 2) float64, (K,) bool)
-        Measured in other frames, the motion there, and where the other frame shows the same highlight.
-
-    Returns
-    -------
-    Highlights
-        Positions of `lights`. Patterns of frames with another place in the pixel are left out; a pattern sums to 1.
+    Others are measured in other frames, with the motion there, and where (K,) they are the same. Patterns of frames
+    with another place in the pixel are left out; a pattern sums to 1.
     """
     light, count, pattern = (
         lights.light.astype(np.float64),
@@ -218,13 +172,7 @@ def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Po
 
 
 def add_highlights(picture: Floats, lights: Highlights) -> Floats:
-    """Return radiance (H, W, C) with highlights added by their patterns.
-
-    Parameters
-    ----------
-    picture : (H, W, C) float32
-    lights : Highlights, from `average_highlights`
-    """
+    """Return radiance (H, W, C) with highlights of `average_highlights` added by their patterns."""
     brighter = picture.copy()
     blocks = _blocks(lights.pixels, picture.shape, 3)
     for rows, columns, inside, light, pattern in zip(*blocks, lights.light, lights.pattern, strict=True):
@@ -233,13 +181,7 @@ def add_highlights(picture: Floats, lights: Highlights) -> Floats:
 
 
 def remove_highlights(color: Floats, pixels: Places) -> Floats:
-    """Return radiance or irradiance (H, W, C) with the 3×3 pixels of each highlight replaced by its surroundings.
-
-    Parameters
-    ----------
-    color : (H, W, C) float32, finite
-    pixels : (K, 2) intp
-    """
+    """Return radiance or irradiance (H, W, C) with the 3×3 pixels of each highlight replaced by its surroundings."""
     rows, columns, inside = _blocks(pixels, color.shape)
     around, core = _around(color[rows, columns].astype(np.float64), inside), inside[:, 1:4, 1:4]
     clean = color.copy()
@@ -248,14 +190,9 @@ def remove_highlights(color: Floats, pixels: Places) -> Floats:
 
 
 def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
-    """Clamp a denoised picture (H, W, C) around highlights to the brightest pixel of the surrounding ring.
+    """Clamp a denoised picture (H, W, C) around highlights to the brightest pixel of the ring around a halo's radius.
 
-    Parameters
-    ----------
-    picture : (H, W, C) float32
-    places : (K, 2) intp
-    radius : int
-        Of the halo, pixels; ring pixels as near to another place do not count.
+    Ring pixels as near to another place do not count.
     """
     held = picture.copy()
     middles = np.zeros(picture.shape[:2], np.uint8)
@@ -273,18 +210,9 @@ def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
 def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, float]:
     """Replace fireflies by the mean of the ring around them, which leaves neither a dark hole nor a halo.
 
-    Parameters
-    ----------
-    color : (H, W, C) float32
-    places : (K, 2) intp
-
-    Returns
-    -------
-    cleaned : (H, W, C) float32
-        A copy; of the 3×3 around a place those pixels are replaced that are above four times the brightest of the ring.
-    replaced : (H, W) bool
-    removed : float
-        Removed share of the frame's light, in [0, 1]; in expectation this light belongs to the picture.
+    Returns a copy, where (H, W) it was replaced, and the removed share of the frame's light, in [0, 1]; in expectation
+    this light belongs to the picture. Of the 3×3 around a place those pixels are replaced that are above four times the
+    brightest of the ring.
     """
     cleaned, replaced = color.copy(), np.zeros(color.shape[:2], bool)
     level = _level(color)

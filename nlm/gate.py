@@ -24,14 +24,7 @@ SHARE, _FLOOR = 0.3, 0.004
 
 
 def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
-    """Return the weights (T, H, W) of `color_gates` for the share 0.3.
-
-    Parameters
-    ----------
-    estimates : (T, H, W, 3) float32
-    noisy : (H, W, 3) float32
-    exposure : float
-    """
+    """Return the weights (T, H, W) of `color_gates` for the share 0.3."""
     return color_gates(estimates, noisy, exposure, (SHARE,))[0]
 
 

@@ -37,12 +37,6 @@ def find_bright(excess: Floats) -> Mask:
 def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
     """Find the motions, rows and columns, that many bright pixels of one frame share on the way to another.
 
-    Parameters
-    ----------
-    here, there : (H, W) bool, from `find_bright`
-
-    Notes
-    -----
     The cross-correlation of both masks counts the pixels of each motion. Independent bright pixels, N and M of A, give
     N M / A with Poisson's deviation. Motions of at most one pixel are left out: noise of one seed has these too.
     """

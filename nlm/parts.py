@@ -32,14 +32,7 @@ _ROUNDS = 3
 
 
 def sums_to(parts: Sequence[Floats], whole: Floats, exposure: float) -> bool:
-    """Return whether layers add up to a picture: 95 % of all values within 0.5 %.
-
-    Parameters
-    ----------
-    parts : sequence of (..., C) float32, as rendered, times albedo for a layer that is rendered without
-    whole : (..., C) float32
-    exposure : float
-    """
+    """Return whether layers, times albedo where rendered without, add up to a picture: 95 % of values within 0.5 %."""
     total = np.zeros_like(whole)
     for part in parts:
         total += part
@@ -54,26 +47,15 @@ def few_differ(share: float) -> bool:
 
 
 def share_outside(part: Floats, whole: Floats, exposure: float) -> float:
-    """Return the share of values, in [0, 1], in which a layer is negative or above the picture.
-
-    Parameters
-    ----------
-    part, whole : (..., C) float32, as rendered
-    exposure : float
-    """
+    """Return the share of values, in [0, 1], in which a layer is negative or above the picture."""
     slack = np.float32(_NEAR) * (np.abs(whole) + np.float32(exposure))
     return float(1 - ((part <= whole + slack) & (part >= -slack)).mean())
 
 
 def shares_noise(part: Floats, whole: Floats) -> bool:
-    """Return whether a picture contains a layer's noise: the regression of second differences has a slope of a half or
-    more.
+    """Return whether a picture contains a layer's noise: the slope of second differences is a half or more.
 
-    The slope is 1 for a part and 0 for other light.
-
-    Parameters
-    ----------
-    part, whole : (H, W, 3) float32, as rendered, finite
+    The slope of the regression is 1 for a part and 0 for other light. Both are (H, W, 3) as rendered, finite.
     """
     of_part, of_whole = (_second_differences(layer).astype(np.float64) for layer in (part, whole))
     # Clipped near the median: a single bright sample must not decide.
@@ -103,11 +85,6 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
     """Return whether a layer includes the albedo: the slope of layer/mean on albedo/mean is a half or more.
 
     Means are over 9×9 pixels; the slope is 1 for albedo times light, and 0 for light alone.
-
-    Parameters
-    ----------
-    layer : (H, W, C) float32, as rendered, finite
-    albedo : (H, W, 3) float32, in [0, 1]
     """
     color = albedo if layer.shape[-1] == albedo.shape[-1] else albedo.mean(axis=-1, keepdims=True)
     light, level = np.abs(_blur(layer)), _blur(color)
@@ -122,22 +99,13 @@ def is_textured(layer: Floats, albedo: Floats) -> bool:
 
 
 def find_sums(layers: Sequence[Floats], whole: Floats, exposure: float) -> list[tuple[int, ...]]:
-    """Find disjoint sets of layers that add up to a picture, those of the fewest layers first.
+    """Find disjoint sets of layers, tuples of their indices, that add up to a picture, those of the fewest layers
+    first.
 
-    Returns a list of sets, each a tuple of indices of layers.
-
-    Parameters
-    ----------
-    layers : sequence of (..., C) float32
-        As for `sums_to`; negative light is allowed.
-    whole : (..., C) float32
-    exposure : float
-
-    Notes
-    -----
     A depth-first search. All sums that continue a partial set lie between its sum with all negative and its
     sum with all positive values of the undecided layers: the branch is cut where too many values of the picture lie
-    outside. A layer with less light than the tolerance is added where that brings the sum nearer.
+    outside. A layer with less light than the tolerance is added where that brings the sum nearer. Negative light is
+    allowed.
     """
     flat = np.asarray(whole, np.float32).ravel()
     step = max(1, flat.size // _VALUES)
@@ -190,13 +158,9 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
 def filter_layers(
     layers: Sequence[Floats], guide: Floats, *, moments: NDArray[np.float64] | None = None
 ) -> list[Floats]:
-    """Denoise layers, each within its own range and with its own mean, by the guided filter.
+    """Denoise layers, averaged over time, each within its own range and with its own mean, by the guided filter.
 
-    Parameters
-    ----------
-    layers : sequence of (H, W, C) float32, averaged over time
-    guide : (H, W, G) float32, the denoised light and more
-    moments : (2, G) float64, optional, as for `nlm.guided.guided_filter`
+    The guide holds the denoised light and more; `moments` as for `nlm.guided.guided_filter`.
     """
     if not layers:
         return []
@@ -263,13 +227,7 @@ def split_light(
 
 
 def add_light(parts: Sequence[Floats], factors: Sequence[Floats | np.float32 | None]) -> Floats:
-    """Return Σ factor · part, (H, W, C).
-
-    Parameters
-    ----------
-    parts : sequence of (H, W, C) float32, at least one
-    factors : sequence of (H, W, C) float32 or None, where None is 1
-    """
+    """Return Σ factor · part, (H, W, C), where a factor None is 1."""
     total = np.zeros_like(parts[0])
     for part, factor in zip(parts, factors, strict=True):
         total += part if factor is None else factor * part

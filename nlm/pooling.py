@@ -68,11 +68,7 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
 def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
     """Clamp each channel of a picture (H, W, 3) to the range of estimates and samples within 3×3 pixels of any frame.
 
-    Parameters
-    ----------
-    picture : (H, W, 3) float32, finite
-    estimates, residuals : (T, H, W, 3) float32
-        As for `pool_samples`, in the unit of the picture. Non-finite values do not count.
+    Estimates and residuals are those of `pool_samples`; non-finite values do not count.
     """
     low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
     run_bands(_range, len(picture), estimates, residuals, low, high)

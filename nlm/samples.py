@@ -155,15 +155,10 @@ def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> Floa
 
 
 def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
-    """Variance (H, W) of a frame's noise, relative to the light, summed over channels.
+    """Variance (H, W) of a frame's noise, relative to the light (`rate` is one over that), summed over channels.
 
     The lesser of the high-pass energies of ``noisy`` and ``noisy − picture``: detail of the frame adds to the first,
     detail that the picture has lost or invented to the second (Immerkær, as `nlm.variance.variance_from_residual`).
-
-    Parameters
-    ----------
-    noisy, picture : (H, W, 3) float32
-    rate : (H, W) float32, one over the light
     """
     residuals = (second_differences(image) * rate[..., None] for image in (noisy, noisy - picture))
     energies = (np.square(residual).sum(axis=-1) / np.float32(36) for residual in residuals)

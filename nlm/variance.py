@@ -27,29 +27,15 @@ _RADIUS = 2
 
 
 def variance_from_halves(a: Floats, b: Floats) -> Floats:
-    """Variance (a − b)² / 4 of the mean of two independent half buffers: one degree of freedom, so smooth before use.
-
-    Parameters
-    ----------
-    a, b : (H, W, C) float32, the same picture twice, each with half of the samples
-    """
+    """Variance (a − b)² / 4 of the mean of two half buffers: one degree of freedom, so smooth before use."""
     if a.shape != b.shape:
         raise ValueError(f"b: expected shape {a.shape} like a, got {b.shape}")
     return np.asarray(np.square(a - b, dtype=np.float32) * np.float32(0.25))
 
 
 def variance_from_window(window: Floats, confidence: Floats) -> Floats:
-    """Variance of the centre frame's pixels, smoothed, from the differences between aligned frames.
+    """Variance (H, W, C) of the centre frame's pixels, smoothed, from the differences between aligned frames.
 
-    Returns (H, W, C) float32, in squared units.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) float32, finite
-    confidence : (T, H, W) float32, in [0, 1]
-
-    Notes
-    -----
     (x − m)² / (1 + 0.7 Σ w² / (Σ w)²), x the centre's value, m = Σ w x_t / Σ w over the neighbours; then
     `smooth_variance`, which bounds the contribution of an outlier. Unlike the sample variance of all frames this hardly
     depends on how much noise warping has removed from the neighbours (which halves the sample variance at half a
@@ -93,12 +79,7 @@ def second_differences(image: Floats) -> Floats:
 
 
 def ratio(a: Floats, b: Floats) -> Floats:
-    """Return a / b, 0 where b is not positive.
-
-    Parameters
-    ----------
-    a, b : (H, W) float32
-    """
+    """Return a / b, 0 where b is not positive."""
     return np.divide(a, b, out=np.zeros_like(b), where=b > 0)
 
 
@@ -122,15 +103,8 @@ def smooth_variance(variance: Floats) -> Floats:
 def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     """Denoise the centre frame's guides: albedo and normals under depth of field or behind glass.
 
-    Returns (H, W, F) float32, guides without noise come back as they are, to about 1e-3.
+    Guides (T, H, W, F) of about unit range without noise come back as they are, to about 1e-3.
 
-    Parameters
-    ----------
-    guides : (T, H, W, F) float32, aligned, finite, of about unit range
-    confidence : (T, H, W) float32, in [0, 1]
-
-    Notes
-    -----
     Non-local means over 3×3 pixels and all frames. The variance is the lesser of that between frames and
     that of the spatial residual: noise shows in both, texture only in the second, and texture resampled by warping
     mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles of the picture without noise are left
@@ -149,11 +123,6 @@ def gaussian_mean(image: Floats, sigma: float) -> Floats:
     """Mean (H, W) with Gaussian weights, which end at three deviations; the image is mirrored at its borders.
 
     The squares of the weights are those of a Gaussian narrower by √2, over 4πσ².
-
-    Parameters
-    ----------
-    image : (H, W) float32, finite
-    sigma : float, pixels
     """
     side = 2 * int(3 * sigma) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)

@@ -28,19 +28,7 @@ def can_fuse(x: Tensor) -> bool:
 def convolve(
     x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None, *, relu: bool = True
 ) -> Tensor:
-    """Convolve, add, and apply a ReLU. Returns ``(N, O, H, W)``.
-
-    Parameters
-    ----------
-    x : Tensor
-        ``(N, C, H, W)``.
-    weight, bias : Tensor
-        ``(O, C, 3, 3)`` and ``(O,)``.
-    added : Tensor, optional
-        ``(N, O, H, W)``, channels last; the result overwrites it.
-    relu : bool
-        Whether to apply the ReLU.
-    """
+    """Convolve ``(N, C, H, W)`` by ``(O, C, 3, 3)``, add, overwriting `added` (channels last), apply a ReLU."""
     if not can_fuse(x):
         result = functional.conv2d(x, weight, bias, padding=1)
         result = result if added is None else added.add_(result)

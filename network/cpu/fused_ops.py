@@ -25,34 +25,15 @@ _UNROLLED = (3, 5, 7)  # lengths of windows that `_blend` is written for
 
 
 def can_blend(x: Tensor, frames: int) -> bool:
-    """Whether `blend_channels` takes these features and this length of the window.
-
-    Parameters
-    ----------
-    x : Tensor
-        Features.
-    frames : int
-        T.
-    """
+    """Whether `blend_channels` takes these features and this length of the window."""
     supported = x.dtype in (torch.float32, torch.bfloat16) and frames in _UNROLLED
     return supported and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
 
 
 def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor, returned: Sequence[int]) -> Tensor:
-    """Run a `network.robust_average.ChannelAverage` block. Returns the frames in `returned`, as x.
+    """Run a `network.robust_average.ChannelAverage` block on ``(T·N, C, H, W)``, time first, T 3, 5 or 7.
 
-    Parameters
-    ----------
-    x : Tensor
-        ``(T·N, C, H, W)``, float32 or bfloat16, time first.
-    frames : int
-        T: 3, 5 or 7.
-    order : sequence of int
-        Order in which frames are blended.
-    weight : Tensor
-        ``(C,)``, of the robust average.
-    returned : sequence of int
-        Frames of the result.
+    Frames are blended in the given order with the ``(C,)`` weight of the robust average; those in `returned` come back.
     """
     pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
     batch, (height, width, channels) = len(x) // frames, pixels.shape[1:]
@@ -70,17 +51,7 @@ def can_project(x: Tensor) -> bool:
 
 
 def convolve_to_rgb(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Convolve features to three channels, in float32.
-
-    Returns ``(N, 3, H, W)`` float32, channels last; features beyond the borders count as 0.
-
-    Parameters
-    ----------
-    x : Tensor
-        ``(N, C, H, W)``, float32 or bfloat16.
-    weight, bias : Tensor
-        ``(3, C, 3, 3)`` and ``(3,)``, float32.
-    """
+    """Convolve ``(N, C, H, W)`` to three float32 channels, channels last; features beyond the borders count as 0."""
     pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
     count, height, width, _ = pixels.shape
     result = torch.empty(count, height, width, 3)

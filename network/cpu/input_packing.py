@@ -61,16 +61,9 @@ def can_pack(window: UNetWindow) -> bool:
 
 
 def packer(window: UNetWindow, columns: Indices) -> Callable[[Indices], PackedInputs]:
-    """Make a function that packs rows of a window.
+    """Make a function that packs rows of a window: it maps h row numbers to inputs of h×w pixels.
 
-    The function maps h row numbers of the window to inputs of h×w pixels.
-
-    Parameters
-    ----------
-    window : UNetWindow
-        Float32; layers whose channels are not last are copied.
-    columns : (w,) array of int
-        Column of the window for each column of the inputs.
+    `columns` has the column of the window for each column of the inputs; layers whose channels are not last are copied.
     """
     layers = [_pixels(layer) for layer in (window.first_pass, window.residual, window.confidence, window.modulation)]
     batch, count = layers[0].shape[:2]

@@ -31,17 +31,10 @@ class UpsampleTaps(NamedTuple):
 
 
 def merge_taps(weight: Tensor, channels: int) -> UpsampleTaps:
-    """Add the taps that read the same feature.
+    """Add the taps ``(O, C + D, 3, 3)`` that read the same feature of the C upsampled channels.
 
     The three taps of an even row 2i read rows i − 1, i and i of the features, those of an odd row 2i + 1 rows i, i
     and i + 1; columns likewise.
-
-    Parameters
-    ----------
-    weight : Tensor
-        ``(O, C + D, 3, 3)``.
-    channels : int
-        C, number of upsampled channels.
     """
     kernels = [half for rows in _halves(weight[:, :channels], 2) for half in _halves(rows, 3)]
     layout = torch.channels_last
@@ -56,18 +49,8 @@ def can_upsample(*layers: Tensor) -> bool:
 
 
 def convolve_upsampled(x: Tensor, skip: Tensor, taps: UpsampleTaps, bias: Tensor) -> Tensor:
-    """Upsample features, concatenate the skip connection, convolve, and apply a ReLU. Returns ``(N, O, 2·H, 2·W)``.
-
-    Parameters
-    ----------
-    x : Tensor
-        ``(N, C, H, W)``.
-    skip : Tensor
-        ``(N, D, 2·H, 2·W)``.
-    taps : UpsampleTaps
-        From `merge_taps`.
-    bias : Tensor
-        ``(O,)``.
+    """Upsample ``(N, C, H, W)``, concatenate the skip ``(N, D, 2·H, 2·W)``, convolve, apply a ReLU: ``(N, O, 2·H,
+    2·W)``.
     """
     count, channels, (height, width) = len(x), len(bias), x.shape[2:]
     parts = functional.conv2d(x, taps.coarse, padding=1).unflatten(1, (2, 2, channels))

@@ -14,19 +14,7 @@ from network.robust_average import outermost_first, ravg
 
 
 class ResidualBlock(nn.Module):
-    """``x + conv(relu(conv(relu(x))))``, without normalisation, at constant width.
-
-    Parameters
-    ----------
-    channels : int
-        Width of input, output and hidden layer.
-    kernel_size : int
-        Odd size of both convolutions.
-
-    References
-    ----------
-    He et al. 2016, "Deep Residual Learning for Image Recognition", doi:10.1109/CVPR.2016.90.
-    """
+    """``x + conv(relu(conv(relu(x))))``, without normalisation, at constant width (doi:10.1109/CVPR.2016.90)."""
 
     def __init__(self, channels: int, kernel_size: int = 3) -> None:
         super().__init__()
@@ -41,25 +29,12 @@ class ResidualBlock(nn.Module):
 class RobustAverage(nn.Module):
     """Robust Average block: blends each frame with the robust average of the others, by a learned weight per pixel.
 
-    Parameters
-    ----------
-    channels : int
-        Width of the features.
-    kernel_size : int
-        Odd size of the convolutions that predict the weights.
-
-    Notes
-    -----
     For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place:
     ``a = ravg(x_j, j ≠ i)``, ``w = sigmoid(conv(relu(conv([x_i, a]))))``, ``x_i ← (1 − w) x_i + w a``, one weight
     per pixel. The parameters are shared over the steps. ``w → 0`` makes the block the identity.
 
     The first convolution acts on the concatenation of x_i and a, and is held as two halves. As each frame is
     excluded before it has been changed, the half on x_i runs on all frames at once, and nothing is concatenated.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 3.
     """
 
     def __init__(self, channels: int, kernel_size: int = 3) -> None:
@@ -83,29 +58,11 @@ class RobustAverage(nn.Module):
 
 
 class TemporalModule(nn.Module):
-    """Temporal module of Vogels et al. 2018: convolutions on the features of all frames together.
+    """Temporal module of Vogels et al. 2018, section 5.2: convolutions on the features of all frames together.
 
-    Parameters
-    ----------
-    channels : int
-        Width of the features of a frame.
-    frames : int
-        T.
-    blocks : int
-        Residual blocks on the joint features.
-    kernel_size : int
-        Odd size of the convolutions.
-
-    Notes
-    -----
     The features of all frames, concatenated, become features of the window; these pass the residual blocks, and a 1×1
     convolution gives each frame its own again, from which its kernel is predicted. Robust Average blocks mix frames at
     many depths with one set of parameters; this does it once, at the end, with weights for each position in the window.
-
-    References
-    ----------
-    Vogels et al. 2018, "Denoising with Kernel Prediction and Asymmetric Loss Functions", section 5.2,
-    doi:10.1145/3197517.3201388.
     """
 
     def __init__(self, channels: int, frames: int, blocks: int = 2, kernel_size: int = 3) -> None:
@@ -123,19 +80,9 @@ class TemporalModule(nn.Module):
 
 
 class UNet(nn.Module):
-    """U-Net shared over the frames, connected in time by RA blocks on the way down.
+    """U-Net shared over the frames, connected in time by RA blocks on the way down; widths are those of the finest
+    first.
 
-    Parameters
-    ----------
-    inputs : int
-        Input channels.
-    widths : sequence of int
-        Channels of each scale, finest first.
-    ra_scales : sequence of int
-        Scales with an RA block.
-
-    Notes
-    -----
     One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
     addition up.
     """

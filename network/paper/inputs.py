@@ -37,12 +37,8 @@ class KernelWindow(NamedTuple):
 def network_inputs(window: KernelWindow) -> Tensor:
     """``(N, T, 10, H, W)``: ``log1p(color / exposure)``, ``log1p(albedo)``, normal, confidence; 0 for missing guides.
 
-    Raises ValueError if shapes do not fit each other.
-
-    Notes
-    -----
-    The logarithm keeps a firefly of 1e6 at 14; negative radiance (bicubic warping makes some) counts as zero
-    here, though not in the frames that kernels are applied to.
+    The logarithm keeps a firefly of 1e6 at 14; negative radiance (bicubic warping makes some) counts as zero here,
+    though not in the frames that kernels are applied to. Raises ValueError if shapes do not fit each other.
     """
     color, confidence, exposure, albedo, normal = window
     n, t, _, h, w = color.shape

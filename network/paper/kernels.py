@@ -25,79 +25,31 @@ _PROCESSOR = "cpu"  # where compiled loops run; elsewhere torch's own operations
 
 
 def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
-    """Thresholded, normalised kernel of raw weights (the paper's η_t).
+    """Thresholded, normalised kernel of raw weights (the paper's η_t, section 4): ``(N, K, H, W)``, ≥ 0, sums to 1.
 
-    Returns ``(N, K, H, W)``, not negative, sums to 1 over the taps. Raises ValueError if a float threshold is outside
-    ``[0, 1/K)``, or the centre is no tap.
-
-    Parameters
-    ----------
-    weights : Tensor
-        ``(N, K, H, W)`` raw weights of K taps.
-    threshold : float or Tensor, optional
-        t, on the scale of the weights; a tensor broadcasts against ``(N, 1, H, W)``. Default ``1 / (2K)``.
-    centre : int
-        The tap with all the weight where no weight exceeds the threshold: the kernel is then the identity.
-
-    Notes
-    -----
-    ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)``. ``t < 1/K`` keeps a normalised kernel of equal weights
-    alive. Where the kernel is the identity the gradient is zero.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 4.
+    ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)``. ``t < 1/K``, by default ``1 / (2K)``, keeps a normalised
+    kernel of equal weights alive. Where no weight exceeds it, the kernel is the identity: all weight on the tap
+    `centre`, gradient 0. Raises ValueError if a float threshold is outside ``[0, 1/K)``, or the centre is no tap.
     """
     return _activate(weights, threshold, centre, relative=False)
 
 
 def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
-    """Kernel of raw weights: normalised, thresholded, normalised again.
+    """Kernel of raw weights on any scale, ``η_t(η_0(w))``: normalised, thresholded, normalised again; float32 or
+    float64.
 
-    Returns a kernel as `threshold_kernel`, in float32 (float64 stays).
-
-    Parameters
-    ----------
-    weights : Tensor
-        ``(N, K, H, W)`` raw weights on any scale.
-    threshold : float or Tensor, optional
-        t on the scale of the *normalised* weights, below 1/K; a tensor broadcasts against ``(N, 1, 1, 1)``.
-        Default ``1 / (2K)``.
-    centre : int
-        As for `threshold_kernel`.
-
-    Notes
-    -----
-    ``η_t(η_0(w))``. Without the first normalisation t would be compared with numbers whose scale the network
-    chooses, and the same t would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first
-    normalisation needs only its sum. Kept in float32: in half precision a weight near 1/K has lost the digits
-    that distinguish it from t.
+    Without the first normalisation t would be compared with numbers whose scale the network chooses, and the same t
+    would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first normalisation needs only its sum.
+    Kept in float32: in half precision a weight near 1/K has lost the digits that distinguish it from t.
     """
     return _activate(_at_least_float32(weights), threshold, centre, relative=True)
 
 
 def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: int) -> Tensor:
-    """Softmax of raw weights, thresholded and normalised again where a threshold is given.
+    """Softmax of raw weights, thresholded and normalised again where the threshold is not 0; float32 or float64.
 
-    Returns a kernel as `threshold_kernel`, in float32 (float64 stays).
-
-    Parameters
-    ----------
-    weights : Tensor
-        ``(N, K, H, W)`` raw weights; only their differences count.
-    threshold : float or Tensor
-        t on the scale of the softmax, below 1/K. 0, the default, is the plain softmax: every tap has some weight.
-    centre : int
-        As for `threshold_kernel`.
-
-    Notes
-    -----
-    ``η_t(σ(w))`` with ``σ(w_i) = exp(w_i) / Σ_j exp(w_j)``. The greatest weight of a softmax is at least 1/K, so with
-    t < 1/K it never falls back to the identity.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 4, equation 2 and the last paragraph on thresholds.
+    ``η_t(σ(w))`` with ``σ(w_i) = exp(w_i) / Σ_j exp(w_j)`` (the paper's equation 2). The greatest weight of a softmax
+    is at least 1/K, so with t < 1/K it never falls back to the identity.
     """
     return threshold_kernel(_at_least_float32(weights).softmax(1), threshold, centre=centre)
 
@@ -107,28 +59,13 @@ def _at_least_float32(weights: Tensor) -> Tensor:
 
 
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply the kernels of one source to its frames, frame by frame.
+    """Apply kernels ``(N, T·K·K, H, W)``, K odd, to their frames ``(N, T, C, H, W)`` of any linear quantity, frame by
+    frame.
 
-    Raises ValueError if the shapes do not fit together.
-
-    Parameters
-    ----------
-    kernels : Tensor
-        ``(N, T·K·K, H, W)``, K odd.
-    frames : Tensor
-        ``(N, T, C, H, W)``: radiance, irradiance, an AOV; any linear quantity.
-
-    Returns
-    -------
-    numerators : Tensor
-        ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``.
-    denominators : Tensor
-        ``(N, T, 1, H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)`` over the taps inside the image.
-
-    Notes
-    -----
-    Taps outside the image count in neither sum, so that dividing renormalises the rest of a kernel at the border. Both
-    directions accumulate in place, in float32 or float64: unfolding would write each frame K·K times.
+    Returns numerators ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``, and denominators ``(N, T, 1,
+    H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)``, both over the taps inside the image, so that dividing renormalises the rest of
+    a kernel at the border. Both directions accumulate in place, in float32 or float64: unfolding would write each frame
+    K·K times. Raises ValueError if the shapes do not fit together.
     """
     if frames.ndim != 5 or kernels.ndim != 4 or kernels.shape[0] != frames.shape[0]:
         raise ValueError(
@@ -155,17 +92,7 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon: float = 1e-6) -> Tensor:
-    """Filtered image of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``. Returns ``(N, C, H, W)``.
-
-    Parameters
-    ----------
-    numerators, denominators : Tensor
-        ``(N, T', C, H, W)`` and ``(N, T', 1, H, W)``: all frames, or a subset of them along the second axis.
-    fallback : Tensor
-        ``(N, C, H, W)``: x, the image where the kernels have no weight on these frames.
-    epsilon : float
-        Weight of the fallback, on the scale of a kernel, whose weights sum to 1.
-    """
+    """Filtered image ``(N, C, H, W)`` of the frames in the sums: ``(Σ S_t + ε x) / (Σ N_t + ε)``, x the fallback."""
     return (numerators.sum(1) + epsilon * fallback) / (denominators.sum(1) + epsilon)
 
 
@@ -241,17 +168,7 @@ class Filtered:
         return self.image(self.centre)
 
     def image(self, fallback: Tensor, frames: Sequence[int] | None = None, epsilon: float = 1e-6) -> Tensor:
-        """Image of some frames together. Returns ``(N, C, H, W)``.
-
-        Parameters
-        ----------
-        fallback : Tensor
-            ``(N, C, H, W)``, as for `mean_of`.
-        frames : sequence of int, optional
-            Indices of the frames; default: all.
-        epsilon : float
-            As for `mean_of`.
-        """
+        """Image ``(N, C, H, W)`` of some frames together, by default of all, by `mean_of`."""
         numerators, denominators = self.numerators, self.denominators
         if frames is not None:
             numerators, denominators = numerators[:, list(frames)], denominators[:, list(frames)]

@@ -127,15 +127,6 @@ def _check_odd(conv_size: int) -> None:
 class KernelHead(nn.Module):
     """Last layer: features of each frame to one kernel per pixel over all frames.
 
-    Parameters
-    ----------
-    channels : int
-        Width of the features.
-    config : KernelConfig
-        Taps and threshold.
-
-    Notes
-    -----
     With h the output of the convolution and c the confidence of the frame over the mean of all: with relu, the paper's
     η_t, the raw weights are ``t + (1 − tK) c / K + h / K``: as η_t takes t away and renormalises, h = 0 gives the mean
     over time and the taps, weighted by confidence, and a tap may get any weight or none. With softmax they are
@@ -151,16 +142,10 @@ class KernelHead(nn.Module):
             cast(Tensor, self.window.bias).zero_()
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Predict kernels. Returns ``(N, taps, H, W)`` float32.
+        """Predict kernels ``(N, taps, H, W)`` from features ``(T·N, C, H, W)``, time first, and confidence ``(N, T, 1,
+        H, W)``.
 
-        Parameters
-        ----------
-        features : Tensor
-            ``(T·N, C, H, W)``, time first.
-        confidence : Tensor
-            ``(N, T, 1, H, W)``.
-        threshold : float, optional
-            t·K in [0, 1). Default: the configured one, which the model was trained with.
+        The threshold is t·K in [0, 1); by default the one that the model was trained with.
         """
         config = self.config
         # 1e-3: a pixel without confidence in any frame (even the centre was not finite) averages them all.
@@ -201,20 +186,14 @@ class RAUNet(UNet):
 
 
 class RAResNet(nn.Module):
-    """The paper's network: residual blocks at full resolution, RA blocks among them; see `filter_window`.
+    """The paper's network (figure 1): residual blocks at full resolution, RA blocks among them; see `filter_window`.
 
-    Notes
-    -----
     The paper's figure shows skip connections after the first four RA blocks and does not say how they join. Here
     each section (residual blocks up to and with an RA block) is skipped: its input is concatenated to its output
     and a 1×1 convolution brings both back to the width.
 
     With 3×3 convolutions it has 3.5 M parameters, with 7×7 19.0 M. The paper says 24 M; 3×3 and the trunk of the
     VGG19 in its loss (20.0 M) come close to that.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, figure 1 and section 7.
     """
 
     #: Height and width must be multiples of this.
@@ -252,12 +231,7 @@ class RAResNet(nn.Module):
 
 
 class TKPCN(nn.Module):
-    """The paper's baseline: a spatial network with shared weights, then one temporal module; no RA blocks.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 7; Vogels et al. 2018, section 5.2, doi:10.1145/3197517.3201388.
-    """
+    """The paper's baseline: a spatial network with shared weights, then one temporal module; no RA blocks."""
 
     #: Height and width must be multiples of this.
     multiple = 1
@@ -285,15 +259,9 @@ class TKPCN(nn.Module):
 class MultiScale(nn.Module):
     """A Robust Average network whose kernels are predicted at full, half and quarter resolution, and blended.
 
-    Notes
-    -----
     The network's features, averaged over 2×2 pixels once and again, go to a head of each resolution. A convolution on
     the centre's features predicts, pixel by pixel, the share of the low frequencies that comes from the next coarser
-    resolution, where K×K taps extend twice as far. It starts at 2 %.
-
-    References
-    ----------
-    Vogels et al. 2018, section 5.3, doi:10.1145/3197517.3201388; Kalojanov and Thurston 2023, section 7.
+    resolution, where K×K taps extend twice as far. It starts at 2 %. Vogels et al. 2018, section 5.3.
     """
 
     def __init__(self, config: MultiScaleConfig) -> None:
@@ -329,35 +297,17 @@ KernelModel = RAUNet | RAResNet | TKPCN | MultiScale
 def filter_window(
     model: KernelModel, window: KernelWindow, threshold: float | None = None, run: Callable[..., Any] | None = None
 ) -> Filtered:
-    """Predict the kernels of a window and apply them to its color.
+    """Predict the kernels of a window, by `run` where the model is wrapped, and apply them to its color.
 
-    Returns the sums of each frame. Raises ValueError if shapes do not fit the model.
-
-    Parameters
-    ----------
-    model : KernelModel
-        The model.
-    window : KernelWindow
-        Of the model's number of frames, with height and width multiples of `model.multiple`.
-    threshold : float, optional
-        t·K in [0, 1), instead of the model's own; higher stays closer to the input.
-    run : callable, optional
-        Called instead of the model, where it is wrapped (distributed, compiled).
+    Height and width are multiples of `model.multiple`. The threshold is t·K in [0, 1), instead of the model's own;
+    higher stays closer to the input. Raises ValueError if shapes do not fit the model.
     """
     kernels = (model if run is None else run)(network_inputs(window), window.confidence, threshold)
     return Filtered.of(kernels, window.color)
 
 
 def for_inference(model: KernelModel, bfloat16: bool) -> KernelModel:
-    """Prepare a model for running: channels last, no gradients; changes and returns it.
-
-    Parameters
-    ----------
-    model : KernelModel
-        Changed in place.
-    bfloat16 : bool
-        Cast its weights; kernels and weights of frames stay float32.
-    """
+    """Prepare a model for running: channels last, no gradients, bfloat16 weights if asked; changes and returns it."""
     model.eval().requires_grad_(False)
     for parameter in model.parameters():
         parameter.data = parameter.to(torch.bfloat16 if bfloat16 else torch.float32)

@@ -163,15 +163,12 @@ INPUTS = Sample._fields[:-2]
 
 
 def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
-    """For each noise level its possible targets: other levels of no more noise, never the other way.
+    """For each noise level its possible targets, (level, "noisy" or "pseudo_reference"), cleanest first.
 
-    The levels, given by their samples per pixel, must be independent renders. Returns, for each level, levels and kinds
-    of targets, "noisy" and "pseudo_reference", cleanest first. A level without an independent one of no more noise gets
-    its own pseudo-reference: the network can then learn no more than the pseudo-reference contains.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 6; Lehtinen et al. 2018, Noise2Noise, arXiv:1803.04189.
+    Targets have no more noise than the input, never the other way; levels, given by samples per pixel, must be
+    independent renders. A level without an independent one of no more noise gets its own pseudo-reference: the network
+    can then learn no more than that contains. Kalojanov and Thurston 2023, section 6; Lehtinen et al. 2018,
+    Noise2Noise, arXiv:1803.04189.
     """
     order = sorted(range(len(samples)), key=lambda level: -samples[level])
     pairs = []
@@ -183,22 +180,11 @@ def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
 
 
 def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
-    """Importance of each pixel for training: noise, detail, and motion that could not be followed.
+    """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed.
 
-    Parameters
-    ----------
-    noisy, estimate : Tensor
-        ``(3, H, W)`` radiance of the centre over the exposure.
-    albedo : Tensor
-        ``(3, H, W)`` of the centre.
-    confidence : Tensor
-        ``(T, 1, H, W)``.
-
-    Returns
-    -------
-    Tensor
-        ``(H, W)``, 0 where a flat sky is. Differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇ albedo|; and a
-        tenth of the frames' lack of confidence, which would otherwise outweigh all else where an object passes.
+    Images are (3, H, W), the confidence (T, 1, H, W); 0 where a flat sky is. Differences on x/(1+x): |noisy −
+    estimate|, |∇ estimate|, |∇ albedo|; and a tenth of the frames' lack of confidence, which would otherwise outweigh
+    all else where an object passes.
     """
     noisy, estimate = (image.clamp_min(0) / (1 + image.clamp_min(0)) for image in (noisy.float(), estimate.float()))
     result = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))
@@ -209,22 +195,7 @@ def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tens
 
 
 def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]], np.ndarray]:
-    """Chances of the possible tiles of an image, half uniform, half by importance.
-
-    Parameters
-    ----------
-    importance : Tensor
-        ``(H, W)``, at least 0, from `importance`.
-    size : int
-        Side of a tile, pixels; at most H and W.
-
-    Returns
-    -------
-    corners : list of (int, int)
-        Row and column of each, every 8 pixels.
-    chances : numpy.ndarray
-        One for each corner; they sum to 1.
-    """
+    """Corners of an image's possible tiles, every 8 pixels, and their chances: half uniform, half by importance."""
     height, width = importance.shape
     sums = np.zeros((height + 1, width + 1))
     sums[1:, 1:] = importance.double().numpy().cumsum(0).cumsum(1)
@@ -239,21 +210,7 @@ def place_chances(importance: Tensor, size: int) -> tuple[list[tuple[int, int]],
 
 
 def important_places(importance: Tensor, size: int, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Draw tiles by importance, none closer to another than half a tile both ways.
-
-    Returns rows and columns of the corners.
-
-    Parameters
-    ----------
-    importance : Tensor
-        ``(H, W)``, at least 0, from `importance`.
-    size : int
-        Side of a tile, pixels.
-    count : int
-        Number of tiles; fewer where no more fit.
-    rng : numpy.random.Generator
-        Source of randomness.
-    """
+    """Draw corners of at most `count` tiles by importance, none closer to another than half a tile both ways."""
     corners, chances = place_chances(importance, size)
     places: list[tuple[int, int]] = []
     while len(places) < count and chances.sum() > 0:
@@ -267,25 +224,10 @@ def important_places(importance: Tensor, size: int, count: int, rng: np.random.G
 def write_shards(
     folder: str | os.PathLike[str], shot: str, samples: Sequence[float], clips: Iterable[Clip]
 ) -> list[Path]:
-    """Write the clips of a shot as ``SHOT.0000.safetensors``, ``SHOT.0001.safetensors`` and so on.
+    """Write the clips of a shot, all of one shape, as ``SHOT.0000.safetensors``, ``SHOT.0001.safetensors`` and so on.
 
-    Raises ValueError if there are no clips, or they differ in shape.
-
-    Parameters
-    ----------
-    folder : path
-        Output folder.
-    shot : str
-        Name; training and validation are split by it.
-    samples : sequence of float
-        Samples per pixel of each level.
-    clips : iterable of Clip
-        At least one, all of one shape; drawn from as they are written.
-
-    Returns
-    -------
-    list of Path
-        The shards. They appear together when the last is finished.
+    `samples` are the samples per pixel of each level; clips are drawn from as they are written. The shards appear
+    together when the last is finished. Raises ValueError if there are no clips, or they differ in shape.
     """
     folder = Path(folder)
     partial: list[Path] = []
@@ -346,20 +288,7 @@ class _Shard:
 
 
 class Clips:
-    """Clips in shards, by number.
-
-    Parameters
-    ----------
-    shards : sequence
-        From `open_clips`.
-    frames : int, optional
-        Length of the windows, odd: the middle frames of the stored windows. Default: all.
-
-    Raises
-    ------
-    ValueError
-        If the length is even, or more than is stored.
-    """
+    """Clips in shards, by number. `frames`: the middle frames of the stored windows, an odd number; all by default."""
 
     def __init__(self, shards: Sequence[_Shard], frames: int | None = None) -> None:
         self._shards = list(shards)
@@ -389,9 +318,8 @@ class Clips:
         return Clips(found, self.frames if found else None)
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
-        """Possible targets, (level, kind), of each noise level of a clip.
-
-        The reference where there is one, and a render beside it, else its `noise_pairs`.
+        """Possible targets, (level, kind), of each noise level: the reference and a render beside it, else
+        `noise_pairs`.
         """
         shard = self._find(index)[0]
         if shard.targets:
@@ -435,17 +363,10 @@ class Clips:
 
 
 def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Clips:
-    """Open all shards of a folder and its subfolders, in the order of their paths.
+    """Open all shards of a folder and its subfolders, in the order of their paths; `frames` as for `Clips`.
 
     Raises FileNotFoundError if there are none; ValueError if one is no shard of clips, or of another version, or their
     windows differ in length, or are shorter.
-
-    Parameters
-    ----------
-    folder : path
-        Output of `write_shards`.
-    frames : int, optional
-        Length of the windows, as for `Clips`.
     """
     paths = sorted(Path(folder).rglob("*.safetensors"))
     if not paths:
@@ -473,16 +394,9 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
 
 
 def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
-    """Split clips into those for training and those for validation; no shot is in both.
+    """Split clips into those for training and those of the validation shots.
 
     Raises ValueError if a name is not among the shots, or no clip is left to train on.
-
-    Parameters
-    ----------
-    clips : Clips
-        All clips.
-    validation : sequence of str
-        Names of the shots to keep out of training.
     """
     unknown = sorted(set(validation) - set(clips.shots))
     if unknown:
@@ -537,29 +451,9 @@ class Samples(Dataset[Sample]):
     """The samples of a training, by number: each is a function of the seed and its number alone.
 
     So the state of the sampling is one number, any process may make any sample, and a training that is resumed or
-    spread over processes gets the same samples.
+    spread over processes gets the same samples. With `neighbours` each sample is two, of successive frames, at the same
+    place and varied alike; clips without a neighbour, as at a cut, are left out.
 
-    Parameters
-    ----------
-    clips : Clips
-        At least one, each at least crop pixels high and wide.
-    config : SamplerConfig
-        Crops and variations.
-    seed : int
-        Seed of everything random.
-    loss : ImageLoss
-        Loss of ``error``.
-    neighbours : bool
-        Whether each sample is two, with a 2 in front of each shape: of successive frames, at the same place and varied
-        alike. Clips without a neighbour, as at a cut, are left out.
-
-    Raises
-    ------
-    ValueError
-        If there are no clips, one is too small, or neighbours are asked for and none has one.
-
-    Notes
-    -----
     The clips are split at random into disjoint sets, one per epoch. An epoch takes each clip of its set once, in random
     order, at a noise level and towards a target drawn from `noise_pairs`; after the last set the first comes again.
     """
@@ -655,17 +549,7 @@ class Samples(Dataset[Sample]):
 
 
 def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
-    """Loss of the best input: the noisy frames' mean weighted by confidence, or the centre's first pass.
-
-    Returns ``(N,)``, at least 1e-6.
-
-    Parameters
-    ----------
-    batch : Sample
-        With N in front.
-    loss : ImageLoss
-        The loss.
-    """
+    """Loss (N,), ≥ 1e-6, of the best input: the noisy frames' mean by confidence, or the centre's first pass."""
     centre = batch.color.shape[1] // 2
     mean = mean_of(batch.color * batch.confidence, batch.confidence, batch.color[:, centre])
     scale = losses.scale_of_radiance(batch.exposure, batch.modulation)
@@ -678,16 +562,7 @@ def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
 def whole_frames(clips: Clips, index: int, multiple: int) -> list[Sample]:
     """A clip at each of its levels, towards the cleanest target, as batches of one, unvaried.
 
-    The samples have N = 1 in front.
-
-    Parameters
-    ----------
-    clips : Clips
-        The clips.
-    index : int
-        Of the clip.
-    multiple : int
-        Height and width are cropped, at the bottom and the right, to multiples of this.
+    Height and width are cropped, at the bottom and the right, to multiples of a number.
     """
     batches = []
     for level, targets in enumerate(clips.pairs(index)):

@@ -42,19 +42,7 @@ from network.windows import UNetWindow
 def predict(
     model: Model, batch: Sample, bfloat16: bool = False, run: Callable[..., Any] | None = None
 ) -> Filtered | UNetOutput:
-    """Run a model on a batch. Both kinds of output have ``irradiance`` and ``parts()``.
-
-    Parameters
-    ----------
-    model : Model
-        Any.
-    batch : Sample
-        With N in front.
-    bfloat16 : bool
-        Whether the convolutions run in bfloat16.
-    run : callable, optional
-        Called instead of the model, where it is wrapped (distributed, compiled).
-    """
+    """Run a model, or `run` where it is wrapped, on a batch; the output has ``irradiance`` and ``parts()``."""
     with torch.autocast(batch.color.device.type, torch.bfloat16, enabled=bfloat16):
         if not isinstance(model, RobustUNet):
             window = KernelWindow(batch.color, batch.confidence, batch.exposure, batch.albedo, batch.normal)
@@ -79,15 +67,7 @@ def centre_of(layers: Tensor) -> Tensor:
 
 
 def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
-    """Terms of the loss of a network that predicts kernels.
-
-    Parameters
-    ----------
-    config : TrainConfig
-        Its terms, "temporal" by default, and the weight of the whole window.
-    frames : int
-        Length of the window.
-    """
+    """Terms of the loss of a network that predicts kernels of windows of so many frames; "temporal" by default."""
     if config.terms in (None, "temporal"):
         return losses.temporal_terms(frames, config.whole)
     return losses.power_terms(frames) if config.terms == "power" else losses.spatial_terms(frames)
@@ -107,25 +87,9 @@ def batch_loss(
     loss: losses.ImageLoss,
     run: Callable[..., Any] | None = None,
 ) -> Tensor:
-    """Training loss of a batch: log(1 + the temporal loss of each crop, relative to that of its clip's best input).
+    """Training loss of a batch: mean of log(1 + the temporal loss of each crop, relative to that of its clip's best
+    input).
 
-    Returns the mean over the batch, ``()``.
-
-    Parameters
-    ----------
-    model : Model
-        Any.
-    batch : Sample
-        With N in front; of neighbours where their differences count.
-    config : TrainConfig
-        Terms, slope, differences and precision.
-    loss : ImageLoss
-        Of images.
-    run : callable, optional
-        As for `predict`.
-
-    Notes
-    -----
     Possible gains differ by orders of magnitude between shots, and the targets' noise adds a floor. Each crop's loss is
     divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the centre's first
     pass), so that every clip counts about the same. Where clips are whole frames and a crop was divided by its own
@@ -158,19 +122,9 @@ def batch_loss(
 def validate(model: Model, clips: Clips) -> dict[str, float]:
     """Means over whole validation clips, each at all of its noise levels.
 
-    Parameters
-    ----------
-    model : Model
-        The model.
-    clips : Clips
-        At least one.
-
-    Returns
-    -------
-    dict
-        PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's first
-        pass), ``gated`` (average of the first passes) and ``denoised``. ``mean``: radiance of denoised over that of the
-        targets. ``side``: weight of the side frames.
+    PSNR in dB on x/(1+x) against the targets, which may be noisy: ``noisy``, ``estimate`` (the centre's first pass),
+    ``gated`` (average of the first passes) and ``denoised``. ``mean``: radiance of denoised over that of the targets.
+    ``side``: weight of the side frames.
     """
     sums: dict[str, float] = {}
     device = next(model.parameters()).device
@@ -202,34 +156,19 @@ def train(
     resume: bool = False,
     log: Callable[[int, dict[str, float]], None] = lambda step, values: None,
 ) -> list[float]:
-    """Train a model and write the moving average of its weights.
+    """Train a model in place and write the moving average of its weights; return the loss of each step of this process.
 
-    Returns the loss of each step of this run; of several processes, of this one's share. Raises ValueError if the
-    state to resume is cut short or of another training, the batch cannot be shared evenly, or crops or terms do not
-    fit the model; FileNotFoundError if there is no state to resume.
+    The file `out` is written at each checkpoint and at the end; ``OUT.state`` beside it holds the state that `resume`
+    continues from as if nothing had been interrupted, and is removed at the end. `validation` may be empty.
+    `log` is called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
+    ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with its
+    values, as ``validation/psnr`` and so on.
 
-    Parameters
-    ----------
-    training, validation : Clips
-        Of disjoint shots; validation may be empty.
-    model : Model
-        Trained in place from the weights it has.
-    config : TrainConfig
-        Settings.
-    out : path
-        Safetensors file, written at each checkpoint and at the end; ``OUT.state`` beside it holds the state for
-        resuming and is removed at the end.
-    resume : bool
-        Continue from ``OUT.state``, as if the training had not been interrupted.
-    log : callable
-        Called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
-        ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with
-        its values, as ``validation/psnr`` and so on.
-
-    Notes
-    -----
     In a process group (``torch.distributed``, gloo or nccl) each process trains on its share of every batch, and
     `DistributedDataParallel` averages the gradients: the same as one process on the whole batch.
+
+    Raises ValueError if the state to resume is cut short or of another training, the batch cannot be shared evenly, or
+    crops or terms do not fit the model; FileNotFoundError if there is no state to resume.
     """
     rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if _in_group() else (0, 1)
     if config.batch % world:

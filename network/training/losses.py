@@ -37,28 +37,14 @@ class ImageLoss(Protocol):
 
 
 def l1(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median).
-
-    Parameters
-    ----------
-    prediction, target, scale, weight : Tensor
-        As for `ImageLoss`.
-    """
+    """Mean absolute error over the scale: ``mean |d − r| / s``. Darkens with noisy targets (median)."""
     return _mean((prediction - target).abs(), weight) / scale
 
 
 def smape(prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
     """Symmetric mean absolute percentage error: ``mean |d − r| / (|d| + |r| + ε s)``, ε = 1e-2, where "dark" starts.
 
-    Parameters
-    ----------
-    prediction, target, scale, weight : Tensor
-        As for `ImageLoss`.
-
-    References
-    ----------
-    Vogels et al. 2018, "Denoising with Kernel Prediction and Asymmetric Loss Functions",
-    doi:10.1145/3197517.3201388.
+    Vogels et al. 2018, "Denoising with Kernel Prediction and Asymmetric Loss Functions", doi:10.1145/3197517.3201388.
     """
     floor = 1e-2 * scale.view(-1, 1, 1, 1)
     return _mean((prediction - target).abs() / (prediction.abs() + target.abs() + floor), weight)
@@ -69,23 +55,13 @@ def relmse(
 ) -> Tensor:
     """Relative squared error with denominators from the prediction: ``mean (d − r)² / (d̄² + ε s²)``, ε = 0.1.
 
-    Parameters
-    ----------
-    prediction, target, scale, weight : Tensor
-        As for `ImageLoss`.
-    limit : float
-        Relative error beyond which the square continues as a straight line (Huber), so that one firefly in a
-        target is not the whole gradient. ``inf`` for the pure, unbiased square.
+    Beyond the relative error `limit` the square continues as a straight line (Huber), so that one firefly in a target
+    is not the whole gradient; ``inf`` is the pure, unbiased square (Lehtinen et al. 2018, section 3.3,
+    arXiv:1803.04189).
 
-    Notes
-    -----
     ``d̄`` is the mean of the prediction over the channels, without gradient: dividing by each channel would let
     dark channels of saturated colors dominate. Pixels darker than ``sqrt(ε) s``, a third of the scale, count by
     absolute error.
-
-    References
-    ----------
-    Lehtinen et al. 2018, "Noise2Noise", section 3.3, arXiv:1803.04189.
     """
     level = prediction.detach().mean(1, keepdim=True)
     relative = (prediction - target) * torch.rsqrt(level**2 + RELMSE_FLOOR * scale.view(-1, 1, 1, 1) ** 2)
@@ -97,15 +73,8 @@ def display(
 ) -> Tensor:
     """Squared error on the display curve ``T(x) = x / (x + s)``, to first order: ``mean (T'(d) (d − r))²``.
 
-    Parameters
-    ----------
-    prediction, target, scale, weight : Tensor
-        As for `ImageLoss`.
-    limit : float
-        Error, of the range of T, beyond which the square continues as a straight line, as of `relmse`.
+    Beyond the error `limit`, of the range of T, the square continues as a straight line, as of `relmse`.
 
-    Notes
-    -----
     About the square of `tone_mapped_psnr` at the exposure of the image. Its weights, ``T'(d) = s / (d + s)²``, depend
     on the prediction and carry no gradient, so that the noise of targets, which would darken a difference of T, leaves
     the mean alone but for light beyond the limit. Towards references it is better than `relmse`, which weighs dark
@@ -128,21 +97,10 @@ def spatial_terms(frames: int) -> list[Term]:
 
 
 def temporal_terms(frames: int, whole: float = 0.0) -> list[Term]:
-    """The paper's terms in practice: the centre, each of `frame_pairs`, and the whole window with its own weight.
+    """The paper's terms in practice: the centre first, each of `frame_pairs`, and the whole window with its own weight.
 
-    The centre's term is the first.
-
-    Parameters
-    ----------
-    frames : int
-        Length of the window.
-    whole : float
-        Weight of the whole window; 0 leaves its term out.
-
-    Notes
-    -----
     The paper uses the whole window's term only to train a model further, and downweighted, because on its own it
-    leads away from using time.
+    leads away from using time; weight 0 leaves it out.
     """
     return [
         ((frames // 2,), 1.0),
@@ -158,21 +116,12 @@ def power_terms(frames: int) -> list[Term]:
 
 
 def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -> Tensor:
-    """Weights that punish errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1.
+    """Weights that punish errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1; c the noisy
+    centre.
 
-    Returns ``(N, C, H, W)``.
-
-    Parameters
-    ----------
-    prediction, target, noisy : Tensor
-        d, r and c, ``(N, C, H, W)`` radiance; c is the noisy centre.
-    slope : float
-        λ ≥ 1. The greater, the more the network prefers noise to lost detail. For clean targets: where the target's
-        noise is independent of the input's, that noise decides on which side the prediction is.
-
-    References
-    ----------
-    Vogels et al. 2018, section 5.4, doi:10.1145/3197517.3201388.
+    The greater the slope λ ≥ 1, the more the network prefers noise to lost detail. For clean targets: where the
+    target's noise is independent of the input's, that noise decides on which side the prediction is. Vogels et al.
+    2018, section 5.4.
     """
     beyond = (prediction.detach() - target) * (target - noisy) > 0
     return torch.where(beyond, slope, 1.0)
@@ -190,34 +139,10 @@ def temporal_loss(
 ) -> Tensor:
     """Spatial loss converted to a temporal one: the target is predicted from parts of the window.
 
-    Returns ``(N,)`` weighted mean of the terms.
-
-    Parameters
-    ----------
-    loss : ImageLoss
-        Image loss.
-    filtered : Filtered
-        The window after its kernels.
-    color : Tensor
-        ``(N, T, C, H, W)`` aligned irradiance: the fallback of a subset to which the kernels give no weight.
-    target : Tensor
-        ``(N, C, H, W)`` radiance of the centre.
-    modulation : Tensor
-        ``(N, C, H, W)``: radiance is irradiance times modulation.
-    scale : Tensor
-        ``(N,)`` exposure of the irradiance.
-    terms : list of Term
-        From `temporal_terms`, `power_terms` or `spatial_terms`.
-    slope : float
-        λ of `asymmetry`; 1 for none.
-
-    Notes
-    -----
-    A subset's image is the mean of its taps: the kernels of the other frames are zeroed and the rest renormalised.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 5, equation 5.
+    Returns ``(N,)`` weighted mean of the terms; images are ``(N, C, H, W)``, `color` is ``(N, T, C, H, W)`` aligned
+    irradiance, the fallback of a subset to which the kernels give no weight; `scale` ``(N,)`` the exposure of the
+    irradiance, `slope` the λ of `asymmetry`. A subset's image is the mean of its taps: the kernels of the other frames
+    are zeroed and the rest renormalised (Kalojanov and Thurston 2023, section 5, equation 5).
     """
     centre = color.shape[1] // 2
     total = torch.zeros_like(scale)
@@ -237,19 +162,10 @@ def image_loss(
     scale: Tensor,
     slope: float = 1.0,
 ) -> Tensor:
-    """Loss of the radiance of one image; all there is for a network whose images are no sums of its frames.
+    """Loss (N,) of the radiance of one image; parameters as for `temporal_loss`.
 
-    Instead of parts of the window such a network gets windows of which `SamplerConfig.drop_frames` drops frames.
-    Returns ``(N,)``.
-
-    Parameters
-    ----------
-    loss : ImageLoss
-        Image loss.
-    image, noisy : Tensor
-        ``(N, C, H, W)`` irradiance, of the prediction and of the noisy centre.
-    target, modulation, scale, slope : Tensor and float
-        As for `temporal_loss`.
+    For networks whose images are no sums of their frames: instead of parts of the window they get windows of which
+    `SamplerConfig.drop_frames` drops frames.
     """
     radiance = image * modulation
     weights = None if slope == 1 else asymmetry(radiance, target, noisy * modulation, slope)
@@ -265,25 +181,11 @@ def difference_loss(
     to_next: Tensor,
     trust: Tensor,
 ) -> Tensor:
-    """Loss of flicker: of changes between two successive images that their targets do not have. Returns ``(N,)``.
+    """Loss of flicker (N,): of changes between two successive images that their targets do not have.
 
-    Parameters
-    ----------
-    loss : ImageLoss
-        Image loss.
-    images : Tensor
-        ``(N, 2, C, H, W)`` irradiance, the earlier frame first.
-    targets, modulation : Tensor
-        ``(N, 2, C, H, W)``, as for `temporal_loss`.
-    scale : Tensor
-        ``(N, 2)`` exposure of the irradiance.
-    to_next : Tensor
-        ``(N, 2, H, W)``, pixels: from each pixel of the first to its place in the second.
-    trust : Tensor
-        ``(N, 1, H, W)`` in [0, 1]: confidence that both are the same light.
+    Images, targets and modulation are ``(N, 2, C, H, W)``, the earlier frame first, `scale` ``(N, 2)``; `to_next` ``(N,
+    2, H, W)`` pixels, from each pixel of the first to its place in the second; `trust` ``(N, 1, H, W)`` in [0, 1].
 
-    Notes
-    -----
     With ``e_i = d_i − r_i`` and W the warp along the motion it is ``loss(d_1, r_1 + W e_2)``, weighted by trust, and by
     0 where the motion leaves the crop: the error of the motion-compensated difference of the images, which is what
     temporal PSNR measures. Independent noise in the targets adds to it and does not move where it is least.
@@ -302,28 +204,14 @@ def difference_loss(
 
 
 def tone_mapped_psnr(prediction: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio on ``x / (1 + x)``, whose limit, 1, is the peak. Returns ``(N,)`` dB, at most 120.
-
-    Parameters
-    ----------
-    prediction, target : Tensor
-        ``(N, C, H, W)`` radiance; negative counts as 0.
-    """
+    """PSNR (N,) of radiance on ``x / (1 + x)``, in dB, at most 120; negative radiance counts as 0."""
     error = functional.relu(prediction) / (1 + functional.relu(prediction))
     error = error - functional.relu(target) / (1 + functional.relu(target))
     return -10 * torch.log10(error.square().mean((1, 2, 3)).clamp_min(1e-12))
 
 
 def scale_of_radiance(scale: Tensor, modulation: Tensor) -> Tensor:
-    """Scale of the radiance of windows; a black modulation (no albedo anywhere) would make it 0.
-
-    Parameters
-    ----------
-    scale : Tensor
-        ``(N,)`` of the irradiance.
-    modulation : Tensor
-        ``(N, C, H, W)``.
-    """
+    """Scale (N,) of the radiance of windows; a black modulation (no albedo anywhere) would make it 0."""
     return scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
 
 

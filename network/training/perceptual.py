@@ -22,11 +22,8 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGG19(nn.Module):
-    """Convolutions of VGG19: images to the features of two layers. Parameters have torchvision's names.
-
-    References
-    ----------
-    Simonyan and Zisserman 2015, "Very Deep Convolutional Networks for Large-Scale Image Recognition", arXiv:1409.1556.
+    """Convolutions of VGG19 (arXiv:1409.1556): images to the features of two layers. Parameters have torchvision's
+    names.
     """
 
     mean: Tensor
@@ -57,9 +54,9 @@ class VGG19(nn.Module):
 def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
     """Load the weights of VGG19 in torchvision's format, without gradients.
 
-    The source is a state dict (.pth, read without unpickling anything but tensors, or .safetensors), or "hub", which
-    downloads torchvision's, 550 MB, once, to where torch hub keeps such files. Raises FileNotFoundError if there is no
-    such file, and ValueError if it is no state dict of VGG19.
+    The source is a state dict (.pth, of which only tensors are unpickled, or .safetensors), or "hub", which downloads
+    torchvision's, 550 MB, once, to where torch hub keeps such files. Raises FileNotFoundError if there is no such file,
+    and ValueError if it is no state dict of VGG19.
     """
     where = f"vgg {os.fspath(source)!r}"
     if source != "hub" and not Path(source).is_file():
@@ -90,15 +87,9 @@ def load_vgg19(source: str | os.PathLike[str]) -> VGG19:
 class Perceptual(nn.Module):
     """``(L_VGG5,4 + L_VGG3,4) · L_SMAPE``, with L1 distances between features; a `network.training.losses.ImageLoss`.
 
-    Notes
-    -----
     VGG19 takes images in [0, 1]: radiance is mapped by ``y = x / (1 + x)`` of the radiance over its scale, not
-    negative. The sum and the product keep the magnitudes of the terms apart, as in the paper. Weights act on SMAPE, the
-    one factor that is computed from pixels.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 5, equation 6; Johnson et al. 2016, arXiv:1603.08155.
+    negative. The sum and the product keep the magnitudes of the terms apart, as in the paper (Kalojanov and Thurston
+    2023, section 5, equation 6; arXiv:1603.08155). Weights act on SMAPE, the one factor that is computed from pixels.
     """
 
     def __init__(self, vgg: VGG19) -> None:
