@@ -51,21 +51,12 @@ OIDN_MODE_OF_PRESET = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": 
 
 @dataclass(frozen=True)
 class PerFrame:
-    """A first pass that is a function of the frame alone.
+    """A first pass that is a function of the frame alone."""
 
-    Attributes
-    ----------
-    function : callable
-        From a frame to its denoised radiance (H, W, 3), or None where it has none.
-    holds : int
-        Bytes that it takes for itself.
-    files : Shot or None
-        The finished sequence that it reads, if it does.
-    """
-
+    # from a frame to its denoised radiance (H, W, 3), or None where it has none
     function: Callable[[Frame], Array | None]
-    holds: int = 0
-    files: Shot | None = None
+    holds: int = 0  # bytes that it takes for itself
+    files: Shot | None = None  # the finished sequence that it reads, if it does
     from_noisy = False
     reads_frame = True
 
@@ -82,19 +73,12 @@ class PerFrame:
 
 @dataclass(frozen=True)
 class GuideAware:
-    """A first pass by a denoiser whose settings depend on the noise of its guides.
+    """A first pass by a denoiser whose settings depend on the noise of its guides."""
 
-    Attributes
-    ----------
-    function : callable
-        From a frame (number, color, albedo and normal alone, all finite), and whether its guides hold noise, to its
-        denoised radiance (H, W, 3).
-    holds : int
-        Bytes that it takes for itself.
-    """
-
+    # from a frame (number, color, albedo and normal alone, all finite), and whether its guides hold noise, to its
+    # denoised radiance (H, W, 3)
     function: Callable[[Frame, bool], Array]
-    holds: int = 0
+    holds: int = 0  # bytes that it takes for itself
     files = None
     from_noisy = False
     reads_frame = False
@@ -115,15 +99,9 @@ class GuideAware:
 
 @dataclass(frozen=True)
 class Classical:
-    """A first pass by the classical chain, from the window of noisy frames around each frame.
+    """A first pass by the classical chain, from the window of noisy frames around each frame."""
 
-    Attributes
-    ----------
-    preset : ClassicalPreset
-        The settings of the chain.
-    """
-
-    preset: ClassicalPreset
+    preset: ClassicalPreset  # the settings of the chain
     holds = 0
     files = None
     from_noisy = True
@@ -140,18 +118,10 @@ class Classical:
 
 
 class Backends(NamedTuple):
-    """Functions that stand for `hybrid.oidn.denoise_oidn`, with its parameters.
+    """Functions that stand for `hybrid.oidn.denoise_oidn`, with its parameters."""
 
-    Attributes
-    ----------
-    torch : callable or None
-        Runs OIDN's networks on a processor in less time.
-    bundled : callable or None
-        Runs a network that ships with ravg, where OIDN is not installed.
-    """
-
-    torch: Callable[..., Array] | None = None
-    bundled: Callable[..., Array] | None = None
+    torch: Callable[..., Array] | None = None  # runs OIDN's networks on a processor in less time
+    bundled: Callable[..., Array] | None = None  # runs a network that ships with ravg, where OIDN is not installed
 
 
 NO_BACKENDS = Backends()
@@ -159,30 +129,14 @@ NO_BACKENDS = Backends()
 
 @dataclass(frozen=True)
 class FirstPassSource:
-    """The first pass of a shot.
+    """The first pass of a shot."""
 
-    Attributes
-    ----------
-    name : str
-        What was taken; written to the header of the output.
-    first_pass : FirstPass or None
-        For a `FrameStream`; None for none.
-    reason : str
-        Why this one.
-    files : Shot or None
-        The finished sequence that it is read from, if it is one.
-    kept : tuple of Path
-        Where its pictures are kept, if they are.
-    device : str or None
-        OIDN's device, if OIDN runs.
-    """
-
-    name: str
-    first_pass: FirstPass | None
-    reason: str
-    files: Shot | None = None
-    kept: tuple[Path, ...] = ()
-    device: str | None = None
+    name: str  # what was taken; written to the header of the output
+    first_pass: FirstPass | None  # for a `FrameStream`; None for none
+    reason: str  # why this one
+    files: Shot | None = None  # the finished sequence that it is read from, if it is one
+    kept: tuple[Path, ...] = ()  # where its pictures are kept, if they are
+    device: str | None = None  # OIDN's device, if OIDN runs
 
 
 def find_first_pass(

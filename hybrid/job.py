@@ -450,35 +450,16 @@ Progress = Callable[[Step], bool | None]
 
 @dataclass(frozen=True)
 class Job:
-    """A shot that is ready to be denoised: options and files are validated, and no frame is denoised yet.
+    """A shot that is ready to be denoised: options and files are validated, and no frame is denoised yet."""
 
-    Attributes
-    ----------
-    options : DenoiseOptions
-        With the preset that was chosen.
-    output : str
-        Pattern or folder of the frames.
-    views : tuple of Shot
-        Each view layer and stereo view of the files, without layers that make no sense.
-    report : ValidationReport
-        Of the first view, with the findings of all.
-    denoiser : WindowDenoiser
-    first_passes : tuple of FirstPassSource
-        One for each view.
-    timings : Timings
-        Seconds and memory of each stage.
-    breakdown : Breakdown or None
-        Weights of the frames, if they are asked for.
-    """
-
-    options: DenoiseOptions
-    output: str
-    views: tuple[Shot, ...]
-    report: ValidationReport
+    options: DenoiseOptions  # with the preset that was chosen
+    output: str  # pattern or folder of the frames
+    views: tuple[Shot, ...]  # each view layer and stereo view of the files, without layers that make no sense
+    report: ValidationReport  # of the first view, with the findings of all
     denoiser: WindowDenoiser
-    first_passes: tuple[FirstPassSource, ...]
-    timings: Timings
-    breakdown: Breakdown | None
+    first_passes: tuple[FirstPassSource, ...]  # one for each view
+    timings: Timings  # seconds and memory of each stage
+    breakdown: Breakdown | None  # weights of the frames, if they are asked for
 
     @classmethod
     def open(

@@ -71,29 +71,16 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How frames are read, denoised and written; none of it changes a pixel.
+    """How frames are read, denoised and written; none of it changes a pixel."""
 
-    Attributes
-    ----------
-    rows : int or None
-        How many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); None for all.
-    background : bool
-        Whether to read and write in the background, which takes the memory of one frame read and one written.
-    resume : bool
-        Leave frames alone that are there, whole, and would be the same: with these attributes, of the same files.
-    keep_going : bool
-        Where a frame cannot be read, denoised or written, go on with the next.
-    attributes : mapping of str to str
-        Written to the header of each file.
-    sources : callable or None
-        The files that the frames of the shot were made from by an earlier pass (`sources_of`).
-    """
-
-    rows: int | None = None
+    rows: int | None = None  # how many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); None for all
+    # whether to read and write in the background, which takes the memory of one frame read and one written
     background: bool = True
+    # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
     resume: bool = False
-    keep_going: bool = False
-    attributes: Mapping[str, str] = field(default_factory=dict)
+    keep_going: bool = False  # where a frame cannot be read, denoised or written, go on with the next
+    attributes: Mapping[str, str] = field(default_factory=dict)  # written to the header of each file
+    # the files that the frames of the shot were made from by an earlier pass (`sources_of`)
     sources: SourcesOf | None = None
 
 

@@ -62,18 +62,10 @@ RADIUS = 2
 
 
 class Context(NamedTuple):
-    """The window that a plan is for.
+    """The window that a plan is for."""
 
-    Attributes
-    ----------
-    first_pass : bool
-        Whether its frames come with denoised frames.
-    radius : int
-        Frames on each side of the centre.
-    """
-
-    first_pass: bool
-    radius: int = RADIUS
+    first_pass: bool  # whether its frames come with denoised frames
+    radius: int = RADIUS  # frames on each side of the centre
 
 
 #: A window of noisy frames alone, and one with a first pass.
@@ -82,52 +74,26 @@ NOISY, DENOISED = Context(first_pass=False), Context(first_pass=True)
 
 @dataclass(frozen=True)
 class Decision:
-    """One stage, whether it runs, and why.
+    """One stage, whether it runs, and why."""
 
-    Attributes
-    ----------
-    stage : str
-        A key of `STAGES`.
-    on : bool
-        Whether the stage runs.
-    figure, threshold : float or None
-        The measured figure and its threshold; None for a switch, and where there was nothing to measure.
-    reason : str
-        The same in words.
-    forced : bool
-        Whether the user decided, and not the figure.
-    frames : tuple of int
-        In a plan of several frames, those with the stage.
-    """
-
-    stage: str
-    on: bool
+    stage: str  # a key of `STAGES`
+    on: bool  # whether the stage runs
+    # the measured figure and its threshold; None for a switch, and where there was nothing to measure
     figure: float | None
     threshold: float | None
-    reason: str
-    forced: bool = False
-    frames: tuple[int, ...] = ()
+    reason: str  # the same in words
+    forced: bool = False  # whether the user decided, and not the figure
+    frames: tuple[int, ...] = ()  # in a plan of several frames, those with the stage
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions for one window, or for a shot: then a stage is on if it is for any frame.
+    """The decisions for one window, or for a shot: then a stage is on if it is for any frame."""
 
-    Attributes
-    ----------
-    decisions : tuple of Decision
-        One for each of `STAGES`.
-    cuts : tuple of (int, int)
-        Neighbouring frames of different shots: nothing is averaged over them.
-    repeats : tuple of (int, int)
-        Neighbouring frames with equal samples, which count once.
-    shares : mapping of str to float
-        The share of the picture, in [0, 1], on which a stage ran that runs only in places.
-    """
-
-    decisions: tuple[Decision, ...]
-    cuts: tuple[tuple[int, int], ...] = ()
-    repeats: tuple[tuple[int, int], ...] = ()
+    decisions: tuple[Decision, ...]  # one for each of `STAGES`
+    cuts: tuple[tuple[int, int], ...] = ()  # neighbouring frames of different shots: nothing is averaged over them
+    repeats: tuple[tuple[int, int], ...] = ()  # neighbouring frames with equal samples, which count once
+    # the share of the picture, in [0, 1], on which a stage ran that runs only in places
     shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -140,17 +106,13 @@ class Plan:
 class Rules:
     """The stages that the user has forced on or off.
 
-    Attributes
-    ----------
-    on, off : frozenset of str
-        Stages that run, or do not, whatever was measured.
-
     Raises
     ------
     ValueError
         A stage that does not exist, or one that is both on and off.
     """
 
+    # stages that run, or do not, whatever was measured
     on: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
 

@@ -25,25 +25,14 @@ SECOND_LOOK = 0.8
 
 @dataclass(frozen=True)
 class ClassicalPreset:
-    """A measured point of accuracy against time.
+    """A measured point of accuracy against time."""
 
-    Attributes
-    ----------
-    name : str
-        As in ``--preset``.
-    nlm_radius, nlm_patch_radius : int
-        Search radius and patch radius of the non-local means, pixels; search radius 0: the robust average alone.
-    guided_radius : int
-        Radius of the guided filter that follows, pixels; 0: none.
-    guided_eps : float
-        Regularisation of the guided filter, relative to the guides' scale.
-    """
-
-    name: str
+    name: str  # as in ``--preset``
+    # search radius and patch radius of the non-local means, pixels; search radius 0: the robust average alone
     nlm_radius: int
     nlm_patch_radius: int
-    guided_radius: int
-    guided_eps: float
+    guided_radius: int  # radius of the guided filter that follows, pixels; 0: none
+    guided_eps: float  # regularisation of the guided filter, relative to the guides' scale
 
 
 DRAFT = ClassicalPreset("draft", 0, 0, guided_radius=1, guided_eps=1e-3)

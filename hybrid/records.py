@@ -102,29 +102,16 @@ class Record:
 
 @dataclass
 class Status:
-    """State of the frames of a sequence, from the records of a folder.
+    """State of the frames of a sequence, from the records of a folder."""
 
-    Attributes
-    ----------
-    asked, finished, running : set of int
-        Frames that some run was asked for, that are finished, and that a live run has still to make.
-    failed : dict of int to str
-        Frame → reason.
-    seconds : list of float
-        Time of each frame that was made.
-    workers : int
-        Number of live runs.
-    records : list of dict
-        Oldest first.
-    """
-
+    # frames that some run was asked for, that are finished, and that a live run has still to make
     asked: set[int] = field(default_factory=set)
     finished: set[int] = field(default_factory=set)
     running: set[int] = field(default_factory=set)
-    failed: dict[int, str] = field(default_factory=dict)
-    seconds: list[float] = field(default_factory=list)
-    workers: int = 0
-    records: list[dict[str, Any]] = field(default_factory=list)
+    failed: dict[int, str] = field(default_factory=dict)  # frame → reason
+    seconds: list[float] = field(default_factory=list)  # time of each frame that was made
+    workers: int = 0  # number of live runs
+    records: list[dict[str, Any]] = field(default_factory=list)  # oldest first
 
     @property
     def missing(self) -> set[int]:

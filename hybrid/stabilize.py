@@ -37,23 +37,13 @@ CONTENT = 0.6
 
 @dataclass(frozen=True)
 class Denoised:
-    """A denoised frame.
+    """A denoised frame."""
 
-    Attributes
-    ----------
-    color : (H, W, 3) array
-        Radiance.
-    aovs : dict of str to (H, W, C) array
-        Other layers that were filtered along, to be written over their own channels.
-    extra : dict of str to (H, W) or (H, W, C) array
-        Layers to be added to the file.
-    parts : frozenset of str
-        Those of `aovs` and `extra` that add up to the color, (H, W, 3) each: they change as it does.
-    """
-
-    color: Array
+    color: Array  # (H, W, 3): radiance
+    # (H, W, C): other layers that were filtered along, to be written over their own channels
     aovs: Mapping[str, Array] = field(default_factory=dict)
-    extra: Mapping[str, Array] = field(default_factory=dict)
+    extra: Mapping[str, Array] = field(default_factory=dict)  # (H, W) or (H, W, C): layers to add to the file
+    # those of `aovs` and `extra` that add up to the color, (H, W, 3) each: they change as it does
     parts: frozenset[str] = frozenset()
 
 
@@ -62,38 +52,20 @@ DenoiseWindow = Callable[[AlignedWindow], Denoised]
 
 @dataclass(frozen=True)
 class WindowResult:
-    """A window denoised, with what the averaging of neighbouring results reads.
+    """A window denoised, with what the averaging of neighbouring results reads."""
 
-    Attributes
-    ----------
-    denoised : Denoised
-        The centre.
-    plan : Plan
-        The stages that ran on the window.
-    neighbour_samples : SampleMean or None
-        The samples of the other frames at the centre's pixels; with the stage "blend-samples".
-    trust : dict of int to pair of Trust or None
-        From the first row of a band to the trust in the frames before and after.
-    drift_weight : (H, W) array or None
-        As `AlignedWindow.drift_weight`.
-    exposure : float
-        Of the centre's irradiance as rendered, or of the nearest frame with light.
-    brightest : float
-        The greatest mean radiance of the frames of the window.
-    excess : (H, W) array or None
-        By how much the centre as rendered exceeds the denoised one, relative to the light; with "blend-samples".
-    repaired, fireflies, outliers : int
-        As `AlignedWindow` has them, over all bands.
-    """
-
-    denoised: Denoised
-    plan: Plan
+    denoised: Denoised  # the centre
+    plan: Plan  # the stages that ran on the window
+    # the samples of the other frames at the centre's pixels; with the stage "blend-samples"
     neighbour_samples: SampleMean | None
+    # from the first row of a band to the trust in the frames before and after
     trust: dict[int, tuple[Trust | None, Trust | None]]
-    drift_weight: Array | None
-    exposure: float
-    brightest: float
+    drift_weight: Array | None  # (H, W): as `AlignedWindow.drift_weight`
+    exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
+    brightest: float  # the greatest mean radiance of the frames of the window
+    # (H, W): by how much the centre as rendered exceeds the denoised one, relative to the light; with "blend-samples"
     excess: Array | None
+    # as `AlignedWindow` has them, over all bands
     repaired: int
     fireflies: int
     outliers: int
@@ -101,33 +73,19 @@ class WindowResult:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """The finished frame, and figures of it.
+    """The finished frame, and figures of it."""
 
-    Attributes
-    ----------
-    denoised : Denoised
-        The frame.
-    plan : Plan
-        The stages that ran on its window.
-    averaged : tuple of int
-        The frames whose results were there to be averaged, itself among them.
-    mean, removed_radiance : float
-        Mean radiance of the noisy frame without its fireflies, and the mean radiance of these.
-    repaired, fireflies, outliers : int
-        As for `WindowResult`.
-    beyond : int
-        Values beyond the range of half floats.
-    """
-
-    denoised: Denoised
-    plan: Plan
-    averaged: tuple[int, ...]
+    denoised: Denoised  # the frame
+    plan: Plan  # the stages that ran on its window
+    averaged: tuple[int, ...]  # the frames whose results were there to be averaged, itself among them
+    # mean radiance of the noisy frame without its fireflies, and the mean radiance of these
     mean: float
     removed_radiance: float
+    # as for `WindowResult`
     repaired: int
     fireflies: int
     outliers: int
-    beyond: int
+    beyond: int  # values beyond the range of half floats
 
 
 class FrameDenoiser:

@@ -74,26 +74,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class ValidationReport:
-    """Findings about a shot's layers.
+    """Findings about a shot's layers."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        In the order of the roles.
-    motion : Choice or None
-        The motion conventions that were tried; None without vectors, or without a pair of frames.
-    variance_scale : float or None
-        Measured factor of the variance.
-    passes : Passes
-        How the AOVs add up to the beauty.
-    estimate_factors : (float, float, float) or None
-        Measured factors of the denoised picture, if its level is not that of the samples.
-    """
-
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # in the order of the roles
+    # the motion conventions that were tried; None without vectors, or without a pair of frames
     motion: Choice | None = None
-    variance_scale: float | None = None
-    passes: Passes = NO_PASSES
+    variance_scale: float | None = None  # measured factor of the variance
+    passes: Passes = NO_PASSES  # how the AOVs add up to the beauty
+    # measured factors of the denoised picture, if its level is not that of the samples
     estimate_factors: tuple[float, float, float] | None = None
 
     @property

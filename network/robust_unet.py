@@ -69,33 +69,15 @@ class RobustUNetConfig:
 
 
 class PooledWindow(NamedTuple):
-    """A window whose frames are noisy images of its centre, and averages of it.
+    """A window whose frames are noisy images of its centre, and averages of it."""
 
-    Attributes
-    ----------
-    frames : Tensor
-        ``(N, T, 3, H, W)`` on the transfer curve, each with its own noise; their mean is `pooled`.
-    pooled : Tensor
-        ``(N, 3, H, W)`` on the curve: the pooled samples of all frames.
-    average : Tensor
-        ``(N, 3, H, W)`` irradiance: average of the first passes by confidence.
-    encoded_average : Tensor
-        The same as radiance on the curve.
-    confidence : Tensor
-        ``(N, T, 1, H, W)``; 1 for the centre where no frame has any.
-    samples : Tensor
-        ``(N, 1, H, W)`` in (0, 1]: frames' worth of pooled samples, over T.
-    parts : Tensor
-        ``(N, T, 3, H, W)`` irradiance: contribution of each frame to the pooled image.
-    """
-
-    frames: Tensor
-    pooled: Tensor
-    average: Tensor
-    encoded_average: Tensor
-    confidence: Tensor
-    samples: Tensor
-    parts: Tensor
+    frames: Tensor  # ``(N, T, 3, H, W)`` on the transfer curve, each with its own noise; their mean is `pooled`
+    pooled: Tensor  # ``(N, 3, H, W)`` on the curve: the pooled samples of all frames
+    average: Tensor  # ``(N, 3, H, W)`` irradiance: average of the first passes by confidence
+    encoded_average: Tensor  # the same as radiance on the curve
+    confidence: Tensor  # ``(N, T, 1, H, W)``; 1 for the centre where no frame has any
+    samples: Tensor  # ``(N, 1, H, W)`` in (0, 1]: frames' worth of pooled samples, over T
+    parts: Tensor  # ``(N, T, 3, H, W)`` irradiance: contribution of each frame to the pooled image
 
 
 def pool_samples(window: UNetWindow) -> PooledWindow:

@@ -13,53 +13,26 @@ FRAME_CHANNELS, SHARED_CHANNELS, STATIC_CHANNELS = 4, 10, 9
 
 
 class UNetWindow(NamedTuple):
-    """An aligned window of T frames, float32.
+    """An aligned window of T frames, float32."""
 
-    Attributes
-    ----------
-    first_pass : Tensor
-        ``(N, T, 3, H, W)`` irradiance: each frame denoised by itself.
-    residual : Tensor
-        ``(N, T, 3, H, W)`` irradiance of the noisy frames minus `first_pass`, each frame's in its own place, aligned to
-        the nearest pixel.
-    confidence : Tensor
-        ``(N, T, 1, H, W)``, at least 0.
-    modulation : Tensor
-        ``(N, 3, H, W)``; radiance is irradiance times modulation.
-    exposure : Tensor
-        ``(N,)``, positive: brightness of the irradiance of whole frames.
-    gain : Tensor
-        ``(N,)``, positive: factor of radiance before the transfer curve (`hybrid.alignment.transfer.measure_gain`).
-    albedo, normal : Tensor or None
-        ``(N, 3, H, W)`` guides of the centre, in [0, 1] and [−1, 1].
-    """
-
-    first_pass: Tensor
+    first_pass: Tensor  # ``(N, T, 3, H, W)`` irradiance: each frame denoised by itself
+    # ``(N, T, 3, H, W)`` irradiance of the noisy frames minus `first_pass`, each frame's in its own place, aligned to
+    # the nearest pixel
     residual: Tensor
-    confidence: Tensor
-    modulation: Tensor
-    exposure: Tensor
+    confidence: Tensor  # ``(N, T, 1, H, W)``, at least 0
+    modulation: Tensor  # ``(N, 3, H, W)``; radiance is irradiance times modulation
+    exposure: Tensor  # ``(N,)``, positive: brightness of the irradiance of whole frames
+    # ``(N,)``, positive: factor of radiance before the transfer curve (`hybrid.alignment.transfer.measure_gain`)
     gain: Tensor
+    # ``(N, 3, H, W)`` guides of the centre, in [0, 1] and [−1, 1]
     albedo: Tensor | None = None
     normal: Tensor | None = None
 
 
 class PackedInputs(NamedTuple):
-    """Inputs of a `network.robust_unet.RobustUNet`, and the average that its image is blended with.
+    """Inputs of a `network.robust_unet.RobustUNet`, and the average that its image is blended with."""
 
-    Attributes
-    ----------
-    frames : Tensor
-        ``(T·N, 4, H, W)``, time first: image on the transfer curve, confidence.
-    shared : Tensor
-        ``(N, 10, H, W)``: albedo, normal, average of the first passes on the curve, pooled samples over T.
-    static : Tensor
-        ``(N, 9, H, W)``: pooled image on the curve, albedo, normal, in [0, 1].
-    average : Tensor
-        ``(N, 3, H, W)`` irradiance: average of the first passes by confidence.
-    """
-
-    frames: Tensor
-    shared: Tensor
-    static: Tensor
-    average: Tensor
+    frames: Tensor  # ``(T·N, 4, H, W)``, time first: image on the transfer curve, confidence
+    shared: Tensor  # ``(N, 10, H, W)``: albedo, normal, average of the first passes on the curve, pooled samples over T
+    static: Tensor  # ``(N, 9, H, W)``: pooled image on the curve, albedo, normal, in [0, 1]
+    average: Tensor  # ``(N, 3, H, W)`` irradiance: average of the first passes by confidence

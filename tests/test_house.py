@@ -229,7 +229,7 @@ def test_docstrings_name_the_parameters_that_there_are(package):
     """A section of parameters has all of them, in order, and no others."""
     found = [node for path in sorted((ROOT / package).rglob("*.py")) for node in public_functions(path)]
     documented = [node for node in found if documented_parameters(node)]
-    assert len(documented) > 5 or package == "network"
+    assert documented or package == "network"
     for node in documented:
         assert documented_parameters(node) == parameters(node), node.name
 

@@ -55,18 +55,10 @@ class _Warped(NamedTuple):
 
 
 class Stillness(NamedTuple):
-    """How far the light of a frame stands still.
+    """How far the light of a frame stands still."""
 
-    Attributes
-    ----------
-    local : (H, W) array
-        In [0, 1].
-    whole : float32
-        Whether enough of the frame stands still, in [0, 1].
-    """
-
-    local: Array
-    whole: np.float32
+    local: Array  # (H, W), in [0, 1]
+    whole: np.float32  # whether enough of the frame stands still, in [0, 1]
 
 
 def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
@@ -79,19 +71,8 @@ def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
 def align(window: Window, rows: slice | None = None, *, timings: Timings | None = None) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
-    Parameters
-    ----------
-    window : Window
-        From `hybrid.stream.FrameStream.window`.
-    rows : slice, optional
-        Only these rows, and `MARGIN` around them; the whole frame without.
-    timings : Timings, optional
-        Counts the stages "warp" and "confidence".
-
-    Raises
-    ------
-    ValueError
-        If one frame has a layer that another one lacks, or the centre has no first pass and others do.
+    With `rows` only these rows of the frame, and `MARGIN` around them. Raises ValueError if one frame has a layer that
+    another one lacks, or the centre has no first pass and others do.
     """
     timings = timings or Timings()
     _expect_equal_layers(window)
@@ -229,27 +210,16 @@ def align_results(
 
 
 def aligned_planes(layers: Layers) -> float:
-    """Count the float32 planes of each frame of an `AlignedWindow` of these layers, with its first pass.
-
-    Parameters
-    ----------
-    layers : Layers
-        Of a file.
-    """
+    """Count the float32 planes of each frame of an `AlignedWindow` of these layers, with its first pass."""
     guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
     aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
     return 3 + 3 + guides + aovs + 1
 
 
 def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:
-    """Measure how far the light of a frame stands still, by the weight of the next frame.
+    """Measure how far the light of a frame (H, W) stands still, by the weight of the next frame.
 
-    Parameters
-    ----------
-    drift_weight : (H, W) array or None
-        `AlignedWindow.drift_weight`. Without one nothing is known: 0 everywhere, and 1 for the whole.
-    shape : (int, int)
-        H and W.
+    Without `AlignedWindow.drift_weight` nothing is known: 0 everywhere, and 1 for the whole.
     """
     if drift_weight is None:
         return Stillness(np.zeros(shape, np.float32), np.float32(1))

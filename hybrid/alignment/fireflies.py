@@ -37,16 +37,10 @@ WITNESSES, REACH = 2, 2
 def remove_fireflies(
     frame: PreparedFrame, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
 ) -> PreparedFrame:
-    """Remove the single bright samples of a frame, and set its one-pixel highlights apart.
+    """Remove the single bright samples of a prepared frame, and set its one-pixel highlights apart.
 
-    Parameters
-    ----------
-    frame : PreparedFrame
-        As prepared.
-    neighbour : callable
-        From −2, −1, 1 or 2 to the prepared frame so many frames away, fireflies included; None if there is none.
-    timings : Timings
-        Counts the stage "prepare".
+    `neighbour` maps −2, −1, 1 or 2 to the prepared frame so many frames away, fireflies included; None if there is
+    none.
     """
     with timings.stage("prepare"):
         places, isolated = find_bright_samples(frame.irradiance)

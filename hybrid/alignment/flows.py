@@ -23,18 +23,10 @@ HIDDEN = 3.0
 
 
 class Flow(NamedTuple):
-    """Where each pixel of a frame is in another one.
+    """Where each pixel of a frame is in another one."""
 
-    Attributes
-    ----------
-    vectors : (H, W, 2) array
-        Pixels, x and y.
-    valid : (H, W) bool array
-        Where they are defined.
-    """
-
-    vectors: Array
-    valid: Mask
+    vectors: Array  # (H, W, 2): pixels, x and y
+    valid: Mask  # (H, W): where they are defined
 
 
 class Link(NamedTuple):
@@ -45,35 +37,22 @@ class Link(NamedTuple):
 
 
 class PairFlows(NamedTuple):
-    """Flows between two neighbouring frames.
+    """Flows between two neighbouring frames."""
 
-    Attributes
-    ----------
-    to_later, to_earlier : Flow or None
-        None where there is none.
-    refined : float or None
-        The mean share of the picture, in [0, 1], on which TV-L1 corrected the renderer's vectors; None where it did
-        not run.
-    """
-
+    # None where there is none
     to_later: Flow | None
     to_earlier: Flow | None
+    # the mean share of the picture, in [0, 1], on which TV-L1 corrected the renderer's vectors; None where it did not
+    # run
     refined: tuple[float, ...] = ()
 
 
 def measure_flows(
     earlier: PreparedFrame, later: PreparedFrame, stages: Collection[str], refine: Callable[..., Array]
 ) -> PairFlows:
-    """Find the flows between two neighbouring frames.
+    """Find the flows between two neighbouring frames; `refine` corrects vectors as `flow.tvl1.refine_flow` does.
 
-    Parameters
-    ----------
-    earlier, later : PreparedFrame
-        The frames.
-    stages : collection of str
-        Those that the pair calls for, so that its flow is the same in every window.
-    refine : callable
-        Corrects vectors as `flow.tvl1.refine_flow` does.
+    The stages are those that the pair calls for, so that its flow is the same in every window.
     """
     shape = earlier.irradiance.shape[:2]
     if "warp" not in stages:
@@ -110,18 +89,7 @@ def _correct(
 
 
 def compose_flows(first: Flow | None, second: Flow | None) -> Flow | None:
-    """Compose two flows.
-
-    Parameters
-    ----------
-    first, second : Flow or None
-        From a frame to the next, and from that one on.
-
-    Returns
-    -------
-    Flow or None
-        None where one is missing.
-    """
+    """Compose the flows from a frame to the next, and from that one on; None where one is missing."""
     if first is None or second is None:
         return None
     return Flow(*compose_flow(first.vectors, second.vectors, first_valid=first.valid, second_valid=second.valid))

@@ -54,90 +54,44 @@ CUT = 0.5
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """Measurements of one frame.
-
-    Attributes
-    ----------
-    number : int
-    albedo_spread : float or None
-        Standard deviation of the albedo over the frame.
-    guides : bool
-        Whether the frame has albedo or normal.
-    fireflies : int
-        Number of fireflies that were removed.
-    outliers : float
-        Share of the pixels far above all their neighbours, in [0, 1].
-    transparent : float or None
-        Share of the pixels whose alpha is below 0.999.
-    noise_free : float
-        Share of the tiles without noise, in [0, 1].
-    """
+    """Measurements of one frame."""
 
     number: int
-    albedo_spread: float | None
-    guides: bool
-    fireflies: int
-    outliers: float
-    transparent: float | None
-    noise_free: float
+    albedo_spread: float | None  # standard deviation of the albedo over the frame
+    guides: bool  # whether the frame has albedo or normal
+    fireflies: int  # number of fireflies that were removed
+    outliers: float  # share of the pixels far above all their neighbours, in [0, 1]
+    transparent: float | None  # share of the pixels whose alpha is below 0.999
+    noise_free: float  # share of the tiles without noise, in [0, 1]
 
 
 @dataclass(frozen=True)
 class PairFacts:
-    """Measurements of two neighbouring frames.
+    """Measurements of two neighbouring frames."""
 
-    Attributes
-    ----------
-    numbers : (int, int)
-        Ascending.
-    vectors : bool
-        Whether the frames have motion vectors.
-    speed : float
-        Pixels per frame, the 0.999 quantile of the vectors; 0 without vectors.
-    changed : float
-        Share of the picture that changes at equal pixels by more than noise, in [0, 1].
-    unexplained : float
-        Share of the picture whose light changes along the vectors by more than noise; `changed` without vectors.
-    fixed_noise : float
-        Share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0.
-    guide_noise : float
-        Upper quartile of the difference of albedo and normal between the frames, along the vectors.
-    cut : bool
-        Whether the frames are of different scenes, so that they must not be averaged.
-    repeated : bool
-        Whether the later frame repeats the earlier one, and has no samples of its own.
-    """
-
-    numbers: tuple[int, int]
-    vectors: bool
-    speed: float
-    changed: float
+    numbers: tuple[int, int]  # ascending
+    vectors: bool  # whether the frames have motion vectors
+    speed: float  # pixels per frame, the 0.999 quantile of the vectors; 0 without vectors
+    changed: float  # share of the picture that changes at equal pixels by more than noise, in [0, 1]
+    # share of the picture whose light changes along the vectors by more than noise; `changed` without vectors
     unexplained: float
+    # share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0
     fixed_noise: float
-    guide_noise: float
-    cut: bool = False
-    repeated: bool = False
+    guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
+    cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
+    repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
 
 
 @dataclass(frozen=True)
 class SmallFrame:
-    """A frame reduced by a whole `factor` for measuring.
-
-    Attributes
-    ----------
-    irradiance, light : (h, w, 3) array
-        Means over factor × factor pixels, noisy and without most of the noise.
-    albedo : (h, w, 3) array or None
-        Divisor of the irradiance.
-    valid : (h, w) bool array
-        Where the frame has been rendered.
-    """
+    """A frame reduced by a whole `factor` for measuring."""
 
     factor: int
+    # (h, w, 3): means over factor × factor pixels, noisy and without most of the noise
     irradiance: Array
     light: Array
-    albedo: Array | None
-    valid: Mask
+    albedo: Array | None  # (h, w, 3): divisor of the irradiance
+    valid: Mask  # (h, w): where the frame has been rendered
 
     def textured(self) -> SmallFrame:
         """Return the frame times its albedo: motion shows in texture first."""
@@ -166,14 +120,7 @@ def shrink(frame: PreparedFrame) -> SmallFrame:
 
 
 def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
-    """Measure one frame.
-
-    Parameters
-    ----------
-    frame : PreparedFrame
-    small : SmallFrame
-        From `shrink`.
-    """
+    """Measure one frame, and its `shrink`."""
     _, rejected = reject_outliers(frame.irradiance[None], frame.valid[None].astype(np.float32))
     return FrameFacts(
         number=frame.number,
@@ -187,15 +134,7 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
 
 
 def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallFrame, SmallFrame]) -> PairFacts:
-    """Measure two neighbouring frames.
-
-    Parameters
-    ----------
-    here, there : PreparedFrame
-        In order of time.
-    smalls : (SmallFrame, SmallFrame)
-        From `shrink`.
-    """
+    """Measure two neighbouring frames, in order of time, and their `shrink`."""
     vectors = rendered_flow(here, there)
     changed = _changed(smalls[0].textured(), smalls[1].textured(), None)
     if vectors is None:  # motion shows in the guides first, which have next to no noise
@@ -251,17 +190,10 @@ def _guides(here: PreparedFrame, there: PreparedFrame) -> list[tuple[Array, Arra
 
 
 def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> float:
-    """Measure the share of the noise of two frames that is the same at equal pixels, in [-1, 1]; 0 without noise.
+    """Measure the share of the noise of two neighbours that is the same at equal pixels, in [-1, 1]; 0 without noise.
 
-    Parameters
-    ----------
-    here, there : PreparedFrame
-        Neighbouring frames of one size.
-    moves : bool
-        Whether the picture changes at equal pixels: without vectors, motion is then searched for.
+    With `moves` the picture changes at equal pixels: without vectors, motion is then searched for.
 
-    Notes
-    -----
     Detail correlates at equal pixels as fixed noise does, so it is removed first. In moving parts each frame is
     compared with the other one, warped to it: d_a = a - b(x + v), d_b = b - a(x - v). With a seed for each frame their
     covariance at equal pixels is 0, with and without detail; with one seed it is half of their variance. In static
@@ -301,19 +233,10 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
 
 
 def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
-    """Find pixels at which two frames have noise or detail, and those at which it is the same sample.
+    """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
 
-    Parameters
-    ----------
-    here, there : (H, W, 3) array
-        Irradiance, as rendered.
-
-    Returns
-    -------
-    grainy : (H, W) array
-        1 where both differ from the median of 5×5 pixels by more than the rounding of half floats, else 0.
-    equal : (H, W) array
-        1 where their values also agree to that rounding, else 0.
+    The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than the rounding of half floats, else
+    0; the second is 1 where their values also agree to that rounding.
     """
     a, b = _level(here), _level(there)
     most = np.maximum(np.abs(a), np.abs(b))
@@ -323,27 +246,13 @@ def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
 
 
 def repeats(grainy: Array, equal: Array) -> bool:
-    """Return whether a frame repeats another; False if hardly any pixel has noise or detail.
-
-    Parameters
-    ----------
-    grainy, equal : (H, W) array
-        From `equal_noise`.
-    """
+    """Return whether a frame repeats another, by `equal_noise`; False if hardly any pixel has noise or detail."""
     count = np.count_nonzero(grainy)
     return bool(count >= FEW and np.count_nonzero(equal) >= REPEATED * count)
 
 
 def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
-    """Return whether two frames have the same noise around each of some pixels, (K,) bool.
-
-    Parameters
-    ----------
-    grainy, equal : (H, W) array
-        From `equal_noise`.
-    pixels : (K, 2) array
-        Rows and columns.
-    """
+    """Return whether two frames, by `equal_noise`, have the same noise around each of some pixels, (K,) bool."""
     share = float(equal.sum() / max(grainy.sum(), 1))
     rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))
     side = (NOISE_AROUND, NOISE_AROUND)

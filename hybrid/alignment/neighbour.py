@@ -26,14 +26,7 @@ SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:
     """Layers of a frame that are warped, by name.
 
-    Parameters
-    ----------
-    frame : PreparedFrame
-        The frame.
-    light : bool
-        Whether its light is among them, which the gate compares where there is no first pass.
-    alpha : bool
-        Whether alpha is among them.
+    With `light`, which the gate compares where there is no first pass.
     """
     named = {
         "color": frame.irradiance,
@@ -47,23 +40,9 @@ def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False)
 
 
 def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> Mask:
-    """Warp a neighbour's layers to some rows of the centre.
+    """Warp a neighbour's layers to some rows of the centre, into `warped`; return where (h, W) the color was measured.
 
-    Parameters
-    ----------
-    there : PreparedFrame
-        The neighbour.
-    flow : (h, W, 2) array
-        From these rows to the neighbour, pixels.
-    rows : slice
-        Rows of the centre.
-    warped : dict of str to (h, W, C) array
-        Results, by the names of `layers_of`.
-
-    Returns
-    -------
-    (h, W) bool array
-        Where the warped color was measured.
+    The flow (h, W, 2) leads from these rows to the neighbour; names are those of `layers_of`.
     """
     layers = layers_of(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
     if not flow.any():
@@ -88,25 +67,10 @@ def trust_geometry(
     back: Array,
     first_row: int,
 ) -> Array:
-    """Measure how far geometry trusts a warped neighbour.
+    """Measure the confidence (h, W), in [0, 1], of geometry in a warped neighbour.
 
-    Parameters
-    ----------
-    centre, warped : dict of str to (h, W, C) array
-        Layers of the centre and the neighbour.
-    flow : (h, W, 2) array
-        From these rows of the centre to the neighbour, pixels.
-    measured : (h, W) bool array
-        Where the neighbour shows a measured color.
-    back : (H, W, 2) array
-        The neighbour's flow to the centre.
-    first_row : int
-        The first of these rows.
-
-    Returns
-    -------
-    (h, W) array
-        Confidence, in [0, 1].
+    The flow (h, W, 2) leads from rows of the centre, of which `first_row` is the first, to the neighbour; `back` (H, W,
+    2) from the neighbour to the centre. `measured` is the result of `warp_layers`.
     """
     return estimate_confidence(
         flow,
@@ -134,25 +98,10 @@ def trust_light(
     *,
     agreeing: float = AGREEING,
 ) -> Array:
-    """Combine the confidence of geometry with the gate.
+    """Combine confidence and coverage of geometry with the gate, each (T, h, W): max(c g, min(coverage, agreeing) g).
 
-    Parameters
-    ----------
-    confidence : (T, h, W) array
-        By geometry, in [0, 1].
-    coverage : (T, h, W) array
-        Coverage: an upper bound of the confidence.
-    gate : (T, h, W) array
-        How far frames show the centre's light (`nlm.gate`), in [0, 1].
-    stages : collection of str
-        Without "gate" the confidence of geometry stands.
-    agreeing : float
-        The confidence that geometry leaves at least where the light agrees.
-
-    Returns
-    -------
-    (T, h, W) array
-        max(c g, min(coverage, agreeing) g), in [0, 1].
+    Coverage is an upper bound of the confidence; `agreeing` is the confidence that geometry leaves at least where the
+    light agrees. Without the stage "gate" the confidence of geometry stands.
     """
     floor = np.minimum(coverage, agreeing) * gate
     return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (coverage > 0)

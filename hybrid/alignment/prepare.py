@@ -39,66 +39,32 @@ class Brightness(NamedTuple):
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, finite and divided by its albedo.
-
-    Attributes
-    ----------
-    number : int
-    irradiance : (H, W, 3) array
-        Color divided by albedo (`hybrid.alignment.transfer.demodulate`), or the color itself if not `demodulated`.
-    albedo, normal : (H, W, 3) array or None
-        Finite.
-    valid : (H, W) bool array
-        False where the renderer's color was not finite.
-    repaired : int
-        Number of pixels, of any layer, that were not finite and have been filled in.
-    motion : Motion or None
-        In our convention.
-    depth : (H, W) array or None
-        Distance; only its order is used, and only with vectors of one direction.
-    variance : (H, W, 3) array or None
-        Of the irradiance.
-    alpha : (H, W, 1) array or None
-        Coverage, finite.
-    aovs : dict of str to (H, W, C) array
-        Demodulated if they are textured.
-    demodulated : bool
-        Whether the albedo has been divided out.
-    pass_colors : dict of str to (H, W, 3) array
-        Colors of AOVs, finite and at least 0.
-    passes : Passes
-        How `aovs` add up to the beauty in this frame.
-    unfiltered : Unfiltered
-        Light that is restored in the finished picture.
-    fireflies : int
-        Number of fireflies that were removed.
-    removed_radiance : float
-        Their mean radiance, which belongs to the picture in expectation.
-    removed_samples : (tuple of index arrays, (K, 3) array) or None
-        Where fireflies were removed from `irradiance`, and its values there as rendered.
-    highlights : Lights or None
-        Persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are
-        not in `irradiance`, and are added to the finished picture.
-    """
+    """One frame, finite and divided by its albedo."""
 
     number: int
+    # (H, W, 3): color divided by albedo (`hybrid.alignment.transfer.demodulate`), or the color itself if not
+    # `demodulated`
     irradiance: Array
+    # (H, W, 3), finite
     albedo: Array | None
     normal: Array | None
-    valid: Mask
-    repaired: int
-    motion: Motion | None
-    depth: Array | None
-    variance: Array | None
-    alpha: Array | None
-    aovs: dict[str, Array]
-    demodulated: bool
-    pass_colors: dict[str, Array] = field(default_factory=dict)
-    passes: Passes = NO_PASSES
-    unfiltered: Unfiltered = field(default_factory=Unfiltered)
-    fireflies: int = 0
-    removed_radiance: float = 0.0
+    valid: Mask  # (H, W): False where the renderer's color was not finite
+    repaired: int  # number of pixels, of any layer, that were not finite and have been filled in
+    motion: Motion | None  # in our convention
+    depth: Array | None  # (H, W): distance; only its order is used, and only with vectors of one direction
+    variance: Array | None  # (H, W, 3), of the irradiance
+    alpha: Array | None  # (H, W, 1): coverage, finite
+    aovs: dict[str, Array]  # (H, W, C), demodulated if they are textured
+    demodulated: bool  # whether the albedo has been divided out
+    pass_colors: dict[str, Array] = field(default_factory=dict)  # (H, W, 3): colors of AOVs, finite and at least 0
+    passes: Passes = NO_PASSES  # how `aovs` add up to the beauty in this frame
+    unfiltered: Unfiltered = field(default_factory=Unfiltered)  # light that is restored in the finished picture
+    fireflies: int = 0  # number of fireflies that were removed
+    removed_radiance: float = 0.0  # their mean radiance, which belongs to the picture in expectation
+    # indices where fireflies were removed from `irradiance`, and its values there, (K, 3), as rendered
     removed_samples: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
+    # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
+    # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
 
     @cached_property
@@ -171,14 +137,7 @@ class PreparedFrame:
 
 
 def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
-    """Fill non-finite pixels of a frame, set light apart that is not filtered, and divide by the albedo.
-
-    Parameters
-    ----------
-    frame : Frame
-    demodulated : bool
-        Divide by the albedo if there is one.
-    """
+    """Fill non-finite pixels of a frame, set light apart that is not filtered, and divide by any albedo."""
     color, unfiltered = split_unfiltered(frame)
     color, bad = replace_nonfinite(color)
     repaired = bad if unfiltered.lights is None else bad & ~unfiltered.lights
@@ -227,13 +186,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
 
 
 def prepared_planes(layers: Layers) -> float:
-    """Count the float32 planes of a `PreparedFrame` of these layers, with its light.
-
-    Parameters
-    ----------
-    layers : Layers
-        Of a file.
-    """
+    """Count the float32 planes of a `PreparedFrame` of these layers, with its light."""
     given = (layers.albedo, layers.normal, layers.variance)
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
     one_way = layers.motion_convention is not None and not layers.motion_convention.pair
@@ -243,15 +196,7 @@ def prepared_planes(layers: Layers) -> float:
 
 
 def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -> Array:
-    """Denoise the irradiance of one frame by a guided filter, cheaply, for the gate.
-
-    Parameters
-    ----------
-    irradiance : (H, W, 3) array
-        Finite.
-    albedo, normal : (H, W, 3) array or None
-        Finite.
-    """
+    """Denoise the finite irradiance of one frame by a guided filter, cheaply, for the gate."""
     clean, _ = reject_outliers(irradiance[None], np.ones((1, *irradiance.shape[:2]), np.float32))
     guides = [layer for layer in (albedo, normal) if layer is not None]
     if guides:
@@ -261,19 +206,9 @@ def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -
 
 
 def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
-    """Return the renderer's flow between neighbouring frames, or None without vectors.
+    """Return the renderer's flow (H, W, 2) between neighbouring frames, and where it is known; None without vectors.
 
-    Parameters
-    ----------
-    here, there : PreparedFrame
-        Neighbours. Vectors span one frame; if only every n-th frame was rendered they are multiplied by n.
-
-    Returns
-    -------
-    flow : (H, W, 2) array
-        Pixels, from `here` to `there`.
-    valid : (H, W) array of bool
-        Where the flow is known.
+    Vectors span one frame; if only every n-th frame was rendered they are multiplied by n.
     """
     step = abs(there.number - here.number)
     forward = there.number > here.number

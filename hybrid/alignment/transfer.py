@@ -21,29 +21,14 @@ LIT = 1e-2
 def demodulate(radiance: Array, albedo: Array) -> Array:
     """Divide radiance by albedo, which leaves the light (irradiance, up to a constant) without the texture.
 
-    Parameters
-    ----------
-    radiance : (H, W, C) array
-        Linear radiance, unbounded.
-    albedo : (H, W, 3) array
-        Reflectance, finite, >= 0. Its mean over channels is used where C is not 3.
-
-    Notes
-    -----
-    ``radiance / (albedo + ALBEDO_FLOOR)``; Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1,
-    doi:10.1145/3072959.3073708.
+    ``radiance / (albedo + ALBEDO_FLOOR)`` (Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1,
+    doi:10.1145/3072959.3073708); with the albedo's mean over channels where radiance has other than three.
     """
     return radiance / _divisor(albedo, radiance.shape[-1])
 
 
 def remodulate(irradiance: Array, albedo: Array) -> Array:
-    """Invert `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``.
-
-    Parameters
-    ----------
-    irradiance : (H, W, C) array
-    albedo : (H, W, 3) array
-    """
+    """Invert `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``."""
     return irradiance * _divisor(albedo, irradiance.shape[-1])
 
 
@@ -54,17 +39,8 @@ def _divisor(albedo: Array, channels: int) -> Array:
 
 
 def compress(radiance: Array, exposure: float) -> Array:
-    """Map [0, inf) to [0, 1).
+    """Map [0, inf) to [0, 1), the exposure to 1/2; negative values count as 0.
 
-    Parameters
-    ----------
-    radiance : array
-        Linear; negative values count as 0.
-    exposure : float
-        Radiance that is mapped to 1/2.
-
-    Notes
-    -----
     ``x / (1 + x)`` with ``x = radiance / exposure``; Reinhard et al. 2002, doi:10.1145/566654.566575, eq. 3.
     """
     light = np.asarray(np.maximum(radiance, 0), np.float32)
@@ -73,14 +49,7 @@ def compress(radiance: Array, exposure: float) -> Array:
 
 
 def expand(compressed: Array, exposure: float) -> Array:
-    """Invert `compress`.
-
-    Parameters
-    ----------
-    compressed : array
-        In [0, 1).
-    exposure : float
-    """
+    """Invert `compress`."""
     return compressed / (1 - compressed) * np.float32(exposure)
 
 
@@ -88,13 +57,9 @@ def measure_exposure(radiance: Array) -> float:
     """Return the mean radiance of the lit part of an image (H, W, C), with its brightest hundredth clipped.
 
     Positive, and proportional to the image; 1 for an image with less light than `NO_LIGHT`. Non-finite values are
-    excluded.
-
-    Notes
-    -----
-    The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times the result,
-    so that an object on black has the exposure of the object alone. Single pixels do not show whether a surface is lit:
-    in noisy images many of its pixels are black.
+    excluded. The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times
+    the result, so that an object on black has the exposure of the object alone. Single pixels do not show whether a
+    surface is lit: in noisy images many of its pixels are black.
     """
     if radiance.size == 0:
         return 1.0
@@ -131,15 +96,6 @@ def measure_gain(picture: Array) -> float:
 def autoexposure(radiance: Array, *, dark: float = 1e-8) -> float:
     """Return OIDN's factor of an image; ``autoexposure(a·x) = autoexposure(x) / a``; 1 without light.
 
-    Parameters
-    ----------
-    radiance : (H, W, 3) array
-        Linear, finite; negative values count as 0.
-    dark : float
-        Bins of at most this luminance are excluded.
-
-    Notes
-    -----
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
     ``training/color.py``; `network.unet.autoexposure` is the same in torch.
     """

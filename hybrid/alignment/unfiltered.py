@@ -34,24 +34,14 @@ _LIGHT = 5
 
 @dataclass(frozen=True)
 class Unfiltered:
-    """Light that is restored in the finished picture of a frame.
+    """Light that is restored in the finished picture of a frame."""
 
-    Attributes
-    ----------
-    beyond : (H, W, 3) array or None
-        Radiance of lights brighter than half can hold: `HALF_MAX` where it is +Inf; NaN in all other pixels.
-    negative : dict of str to (H, W, 3) array
-        "color" or AOV → noisy negative radiance of colors outside of the gamut.
-    gray : frozenset of str
-        Names, "color" or AOVs, whose three channels are equal everywhere.
-    region : (slice, slice) or None
-        Rows and columns of a render region, outside which the frame is black.
-    """
-
+    # (H, W, 3): radiance of lights brighter than half can hold: `HALF_MAX` where it is +Inf; NaN in all other pixels
     beyond: Array | None = None
+    # (H, W, 3): "color" or AOV → noisy negative radiance of colors outside of the gamut
     negative: Mapping[str, Array] = field(default_factory=dict)
-    gray: frozenset[str] = frozenset()
-    region: Region | None = None
+    gray: frozenset[str] = frozenset()  # names, "color" or AOVs, whose three channels are equal everywhere
+    region: Region | None = None  # rows and columns of a render region, outside which the frame is black
 
     @property
     def lights(self) -> Mask | None:
@@ -113,14 +103,7 @@ def find_region(color: Array) -> Region | None:
 
 
 def mirror_region(frame: Frame, region: Region) -> Frame:
-    """Mirror the color and the guides of a frame beyond the edges of its render region.
-
-    Parameters
-    ----------
-    frame : Frame
-    region : (slice, slice)
-        From `find_region`.
-    """
+    """Mirror the color and the guides of a frame beyond the edges of the render region of `find_region`."""
     height, width = frame.color.shape[:2]
     (rows, columns), size = region, (region[0].stop - region[0].start, region[1].stop - region[1].start)
     top, left = min(rows.start, _MIRRORED), min(columns.start, _MIRRORED)

@@ -25,29 +25,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Window:
-    """2k + 1 frames, the flows from the centre to each, and the stages that run on them.
+    """2k + 1 frames, the flows from the centre to each, and the stages that run on them."""
 
-    Attributes
-    ----------
-    frames : tuple of PreparedFrame or None
-        In order; None for a missing one. The centre is there.
-    links : tuple of Link or None
-        None for the centre, and where a flow is missing.
-    first_pass : tuple of (H, W, 3) array or None
-        Denoised radiance of each frame; None without a first pass.
-    stages : frozenset of str
-        The stages that run.
-    repeated : tuple of bool
-        Whether a frame has the samples of the frame beside it on the side of the centre.
-    refined : tuple of float
-        The shares of the picture on which TV-L1 corrected vectors, for all flows within the window.
-    """
-
-    frames: tuple[PreparedFrame | None, ...]
-    links: tuple[Link | None, ...]
-    first_pass: tuple[Array | None, ...] | None
-    stages: frozenset[str]
-    repeated: tuple[bool, ...]
+    frames: tuple[PreparedFrame | None, ...]  # in order; None for a missing one. The centre is there.
+    links: tuple[Link | None, ...]  # None for the centre, and where a flow is missing
+    first_pass: tuple[Array | None, ...] | None  # (H, W, 3): denoised radiance of each frame; None without a first pass
+    stages: frozenset[str]  # the stages that run
+    repeated: tuple[bool, ...]  # whether a frame has the samples of the frame beside it on the side of the centre
+    # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
 
     @property
@@ -66,40 +51,21 @@ class Window:
 
 
 class Trust(NamedTuple):
-    """How far geometry trusts a warped neighbour, before anything is known of its light.
+    """How far geometry trusts a warped neighbour, before anything is known of its light."""
 
-    Attributes
-    ----------
-    coverage : (h, W) bool array
-        Where the neighbour shows a measured color.
-    confidence : (h, W) array
-        In [0, 1].
-    """
-
-    coverage: Mask
-    confidence: Array
+    coverage: Mask  # (h, W): where the neighbour shows a measured color
+    confidence: Array  # (h, W), in [0, 1]
 
 
 @dataclass(frozen=True)
 class WarpSources:
-    """Frames of a window and their flows, for layers that are warped when they are read.
+    """Frames of a window and their flows, for layers that are warped when they are read."""
 
-    Attributes
-    ----------
-    frames : sequence of PreparedFrame or None
-        In order.
-    flows : sequence of (h, W, 2) array or None
-        From these rows of the centre to each; None for the centre and where there is none.
-    first_pass : sequence of (H, W, 3) array or None
-        Denoised radiance of each frame; empty without a first pass.
-    rows : slice
-        Of the centre.
-    """
-
-    frames: Sequence[PreparedFrame | None]
+    frames: Sequence[PreparedFrame | None]  # in order
+    # (h, W, 2), from these rows of the centre to each; None for the centre and where there is none
     flows: Sequence[Array | None]
-    first_pass: Sequence[Array | None]
-    rows: slice
+    first_pass: Sequence[Array | None]  # (H, W, 3): denoised radiance of each frame; empty without a first pass
+    rows: slice  # of the centre
 
     def warp(self, name: str, centre_layer: Array) -> Array:
         """Warp "albedo", "normal" or "irradiance" of all frames, (T, h, W, 3); the centre's where there is no flow."""
@@ -140,90 +106,42 @@ class AlignedWindow:
 
     Figures of the whole frame (`exposure`, `moments`) are measured before: everything done with a window is local, so
     that a part of it gives the same pixels as the whole.
-
-    Attributes
-    ----------
-    number : int
-        The centre frame's number.
-    centre_irradiance : (H, W, 3) array
-        The centre's irradiance.
-    aligned_color : (T, H, W, 3) array or None
-        `color`, where it was needed for the alignment.
-    guides : dict of str to (H, W, 3) array
-        The centre's albedo and normal, as far as there are any.
-    sources : WarpSources
-        The frames and flows, for layers that are warped when they are read.
-    confidence : (T, H, W) array
-        In [0, 1]; the centre's is 1 wherever its own color was finite.
-    modulation : (H, W, 3) array
-        Radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1.
-    clean_albedo : (H, W, 3) array or None
-        The centre's albedo, prefiltered where the plan has it.
-    geometric_confidence : (T, H, W) array
-        Confidence by geometry alone, with which guides are prefiltered.
-    rendered_variance : (H, W, 3) array or None
-        Of the centre's irradiance, where the file has one.
-    first_pass : (T, H, W, 3) array or None
-        The first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where the light
-        drifts.
-    centre_first_pass : (H, W, 3) array or None
-        The centre's first pass, radiance of the whole frame.
-    aovs : dict of str to (T, H, W, C) array
-        Further layers, warped, and divided by the albedo where they are textured.
-    repaired : int
-        Pixels of the centre frame that were not finite.
-    fireflies : int
-        Single bright samples removed from the centre frame.
-    outliers : int
-        Samples of the window, within `inner`, rejected as fireflies.
-    exposure : float
-        Brightness of the centre's irradiance.
-    moments : (2, G + 1) array
-        Mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light.
-    inner : slice
-        The requested rows; those around them are there because the result depends on them.
-    stages : frozenset of str
-        The stages that run.
-    shares : dict of str to float
-        The share of the picture, in [0, 1], on which a stage ran that runs only in places.
-    pass_colors : dict of str to (H, W, 3) array
-        The centre's colors of those `aovs` that are light without it.
-    neighbour_samples : SampleMean or None
-        The mean of the neighbours' samples at the centre's pixels, radiance; with the stage "blend-samples".
-    neighbour_trust : tuple of Trust or None
-        Of the frame before and the frame after the centre; None where there is none.
-    drift_weight : (H, W) array or None
-        The weight of the frame after the centre by its drift; with the stage "drift".
-    passes : Passes
-        The relation of `aovs` to the color.
     """
 
-    number: int
-    centre_irradiance: Array
-    aligned_color: Array | None
-    guides: dict[str, Array]
-    sources: WarpSources
-    confidence: Array
-    modulation: Array
-    clean_albedo: Array | None
-    geometric_confidence: Array
-    rendered_variance: Array | None
+    number: int  # the centre frame's number
+    centre_irradiance: Array  # (H, W, 3): the centre's irradiance
+    aligned_color: Array | None  # (T, H, W, 3): `color`, where it was needed for the alignment
+    guides: dict[str, Array]  # (H, W, 3): the centre's albedo and normal, as far as there are any
+    sources: WarpSources  # the frames and flows, for layers that are warped when they are read
+    confidence: Array  # (T, H, W), in [0, 1]; the centre's is 1 wherever its own color was finite
+    modulation: Array  # (H, W, 3): radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1
+    clean_albedo: Array | None  # (H, W, 3): the centre's albedo, prefiltered where the plan has it
+    geometric_confidence: Array  # (T, H, W): confidence by geometry alone, with which guides are prefiltered
+    rendered_variance: Array | None  # (H, W, 3), of the centre's irradiance, where the file has one
+    # (T, H, W, 3): the first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where
+    # the light drifts
     first_pass: Array | None
-    centre_first_pass: Array | None
-    aovs: dict[str, Array]
-    repaired: int
-    fireflies: int
-    outliers: int
-    exposure: float
+    centre_first_pass: Array | None  # (H, W, 3): the centre's first pass, radiance of the whole frame
+    aovs: dict[str, Array]  # (T, H, W, C): further layers, warped, and divided by the albedo where they are textured
+    repaired: int  # pixels of the centre frame that were not finite
+    fireflies: int  # single bright samples removed from the centre frame
+    outliers: int  # samples of the window, within `inner`, rejected as fireflies
+    exposure: float  # brightness of the centre's irradiance
+    # (2, G + 1): mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light
     moments: NDArray[np.float64]
-    inner: slice
-    stages: frozenset[str]
+    inner: slice  # the requested rows; those around them are there because the result depends on them
+    stages: frozenset[str]  # the stages that run
+    # the share of the picture, in [0, 1], on which a stage ran that runs only in places
     shares: Mapping[str, float] = field(default_factory=dict)
+    # (H, W, 3): the centre's colors of those `aovs` that are light without it
     pass_colors: dict[str, Array] = field(default_factory=dict)
+    # the mean of the neighbours' samples at the centre's pixels, radiance; with the stage "blend-samples"
     neighbour_samples: SampleMean | None = None
+    # of the frame before and the frame after the centre; None where there is none
     neighbour_trust: tuple[Trust | None, Trust | None] = (None, None)
+    # (H, W): the weight of the frame after the centre by its drift; with the stage "drift"
     drift_weight: Array | None = None
-    passes: Passes = NO_PASSES
+    passes: Passes = NO_PASSES  # the relation of `aovs` to the color
 
     @cached_property
     def color(self) -> Array:
@@ -283,19 +201,5 @@ class AlignedWindow:
 def clean_guide(
     name: str, guides: dict[str, Array], sources: WarpSources, trust: Array, stages: Collection[str]
 ) -> Array:
-    """Average a guide of the centre over the window with the stage "prefilter"; else return it as rendered.
-
-    Parameters
-    ----------
-    name : str
-        "albedo" or "normal".
-    guides : dict of str to (H, W, 3) array
-        Guides of the centre.
-    sources : WarpSources
-        Of the window.
-    trust : (T, H, W) array
-        Confidence by geometry.
-    stages : collection of str
-        Of the window.
-    """
+    """Average the centre's "albedo" or "normal" over the window with the stage "prefilter"; else return it."""
     return prefilter_guide(sources.warp(name, guides[name]), trust) if "prefilter" in stages else guides[name]

@@ -28,38 +28,21 @@ LARGE = 1 << 20  # pixels of a frame; above, maps of all frames would take longe
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """Options of a comparison.
+    """Options of a comparison."""
 
-    Attributes
-    ----------
-    title : str
-        Name of the shot.
-    exposure : float
-        Factor before the tone curve, and on the radiance of relMSE and SMAPE, one for the whole shot.
-    rounds : int
-        Runs of each method, in turns with the others.
-    samples, reference_samples : float, optional
-        Samples per pixel of the shot, and of the reference (both halves together).
-    levels : sequence of (Frames, float)
-        Renders of the shot at other samples per pixel, to measure how the error falls.
-    findings : sequence of str
-        Findings on the shot's layers, for the facts.
-    check_shot : callable, optional
-        Returns further findings; called in the background while reference and motion are read. An exception ends the
-        comparison before any method runs.
-    maps : bool
-        Store the methods' maps of the frames of `mapped_frames`.
-    """
-
-    title: str = "shot"
+    title: str = "shot"  # name of the shot
+    # factor before the tone curve, and on the radiance of relMSE and SMAPE, one for the whole shot
     exposure: float = 1.0
-    rounds: int = 1
+    rounds: int = 1  # runs of each method, in turns with the others
+    # samples per pixel of the shot, and of the reference (both halves together)
     samples: float | None = None
     reference_samples: float | None = None
-    levels: Sequence[Level] = ()
-    findings: Sequence[str] = ()
+    levels: Sequence[Level] = ()  # renders of the shot at other samples per pixel, to measure how the error falls
+    findings: Sequence[str] = ()  # findings on the shot's layers, for the facts
+    # returns further findings; called in the background while reference and motion are read. An exception ends the
+    # comparison before any method runs.
     check_shot: Callable[[], Sequence[str]] | None = None
-    maps: bool = False
+    maps: bool = False  # store the methods' maps of the frames of `mapped_frames`
 
 
 def compare_shot(

@@ -30,20 +30,11 @@ SMALLEST_CROP = 160  # pixels across; below that frames are left out instead
 
 @dataclass(frozen=True)
 class MethodImages:
-    """Images of one method, read on demand.
+    """Images of one method, read on demand."""
 
-    Attributes
-    ----------
-    name : str
-        Name of its `MethodResult`.
-    frame : callable
-        From a frame number to (H, W, 3) linear radiance.
-    maps : mapping of str to callable
-        From a title, such as "FLIP", to a function from a frame number to an (H, W) map in [0, 1], or to None.
-    """
-
-    name: str
-    frame: Callable[[int], Array]
+    name: str  # name of its `MethodResult`
+    frame: Callable[[int], Array]  # from a frame number to (H, W, 3) linear radiance
+    # from a title, such as "FLIP", to a function from a frame number to an (H, W) map in [0, 1], or to None
     maps: Mapping[str, Callable[[int], Array | None]] = field(default_factory=dict)
 
 

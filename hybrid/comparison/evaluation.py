@@ -63,27 +63,13 @@ CHANGE_GAIN = 25
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Evaluates the frames of methods in a store.
+    """Evaluates the frames of methods in a store."""
 
-    Attributes
-    ----------
-    store : FrameStore
-        Holds the methods' frames, the reference, and the flow of each pair.
-    numbers : sequence of int
-        Frames to evaluate.
-    pairs : sequence of (int, int)
-        Neighbouring frames with a flow between them, from `store_flows`.
-    exposure : float
-        Factor before the tone curve, one for the whole shot.
-    static : (H, W) array of bool
-        Static pixels, from `find_static_pixels`.
-    """
-
-    store: FrameStore
-    numbers: Sequence[int]
-    pairs: Sequence[tuple[int, int]]
-    exposure: float
-    static: NDArray[np.bool_]
+    store: FrameStore  # holds the methods' frames, the reference, and the flow of each pair
+    numbers: Sequence[int]  # frames to evaluate
+    pairs: Sequence[tuple[int, int]]  # neighbouring frames with a flow between them, from `store_flows`
+    exposure: float  # factor before the tone curve, one for the whole shot
+    static: NDArray[np.bool_]  # (H, W): static pixels, from `find_static_pixels`
 
     def map_flip(self, names: Sequence[str]) -> None:
         """Store the FLIP maps of several methods at once: they share the computations on the reference.

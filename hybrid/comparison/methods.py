@@ -37,36 +37,21 @@ WindowFilter = Callable[[AlignedWindow], Array]  # to (H, W, 3) radiance
 
 @dataclass(frozen=True)
 class Method:
-    """A denoiser of a comparison.
+    """A denoiser of a comparison."""
 
-    Attributes
-    ----------
-    run : callable
-        From a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process and must be
-        picklable. An `ImportError` lists the method as absent.
-    family : str
-        Methods of one family share color and marker on the chart.
-    maps : callable, optional
-        From a shot and frame numbers to (number, (H, W) maps in [0, 1] by title), for the report.
-    cost : str
-        "measured"; "free": the frames exist before any method runs; "unknown": another program made the frames.
-    threads : int
-        Limit on the number of threads; 0: no limit.
-    given : Shot, optional
-        Frames that another denoiser has written: they are checked before any method runs.
-    settings : mapping of str to object
-        Shown in the report; in a sweep, the settings that differ from those of `base`.
-    sweep, base : str
-        The setting that is varied, and the method that is varied.
-    """
-
+    # from a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process and must be
+    # picklable. An `ImportError` lists the method as absent.
     run: Run
-    family: str
+    family: str  # methods of one family share color and marker on the chart
+    # from a shot and frame numbers to (number, (H, W) maps in [0, 1] by title), for the report
     maps: Maps | None = None
+    # "measured"; "free": the frames exist before any method runs; "unknown": another program made the frames
     cost: Literal["measured", "free", "unknown"] = "measured"
-    threads: int = 0
-    given: Shot | None = None
+    threads: int = 0  # limit on the number of threads; 0: no limit
+    given: Shot | None = None  # frames that another denoiser has written: they are checked before any method runs
+    # shown in the report; in a sweep, the settings that differ from those of `base`
     settings: Mapping[str, object] = field(default_factory=dict)
+    # the setting that is varied, and the method that is varied
     sweep: str = ""
     base: str = ""
 

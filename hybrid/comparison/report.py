@@ -50,30 +50,15 @@ FILES = ("report.html", "results.json", "chart.png")
 
 @dataclass(frozen=True)
 class Report:
-    """Content of a report.
+    """Content of a report."""
 
-    Attributes
-    ----------
-    comparison : Comparison
-        The shot of the page, methods in the order of the tables. Gains are relative to the method "noisy".
-    images : ShotImages, optional
-        Frames and maps for the viewer.
-    others : sequence of Comparison
-        Comparisons of other shots, for a table of all shots.
-    cost : str
-        One of `COSTS`: the chart's first choice, and that of chart.png.
-    rate : float
-        Frames per second at which the page plays first.
-    movies : bool
-        Also write the animations in full size into a folder ``movies``.
-    """
-
+    # the shot of the page, methods in the order of the tables. Gains are relative to the method "noisy".
     comparison: Comparison
-    images: ShotImages | None = None
-    others: Sequence[Comparison] = ()
-    cost: Cost = "seconds_per_megapixel"
-    rate: float = 24.0
-    movies: bool = False
+    images: ShotImages | None = None  # frames and maps for the viewer
+    others: Sequence[Comparison] = ()  # comparisons of other shots, for a table of all shots
+    cost: Cost = "seconds_per_megapixel"  # one of `COSTS`: the chart's first choice, and that of chart.png
+    rate: float = 24.0  # frames per second at which the page plays first
+    movies: bool = False  # also write the animations in full size into a folder ``movies``
 
 
 def write_report(folder: Path | str, report: Report) -> Path:

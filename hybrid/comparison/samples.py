@@ -20,21 +20,11 @@ def decibels(error: float | np.floating) -> str:
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Mean squared error of the noisy render as a function of its samples.
+    """Mean squared error of the noisy render as a function of its samples."""
 
-    Attributes
-    ----------
-    levels : tuple of (float, float)
-        Measured (samples, error) by rising samples.
-    samples : float
-        Samples per pixel of the shot that was denoised.
-    floor : float
-        Contribution of the reference's noise to every measured error; 0 where halves have removed it.
-    """
-
-    levels: tuple[tuple[float, float], ...]
-    samples: float = 1.0
-    floor: float = 0.0
+    levels: tuple[tuple[float, float], ...]  # measured (samples, error) by rising samples
+    samples: float = 1.0  # samples per pixel of the shot that was denoised
+    floor: float = 0.0  # contribution of the reference's noise to every measured error; 0 where halves have removed it
 
     @property
     def slope(self) -> float | None:

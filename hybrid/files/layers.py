@@ -52,35 +52,11 @@ class Layers:
     for `variance`, one for `depth` and `alpha`, two to four for `motion`. Vectors to the next frame may lie in a layer
     of their own, `motion_next`. `half_a` and `half_b` are the color of two independent halves of the samples, whose
     difference gives the variance.
-
-    Attributes
-    ----------
-    target : Layer
-        Layer that the denoised picture replaces: the color, except where Cycles denoised: there the color is ``Noisy
-        Image``, which stays, and ``Combined`` is replaced.
-    profile, reason : str
-        Name of the profile, and why it was chosen.
-    motion_convention : MotionConvention or None
-        Its parts `settled` are documented, the parts `typed` stated by the user, the others assumed.
-    variance_of : str or None
-        "mean" or "sample".
-    variance_scale : float or None
-        Factor that makes the variance that of a pixel.
-    estimate_factors : (float, float, float) or None
-        Measured factors of the estimate.
-    samples : float or None
-        Samples per pixel.
-    view : str or None
-        Stereo view, one of `views`; the others are not denoised.
-    aovs : mapping of str to Layer
-        By the names that were asked for.
-    pass_colors : mapping of str to Layer
-        Colors by which AOVs are multiplied that are written without color.
-    notes : tuple of str
-        Layers left alone that a user might expect to be denoised; one line each.
     """
 
     color: Layer
+    # layer that the denoised picture replaces: the color, except where Cycles denoised: there the color is ``Noisy
+    # Image``, which stays, and ``Combined`` is replaced
     target: Layer
     albedo: Layer | None = None
     normal: Layer | None = None
@@ -92,20 +68,23 @@ class Layers:
     half_b: Layer | None = None
     alpha: Layer | None = None
     estimate: Layer | None = None
+    # name of the profile, and why it was chosen
     profile: str = ""
     reason: str = ""
+    # its parts `settled` are documented, the parts `typed` stated by the user, the others assumed
     motion_convention: MotionConvention | None = None
     settled: frozenset[str] = frozenset()
     typed: frozenset[str] = frozenset()
-    variance_of: str | None = None
-    variance_scale: float | None = None
-    estimate_factors: tuple[float, float, float] | None = None
-    samples: float | None = None
-    view: str | None = None
+    variance_of: str | None = None  # "mean" or "sample"
+    variance_scale: float | None = None  # factor that makes the variance that of a pixel
+    estimate_factors: tuple[float, float, float] | None = None  # measured factors of the estimate
+    samples: float | None = None  # samples per pixel
+    view: str | None = None  # stereo view, one of `views`; the others are not denoised
     views: tuple[str, ...] = ()
-    aovs: Mapping[str, Layer] = field(default_factory=dict)
+    aovs: Mapping[str, Layer] = field(default_factory=dict)  # by the names that were asked for
+    # colors by which AOVs are multiplied that are written without color
     pass_colors: Mapping[str, Layer] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # layers left alone that a user might expect to be denoised; one line each
 
     def without(self, roles: Collection[str]) -> Layers:
         """Return the layers without some roles, and without the layers these are made from."""

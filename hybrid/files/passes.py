@@ -27,24 +27,13 @@ class Sum:
 
 @dataclass(frozen=True)
 class Passes:
-    """How the AOVs of a shot relate to its beauty.
+    """How the AOVs of a shot relate to its beauty."""
 
-    Attributes
-    ----------
-    sums : tuple of Sum
-        No AOV is a part twice; the sum that makes an AOV comes after those that this AOV is a part of.
-    textured : tuple of str
-        AOVs that were multiplied by the surfaces' albedo.
-    kept : tuple of str
-        AOVs without noise, which are not denoised.
-    light : float
-        Mean of all AOVs of light together, as a share of the beauty's.
-    """
-
+    # no AOV is a part twice; the sum that makes an AOV comes after those that this AOV is a part of
     sums: tuple[Sum, ...] = ()
-    textured: tuple[str, ...] = ()
-    kept: tuple[str, ...] = ()
-    light: float = 0.0
+    textured: tuple[str, ...] = ()  # AOVs that were multiplied by the surfaces' albedo
+    kept: tuple[str, ...] = ()  # AOVs without noise, which are not denoised
+    light: float = 0.0  # mean of all AOVs of light together, as a share of the beauty's
 
     def in_frame(self, color: Array, lights: Mapping[str, Array], exposure: float) -> Passes:
         """Return the passes without the sums that do not hold in a frame: their parts are denoised by themselves.

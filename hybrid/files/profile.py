@@ -41,45 +41,24 @@ _MEANINGS = ("mean", "sample")
 
 @dataclass(frozen=True)
 class Profile:
-    """Names and conventions of one renderer.
-
-    Attributes
-    ----------
-    name : str
-    attributes : tuple of str
-        Header attributes of its files, as ``name`` or ``name=value``; ``*`` matches anything.
-    known_layers : tuple of str
-        Names of layers that hardly any other renderer writes.
-    layers : mapping of str to tuple of str
-        Role → names, the preferred first; "" for the bare channels of a file.
-    affixes : tuple of str
-        Text before or after these names.
-    files : mapping of str to str
-        Role → name of its sidecar sequence; ``{name}`` stands for the color's name.
-    motion, motion_assumed : mapping of str to object
-        Parts of `flow.motion.MotionConvention` that are documented, and that are inferred.
-    variance : str or None
-        "mean": the variance of a pixel; "sample": of its samples; None if unknown.
-    samples : str or None
-        Header attribute of the samples per pixel; ``*`` matches anything.
-    why : str
-        Why the profile was chosen.
-    typed : frozenset of str
-        Parts of `motion` that the user states.
-    """
+    """Names and conventions of one renderer."""
 
     name: str
+    # header attributes of its files, as ``name`` or ``name=value``; ``*`` matches anything
     attributes: tuple[str, ...] = ()
-    known_layers: tuple[str, ...] = ()
+    known_layers: tuple[str, ...] = ()  # names of layers that hardly any other renderer writes
+    # role → names, the preferred first; "" for the bare channels of a file
     layers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    affixes: tuple[str, ...] = ()
+    affixes: tuple[str, ...] = ()  # text before or after these names
+    # role → name of its sidecar sequence; ``{name}`` stands for the color's name
     files: Mapping[str, str] = field(default_factory=dict)
+    # parts of `flow.motion.MotionConvention` that are documented, and that are inferred
     motion: Mapping[str, Any] = field(default_factory=dict)
     motion_assumed: Mapping[str, Any] = field(default_factory=dict)
-    variance: str | None = None
-    samples: str | None = None
-    why: str = "asked for"
-    typed: frozenset[str] = frozenset()
+    variance: str | None = None  # "mean": the variance of a pixel; "sample": of its samples; None if unknown
+    samples: str | None = None  # header attribute of the samples per pixel; ``*`` matches anything
+    why: str = "asked for"  # why the profile was chosen
+    typed: frozenset[str] = frozenset()  # parts of `motion` that the user states
 
     def convention(self, channels: int) -> MotionConvention:
         """Return the convention of vectors with so many channels, as far as documented or assumed."""

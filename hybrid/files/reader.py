@@ -26,27 +26,13 @@ from hybrid.files.sources import ReadSources, Source
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How layers are read where that differs from their profile (`hybrid.validation`).
+    """How layers are read where that differs from their profile (`hybrid.validation`)."""
 
-    Attributes
-    ----------
-    left_out : frozenset of str
-        Roles that are not read.
-    motion : MotionConvention or None
-        Convention of the motion vectors.
-    variance_scale : float or None
-        Factor of the variance.
-    passes : Passes
-        How AOVs add up to the beauty.
-    estimate_factors : (float, float, float) or None
-        Factors of the denoised picture, by channel.
-    """
-
-    left_out: frozenset[str] = frozenset()
-    motion: MotionConvention | None = None
-    variance_scale: float | None = None
-    passes: Passes = NO_PASSES
-    estimate_factors: tuple[float, float, float] | None = None
+    left_out: frozenset[str] = frozenset()  # roles that are not read
+    motion: MotionConvention | None = None  # convention of the motion vectors
+    variance_scale: float | None = None  # factor of the variance
+    passes: Passes = NO_PASSES  # how AOVs add up to the beauty
+    estimate_factors: tuple[float, float, float] | None = None  # factors of the denoised picture, by channel
 
     def apply(self, layers: Layers) -> Layers:
         """Return the layers with this interpretation."""
@@ -60,39 +46,17 @@ class Interpretation:
 
 @dataclass(frozen=True)
 class ShotFiles:
-    """The files of a shot, and by which names their layers are found.
+    """The files of a shot, and by which names their layers are found."""
 
-    Attributes
-    ----------
-    files : mapping of int to Path
-        Frame number → file.
-    first : int
-        The frame that fixes the layers and the size.
-    layers : mapping of str to str or Layer
-        Role → layer that the user names.
-    sidecars : mapping of str to SidecarSequence
-        Role → sequence of its own.
-    profile : Profile or None
-        None: the profile that fits the files.
-    motion : str or None
-        Convention that the user states (`Profile.with_motion`), or "none".
-    aovs : tuple of str
-        Names of AOVs.
-    max_pixels : int
-        Limit of `read_exr`.
-    canvas : Window or None
-        None: the smallest window that holds the color of every frame.
-    """
-
-    files: Mapping[int, Path]
-    first: int
-    layers: Mapping[str, str | Layer] = field(default_factory=dict)
-    sidecars: Mapping[str, SidecarSequence] = field(default_factory=dict)
-    profile: Profile | None = None
-    motion: str | None = None
-    aovs: tuple[str, ...] = ()
-    max_pixels: int = MAX_PIXELS
-    canvas: Window | None = None
+    files: Mapping[int, Path]  # frame number → file
+    first: int  # the frame that fixes the layers and the size
+    layers: Mapping[str, str | Layer] = field(default_factory=dict)  # role → layer that the user names
+    sidecars: Mapping[str, SidecarSequence] = field(default_factory=dict)  # role → sequence of its own
+    profile: Profile | None = None  # None: the profile that fits the files
+    motion: str | None = None  # convention that the user states (`Profile.with_motion`), or "none"
+    aovs: tuple[str, ...] = ()  # names of AOVs
+    max_pixels: int = MAX_PIXELS  # limit of `read_exr`
+    canvas: Window | None = None  # None: the smallest window that holds the color of every frame
 
     def path(self, number: int) -> Path:
         """Return the file of a frame; raise FileNotFoundError if it is missing."""

@@ -19,21 +19,11 @@ Array = NDArray[np.float32]
 
 
 class SharedLight(NamedTuple):
-    """AOVs and color whose sums agree.
+    """AOVs and color whose sums agree."""
 
-    Attributes
-    ----------
-    aovs : dict of str to (H, W, C) array
-        Radiance.
-    color : (H, W, 3) array
-        Radiance.
-    parts : frozenset of str
-        Names of the AOVs that are parts of a sum.
-    """
-
-    aovs: dict[str, Array]
-    color: Array
-    parts: frozenset[str]
+    aovs: dict[str, Array]  # (H, W, C): radiance
+    color: Array  # (H, W, 3): radiance
+    parts: frozenset[str]  # names of the AOVs that are parts of a sum
 
 
 def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:

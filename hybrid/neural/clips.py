@@ -26,26 +26,14 @@ from nlm.average import replace_nonfinite
 
 @dataclass(frozen=True)
 class ClipSource:
-    """Renders of a shot that clips are made of.
+    """Renders of a shot that clips are made of."""
 
-    Attributes
-    ----------
-    name : str
-        Of the shot; training and validation are split by it.
-    levels : mapping of str to Shot
-        Independent renders of the same frames.
-    samples : sequence of float
-        Samples per pixel of each level.
-    reference : Shot or None
-        The same frames clean, or some of them: clips are made of these alone, with the reference as target.
-    target : Shot or None
-        A further render of the same frames, of more samples: its pseudo-references and itself are the targets.
-    """
-
-    name: str
-    levels: Mapping[str, Shot]
-    samples: Sequence[float]
+    name: str  # of the shot; training and validation are split by it
+    levels: Mapping[str, Shot]  # independent renders of the same frames
+    samples: Sequence[float]  # samples per pixel of each level
+    # the same frames clean, or some of them: clips are made of these alone, with the reference as target
     reference: Shot | None = None
+    # a further render of the same frames, of more samples: its pseudo-references and itself are the targets
     target: Shot | None = None
 
     def numbers(self) -> list[int]:

@@ -16,18 +16,10 @@ from network.cpu.convolution import convolve
 
 
 class UpsampleTaps(NamedTuple):
-    """Weights of a convolution over upsampled features and a skip connection.
+    """Weights of a convolution over upsampled features and a skip connection."""
 
-    Attributes
-    ----------
-    coarse : Tensor
-        ``(4·O, C, 2, 2)``: merged taps on the features, for each of the four pixels that a feature covers.
-    skip : Tensor
-        ``(O, D, 3, 3)``: taps on the skip connection.
-    """
-
-    coarse: Tensor
-    skip: Tensor
+    coarse: Tensor  # ``(4·O, C, 2, 2)``: merged taps on the features, for each of the four pixels that a feature covers
+    skip: Tensor  # ``(O, D, 3, 3)``: taps on the skip connection
 
 
 def merge_taps(weight: Tensor, channels: int) -> UpsampleTaps:

@@ -12,24 +12,14 @@ CHANNELS = 10
 
 
 class KernelWindow(NamedTuple):
-    """An aligned window of T frames, float32, finite.
+    """An aligned window of T frames, float32, finite."""
 
-    Attributes
-    ----------
-    color : Tensor
-        ``(N, T, 3, H, W)`` irradiance, side frames mixed with the centre where they are not trusted.
-    confidence : Tensor
-        ``(N, T, 1, H, W)`` in [0, 1].
-    exposure : Tensor
-        ``(N,)``, positive: brightness of each window as a whole, proportional to its radiance. Of whole frames and
-        never of tiles: tiles of different exposure would show their seams.
-    albedo, normal : Tensor or None
-        ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space.
-    """
-
-    color: Tensor
-    confidence: Tensor
+    color: Tensor  # ``(N, T, 3, H, W)`` irradiance, side frames mixed with the centre where they are not trusted
+    confidence: Tensor  # ``(N, T, 1, H, W)`` in [0, 1]
+    # ``(N,)``, positive: brightness of each window as a whole, proportional to its radiance. Of whole frames and never
+    # of tiles: tiles of different exposure would show their seams.
     exposure: Tensor
+    # ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space
     albedo: Tensor | None = None
     normal: Tensor | None = None
 

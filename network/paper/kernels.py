@@ -97,37 +97,17 @@ def mean_of(numerators: Tensor, denominators: Tensor, fallback: Tensor, epsilon:
 
 
 class Pyramid(NamedTuple):
-    """Kernels at several resolutions, each half of the one before, and how they are blended.
+    """Kernels at several resolutions, each half of the one before, and how they are blended."""
 
-    Attributes
-    ----------
-    kernels : tuple of Tensor
-        ``(N, taps, H / 2^s, W / 2^s)``, finest first.
-    blends : tuple of Tensor
-        One fewer, α_s in [0, 1] of ``(N, 1, H / 2^s, W / 2^s)``: share of the low frequencies of scale s that comes
-        from the next coarser scale.
-    """
-
-    kernels: tuple[Tensor, ...]
+    kernels: tuple[Tensor, ...]  # ``(N, taps, H / 2^s, W / 2^s)``, finest first
+    # one fewer, α_s in [0, 1] of ``(N, 1, H / 2^s, W / 2^s)``: share of the low frequencies of scale s that comes from
+    # the next coarser scale
     blends: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
 class Filtered:
     """A window after its kernels, frame by frame: the images of any of its frames are sums of these.
-
-    Attributes
-    ----------
-    numerators, denominators : Tensor
-        ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `apply_kernels`.
-    kernels : Tensor or Pyramid
-        The kernels.
-    centre : Tensor
-        ``(N, C, H, W)``: the centre frame before filtering.
-    coarse : Filtered, optional
-        The same at half the resolution.
-    blend : Tensor, optional
-        ``(N, 1, H, W)``, α of `Pyramid`; with coarse.
 
     Notes
     -----
@@ -139,12 +119,13 @@ class Filtered:
     Vogels et al. 2018, section 5.3 (multi-scale reconstruction), doi:10.1145/3197517.3201388.
     """
 
+    # ``(N, T, C, H, W)`` and ``(N, T, 1, H, W)`` of `apply_kernels`
     numerators: Tensor
     denominators: Tensor
-    kernels: Tensor | Pyramid
-    centre: Tensor
-    coarse: Filtered | None = None
-    blend: Tensor | None = None
+    kernels: Tensor | Pyramid  # the kernels
+    centre: Tensor  # ``(N, C, H, W)``: the centre frame before filtering
+    coarse: Filtered | None = None  # the same at half the resolution
+    blend: Tensor | None = None  # ``(N, 1, H, W)``, α of `Pyramid`; with coarse
 
     @classmethod
     def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Filtered:
