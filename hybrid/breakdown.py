@@ -27,12 +27,7 @@ def frame_names(frames: int) -> list[str]:
 
 
 class Breakdown:
-    """Statistics of the frames' weights over all pixels and frames of a shot, as in the paper's Table 1.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, table 1 and figure 6.
-    """
+    """Statistics of the frames' weights over all pixels and frames of a shot, as in the paper's table 1."""
 
     def __init__(self) -> None:
         self.pixels = 0
@@ -61,12 +56,7 @@ class Breakdown:
 def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
     """Return the layers for a frame's file: ``contribution.before2`` and so on, ``weight.before2`` and so on.
 
-    Parameters
-    ----------
-    parts : (T, H, W, 3) array
-        Radiance contributed by each frame, in time order; their sum is the result.
-    weights : (T, H, W) array
-        Weight of each frame; their sum is 1.
+    From the radiance (T, H, W, 3) that each frame contributes, and the weight (T, H, W) of each; these sum to 1.
     """
     names = frame_names(len(parts))
     layers = {f"contribution.{name}": part for name, part in zip(names, parts, strict=True)}
@@ -74,20 +64,11 @@ def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
 
 
 def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
-    """Return layers in [0, 1] that show the effect of each stage.
+    """Return layers (H, W), in [0, 1], that show the effect of each stage on the result of a window.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-    irradiance : (H, W, 3) array
-        Result of the window.
-
-    Returns
-    -------
-    dict of str to (H, W) array
-        ``stage.align``: mean geometric confidence of the neighbours that exist. ``stage.gate``: the same after
-        comparison of their light. ``stage.network``: relative difference of the result to the weighted average of the
-        first passes (without these: of the colors), |r − a| / (a + exposure), means over channels.
+    ``stage.align``: mean geometric confidence of the neighbours that exist. ``stage.gate``: the same after
+    comparison of their light. ``stage.network``: relative difference of the result to the weighted average of the
+    first passes (without these: of the colors), |r − a| / (a + exposure), means over channels.
     """
     sides = [
         index for index, trust in enumerate(aligned.geometric_confidence) if index != aligned.centre and trust.any()
@@ -105,17 +86,8 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
 def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, path: Path) -> None:
     """Write a PNG of the middle frame: noisy and denoised, the contributions in time order, and below their weights.
 
-    Weights are black at 0 and white at 1; all other images have one exposure and are sRGB encoded.
-
-    Parameters
-    ----------
-    pictures : sequence of Shot
-        The noisy shot, once for each view in its files; the views are below each other.
-    output : str or Path
-        Pattern or folder of frames with the layers of `layers_of`.
-    frames : int
-        Length of the window.
-    path : Path
+    The views of the shot's files are below each other. Weights are black at 0 and white at 1; all other images have one
+    exposure and are sRGB encoded.
     """
     sheets = [_sheet(shot, output, frame_names(frames)) for shot in pictures]
     width = max(sheet.shape[1] for sheet in sheets)

@@ -39,25 +39,8 @@ def parse_budget(text: str) -> float:
 def measure_presets(
     shot: Shot, rules: Rules, presets: Iterable[str], load: Callable[[str], tuple[WindowDenoiser, FirstPassSource]]
 ) -> Iterator[Measured]:
-    """Measure presets on the middle of a shot, one after the other.
+    """Measure presets, the most accurate first, on the middle of a shot, until one fits that nothing slower follows.
 
-    Parameters
-    ----------
-    shot : Shot
-        Its middle frames are read.
-    rules : Rules
-        The forced stages.
-    presets : iterable of str
-        The most accurate first: nothing slower than needed is measured after a preset that fits.
-    load : callable
-        From a preset to its denoiser and first pass.
-
-    Yields
-    ------
-    Measured
-
-    Notes
-    -----
     The second of two neighbouring frames is timed: while a window slides, each frame is read, aligned and denoised
     once. A finished sequence as first pass counts as if reading it cost nothing.
     """
@@ -86,15 +69,7 @@ def measure_presets(
 
 
 def cut_out(shot: Frames, side: int) -> MappedShot:
-    """Cut the middle out of each frame of a shot.
-
-    Parameters
-    ----------
-    shot : Frames
-        Frames of H × W pixels.
-    side : int
-        Pixels that are left each way, at most.
-    """
+    """Cut the middle, at most `side` pixels each way, out of each frame of a shot."""
     height, width = shot.shape
     top, left = max(0, height - side) // 2, max(0, width - side) // 2
     here = slice(top, top + side), slice(left, left + side)

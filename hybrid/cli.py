@@ -157,13 +157,7 @@ def ravg(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; 0: done, 1: bad data (one line on standard error), 2: bad usage. A bug shows its traceback.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments; the process's own without.
-    """
+    """Run the command; 0: done, 1: bad data (one line on standard error), 2: bad usage. A bug shows its traceback."""
     prepare_libraries()
     with tolerant_streams():
         start_log()  # until a command has read its options of the log

@@ -257,25 +257,9 @@ def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: _Kept
 class _KeptPictures:
     """OIDN's pictures on disk, each with a record of what it was made from.
 
-    Parameters
-    ----------
-    shot : Shot
-        The noisy shot.
-    spec : str
-        A pattern or a folder; for one of several views, a folder of its own there.
-    forced : str
-        As for `find_first_pass`.
-    mode : str
-        A key of `OIDN_MODES`.
-    in_torch : bool
-        Whether OIDN's networks run in torch, less exactly.
-    device : str
-        OIDN's device.
-
-    Raises
-    ------
-    ValueError
-        If `spec` is one name for several frames, neighbours among them, or would overwrite an input.
+    `spec` is a pattern or a folder; for one of several views, a folder of its own there. `mode` is a key of
+    `OIDN_MODES`; `in_torch` networks are less exact. Raises ValueError if `spec` is one name for several frames,
+    neighbours among them, or would overwrite an input.
     """
 
     def __init__(self, shot: Shot, spec: str, forced: str, mode: str, in_torch: bool, device: str) -> None:
@@ -293,10 +277,7 @@ class _KeptPictures:
     def read_or_run(self, frame: Frame, *noisy_guides: bool, run: Callable[..., Array]) -> Array:
         """Read the picture that an earlier run has kept, if it would be the same now; else make and keep it.
 
-        Raises
-        ------
-        ValueError
-            If another file is there, which no run has kept as a first pass.
+        Raises ValueError if another file is there, which no run has kept as a first pass.
         """
         path, shot = self.places[frame.number], self._shot
         files = shot.sources(shot.neighbours(frame.number, self._support))
@@ -344,21 +325,9 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
 
 
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
-    """Run OIDN, or what stands for it, on a frame with what guides it has.
+    """Run OIDN, or what stands for it, on a frame with what guides it has: (H, W, 3) linear radiance.
 
-    Parameters
-    ----------
-    frame : Frame
-        Pixels that are not finite are replaced.
-    denoise : callable, optional
-        What stands for `denoise_oidn`, with the same parameters.
-    **mode : object
-        As for `denoise_oidn`.
-
-    Returns
-    -------
-    (H, W, 3) array of float32
-        Linear radiance.
+    Pixels that are not finite are replaced; `mode` as for `denoise_oidn`.
     """
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
@@ -366,20 +335,10 @@ def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None
 
 
 def read_denoised(sequence: Shot, number: int) -> Array:
-    """Read the denoised picture of a frame, wherever its file has it.
+    """Read the denoised picture (H, W, 3) of a frame, linear radiance, wherever its file has it.
 
-    Parameters
-    ----------
-    sequence : Shot
-        Finished frames.
-    number : int
-        Of a frame that is there.
-
-    Returns
-    -------
-    (H, W, 3) array of float32
-        Linear radiance: the estimate, where the color is the noisy picture beside it; else the color, as in every file
-        that ravg has written over it.
+    That is the estimate, where the color is the noisy picture beside it; else the color, as in every file that ravg has
+    written over it.
     """
     found = sequence.read(number)
     if found.estimate is None:

@@ -40,8 +40,6 @@ def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
     `pictures` are (denoised picture, samples) of some frames, each (H, W, 3), linear; non-finite pixels are excluded.
     Returns None if the levels agree within their uncertainty, or if frames have no common level.
 
-    Notes
-    -----
     For tiles of 8×8 pixels with the means e of the picture and s of the samples, the factor is the median of s / e,
     weighted by e. It differs from 1 only if the ratio of the sums of s and e does so too: the median of skewed noise
     lies below its mean, and fireflies, which denoisers remove, lie above.

@@ -36,10 +36,7 @@ _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 def parse_size(words: str) -> int:
     """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``; units are powers of 1024.
 
-    Raises
-    ------
-    ValueError
-        If it is no size, has no unit, is nothing, or more than there is anywhere.
+    Raises ValueError if it is no size, has no unit, is nothing, or more than there is anywhere.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", words, re.IGNORECASE)
     size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
@@ -59,37 +56,12 @@ def plan_rows(
     network: int | None = None,
     pools: bool = False,
 ) -> int | None:
-    """Find how many rows of a frame may be worked on at a time.
+    """Find how many rows of a frame may be worked on at a time: a multiple of 64, or None for all.
 
-    Parameters
-    ----------
-    limit : int
-        Bytes.
-    shot : Shot
-        Its headers are read.
-    stages : collection of str
-        The stages that may run on some frame.
-    first_pass : FirstPass, optional
-        The first pass of the shot.
-    radius : int
-        Frames on each side of the centre.
-    network : int, optional
-        Bytes that a network takes while it runs; None without a network.
-    pools : bool
-        Whether samples are pooled and denoised by OIDN.
+    The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
+    `network` the bytes that a network takes while it runs; with `pools` samples are pooled and denoised by OIDN. Raises
+    ValueError, with what is needed, if not even the fewest rows fit.
 
-    Returns
-    -------
-    int or None
-        Rows, a multiple of 64; None for all. The same for the same arguments, on every machine.
-
-    Raises
-    ------
-    ValueError
-        If not even the fewest rows fit; says how much is needed.
-
-    Notes
-    -----
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
     prepared, written or worked on. `benchmarks/bench_memory.py` measures the true peak.
     """

@@ -36,7 +36,7 @@ def denoise_oidn(
     threads: int = 0,
     device: str = "cpu",
 ) -> NDArray[np.float32]:
-    """Denoise one frame with OIDN's ray-tracing filter in HDR mode.
+    """Denoise one frame with OIDN's ray-tracing filter in HDR mode (Áfra 2025, https://www.openimagedenoise.org).
 
     Parameters
     ----------
@@ -62,11 +62,6 @@ def denoise_oidn(
     device : str
         "cpu", "cuda", "hip", "sycl" or "metal" (`find_device`).
 
-    Returns
-    -------
-    (H, W, 3) array of float32
-        Linear radiance.
-
     Raises
     ------
     ImportError
@@ -75,10 +70,6 @@ def denoise_oidn(
         If shapes differ, values are not finite, the quality is unknown, or there is a normal alone.
     RuntimeError
         If OIDN reports an error, or has no such device here.
-
-    References
-    ----------
-    Áfra 2025, "Intel Open Image Denoise", https://www.openimagedenoise.org
     """
     guides = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
     images = {name: _as_input(image, name, color) for name, image in {"color": color, **guides}.items()}
@@ -175,24 +166,9 @@ def _reads_memory(device: Any) -> bool:
 
 
 def find_device(name: str) -> str:
-    """Find a device of OIDN.
+    """Find a device of OIDN: cuda, hip, sycl, cpu, metal, or "auto", the first that is there of the former four.
 
-    Parameters
-    ----------
-    name : str
-        "auto": the first that is there of cuda, hip, sycl, cpu; or one of these, or metal.
-
-    Returns
-    -------
-    str
-        Its name.
-
-    Raises
-    ------
-    ImportError
-        If pyoidn is not installed.
-    ValueError
-        If it is not there; names those that are.
+    Raises ImportError if pyoidn is not installed; ValueError, with those that are there, if the device is not.
     """
     for kind in [kind for kind in DEVICES if kind != "metal"] if name == "auto" else [name]:
         if _has_device(kind):

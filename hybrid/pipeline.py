@@ -96,43 +96,17 @@ def denoise_frames(
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it, one after the other.
 
+    Yields `Finished` or, with `keep_going`, `Failed` in the order of the frames, each after it has been written as a
+    whole or given up; most often when the next one has been denoised. The views are the shot and further pictures of
+    the same files, each with a window of its own; a file is written once.
+
     While a frame is denoised, the one before it is written in one thread; after it is denoised, the next one that its
-    successor needs is read in another: memory is at its fullest while a denoiser runs.
+    successor needs is read in another: memory is at its fullest while a denoiser runs. Whatever ends the process, a
+    frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). Files that earlier processes have
+    left half written are removed.
 
-    Parameters
-    ----------
-    views : sequence of View
-        The shot, and further pictures of the same files (`Shot.pictures`), each with a window of its own. A file is
-        written once.
-    output : str or Path
-        A pattern with a placeholder for the frame number, or a folder.
-    denoise : callable
-        From `AlignedWindow` to `Denoised`.
-    rules : Rules
-        The forced stages.
-    settings : RunSettings
-        How frames are read, denoised and written.
-    radius : int
-        Frames on each side of the centre.
-    timings : Timings, optional
-        Counts the stages.
-
-    Yields
-    ------
-    Finished or Failed
-        In the order of the frames, each after it has been written as a whole, or with `keep_going`, given up; most
-        often when the next one has been denoised.
-
-    Raises
-    ------
-    ValueError
-        If a frame would be written over its own input, or its result cannot be right: it is not finite, or its light
-        is not that of the noisy frame (`hybrid.validation.find_lost_light`).
-
-    Notes
-    -----
-    Whatever ends the process, a frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). Files
-    that earlier processes have left half written are removed.
+    Raises ValueError if a frame would be written over its own input, or its result cannot be right: it is not finite,
+    or its light is not that of the noisy frame (`hybrid.validation.find_lost_light`).
     """
     timings = timings or Timings()
     shot = views[0].shot
@@ -283,37 +257,14 @@ def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) ->
     """Count the frames on each side that one frame depends on.
 
     The window's, two for the removal of fireflies, and one for the average of neighbouring results.
-
-    Parameters
-    ----------
-    first_pass : FirstPass or None
-        Of the shot.
-    radius : int
-        Frames on each side of the centre of a window.
-    rules : Rules
-        The forced stages.
     """
     return REACH + ("stabilize" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
 
 
 def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:
-    """List the files that each frame is made from.
+    """Return a function from a frame's number to all files within its temporal support.
 
-    Parameters
-    ----------
-    views : sequence of View
-        As for `denoise_frames`.
-    radius : int
-        Frames on each side of the centre.
-    rules : Rules
-        The forced stages.
-    earlier : callable, optional
-        The same for the frames of the shot, where an earlier pass made them.
-
-    Returns
-    -------
-    callable
-        From a frame's number to all files within its temporal support.
+    `earlier` is the same for the frames of the shot, where an earlier pass made them.
     """
     shot, support = views[0].shot, temporal_support(views[0].first_pass, radius, rules)
 

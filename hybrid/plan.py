@@ -104,13 +104,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Rules:
-    """The stages that the user has forced on or off.
-
-    Raises
-    ------
-    ValueError
-        A stage that does not exist, or one that is both on and off.
-    """
+    """The stages that the user has forced; ValueError for one that does not exist, or is both on and off."""
 
     # stages that run, or do not, whatever was measured
     on: frozenset[str] = frozenset()
@@ -136,19 +130,8 @@ class Rules:
         return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
 
     def decide(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], context: Context = NOISY) -> Plan:
-        """Decide the stages of a window.
+        """Decide the stages of a window, from the facts of its frames that are there, and of all neighbours among them.
 
-        Parameters
-        ----------
-        frames : sequence of FrameFacts
-            Of all frames of the window that are there; at least one.
-        pairs : sequence of PairFacts
-            Of all neighbours among them.
-        context : Context
-            The window.
-
-        Notes
-        -----
         Denoised frames are compared in any case (the stage gate), and their outliers are bounded where they are
         averaged. Drift is the change of denoised frames over two frames on a side.
         """
@@ -174,20 +157,7 @@ class Rules:
 
 
 def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> Plan:
-    """Decide which stages the measurements of a window call for, with nothing forced.
-
-    Parameters
-    ----------
-    frames : sequence of FrameFacts
-        Of all frames of the window that are there; at least one.
-    pairs : sequence of PairFacts
-        Of all neighbours among them; those across a cut count for nothing.
-
-    Returns
-    -------
-    Plan
-        One decision for each of `STAGES`.
-    """
+    """Decide which stages the measurements of a window call for, with nothing forced; cuts do not count."""
     cuts = tuple(pair.numbers for pair in pairs if pair.cut)
     repeats = tuple(pair.numbers for pair in pairs if pair.repeated)
     pairs = [pair for pair in pairs if not pair.cut]
@@ -230,15 +200,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
 def merge(plans: Mapping[int, Plan]) -> Plan:
     """Merge the plans of several frames into one, with the frames on which each stage runs.
 
-    Parameters
-    ----------
-    plans : mapping of int to Plan
-        By frame number; at least one.
-
-    Returns
-    -------
-    Plan
-        Of each stage the decision whose figure lies farthest on the side that was decided for.
+    Each stage has the decision whose figure lies farthest on the side that was decided for.
     """
     merged = []
     for index, stage in enumerate(STAGES):

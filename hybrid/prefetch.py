@@ -11,16 +11,9 @@ from hybrid.runtime.timing import Timings
 
 
 class Prefetcher:
-    """The frames of a shot, one of which is read ahead.
+    """The frames of a shot, one of which is read ahead in the one thread of an executor; nothing else reads them.
 
-    Parameters
-    ----------
-    shot : Frames
-        The frames; only the thread reads them.
-    thread : Executor
-        One thread.
-    timings : Timings
-        Counts the CPU time of the thread as "read".
+    Its CPU time counts as "read".
     """
 
     def __init__(self, shot: Frames, thread: Executor, timings: Timings) -> None:

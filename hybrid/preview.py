@@ -32,14 +32,7 @@ def check_preview(path: Path) -> None:
 
 
 def check_png(path: Path, what: str) -> None:
-    """Raise ValueError if the name does not end in .png.
-
-    Parameters
-    ----------
-    path : Path
-    what : str
-        Name of the option, for the error.
-    """
+    """Raise ValueError if the name, of the option `what`, does not end in .png."""
     if path.suffix.lower() != ".png":
         raise ValueError(f"{what} {path}: expected a name that ends in .png")
 
@@ -47,18 +40,9 @@ def check_png(path: Path, what: str) -> None:
 def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = RATE) -> None:
     """Write an image of the middle frame, or a movie of the shot, depending on the suffix.
 
-    Parameters
-    ----------
-    shot : Shot
-        The noisy shot.
-    output : str or Path
-        Pattern or folder of the denoised frames.
-    path : Path
-        A .png shows the middle frame, noisy on the left and denoised on the right. A .mp4 or .webp plays the shot
-        with a moving divider: noisy left of it, denoised right. All frames have one exposure, at which the middle
-        noisy frame has a mean of 0.18, and are sRGB encoded.
-    rate : float
-        Frames per second of a movie.
+    A .png shows the middle frame, noisy on the left and denoised on the right. A .mp4 or .webp plays the shot, at
+    `rate` frames per second, with a moving divider: noisy left of it, denoised right. All frames have one exposure, at
+    which the middle noisy frame has a mean of 0.18, and are sRGB encoded.
     """
     check_preview(path)
     pairs = _Pairs(shot, output)
@@ -72,14 +56,7 @@ def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = R
 def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
     """Write a PNG of at most `SHEET_FRAMES` frames with their numbers, row by row, from the first to the last.
 
-    The left half of each frame is noisy, the right half denoised.
-
-    Parameters
-    ----------
-    shot : Shot
-        As for `write_preview`, with the same exposure.
-    output : str or Path
-    path : Path
+    The left half of each frame is noisy, the right half denoised; the exposure is that of `write_preview`.
     """
     check_png(path, "contact")
     pairs = _Pairs(shot, output)
@@ -102,14 +79,7 @@ def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
 
 
 def divide(left: Image8, right: Image8, position: float) -> Image8:
-    """Combine two images with a white divider.
-
-    Parameters
-    ----------
-    left, right : (H, W, 3) array
-    position : float
-        Position of the divider, from 0 (only `right` is visible) to 1.
-    """
+    """Combine two images with a white divider at a position from 0 (only `right` is visible) to 1."""
     width = left.shape[1]
     column = round(position * width)
     whole = np.concatenate([left[:, :column], right[:, column:]], axis=1)

@@ -46,17 +46,6 @@ def filter_window(
 ) -> Array:
     """Denoise the centre of a window from its noisy frames alone; radiance (H, W, 3), finite.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        Without or with a first pass, which is not used.
-    preset : ClassicalPreset
-        Radii of the filters.
-    timings : Timings, optional
-        Counts the stages "average", "nlm" and "guided".
-
-    Notes
-    -----
     Confidence-weighted robust average or joint non-local means over the window, then a guided filter, all on
     irradiance, which is multiplied by the centre's albedo at the end (paper, section "Training Data").
     """
@@ -97,17 +86,8 @@ def filter_window(
 
 
 def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> Array:
-    """Average the first passes of the frames that show the same light; radiance (H, W, 3), finite.
+    """Average the first passes, ValueError without, of frames that show the same light; radiance (H, W, 3), finite.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        With a first pass; ValueError without.
-    timings : Timings, optional
-        Counts the stage "average".
-
-    Notes
-    -----
     ``Σ c_t e_t / Σ c_t``, c the confidence: the greater of geometry's, times the color gate (`nlm.gate`) where the plan
     has it, and 0.3 times the gate. Geometry cannot tell which pixels of an outline are alike; their colors can.
     """
@@ -121,17 +101,8 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
 def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
     """Pool the samples of a window at its centre, and denoise them with OIDN; radiance (H, W, 3), finite.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        With a first pass, ValueError without; the cheapest suffices (`oidn-fast`).
-    device : str
-        OIDN's device, as for `hybrid.oidn.denoise_oidn`; ImportError without pyoidn.
-    timings : Timings, optional
-        Counts the stages "pool" and "denoise".
+    Raises ValueError without a first pass, of which the cheapest suffices (`oidn-fast`); ImportError without pyoidn.
 
-    Notes
-    -----
     With G the gated average of the first passes, b the pooled image (`nlm.pooling`) and O = OIDN(b) with clean guides,
     the result is G + 0.8 (O − G). A weight found by cross-validation (both made once more without the centre, whose
     noisy image is then regressed on their difference) takes a third run of OIDN, and was worth 0.05 dB less than the

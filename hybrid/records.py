@@ -132,13 +132,9 @@ class Status:
 
 
 def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the records of a folder of frames with their files, oldest first; skip files that are no records.
+    """Yield the records of a folder of frames, or of a sequence in it, with their files, oldest first.
 
-    Parameters
-    ----------
-    folder : Path
-    name : str, optional
-        Of one sequence; default: all.
+    Files that are no records are skipped.
     """
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
@@ -150,13 +146,7 @@ def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, 
 def gather_status(folder: Path, name: str | None = None, frames: Collection[int] | None = None) -> Status:
     """Return the status of the runs that write into a folder; raise FileNotFoundError if it has no records.
 
-    Parameters
-    ----------
-    folder : Path
-    name : str, optional
-        Of one sequence; default: all.
-    frames : collection of int, optional
-        Only these, whether or not a run has been asked for them.
+    With `frames` only of these, whether or not a run has been asked for them.
     """
     status = Status()
     for _, document in read_records(folder, name):

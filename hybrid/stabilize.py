@@ -91,19 +91,9 @@ class FrameResult:
 class FrameDenoiser:
     """Denoises the frames of a shot, one after the other.
 
-    Parameters
-    ----------
-    stream : FrameStream
-        Of the shot.
-    denoise : callable
-        From `AlignedWindow` to `Denoised`.
-    rows : int, optional
-        How many rows of a frame to work on at a time; all without. The result is the same.
-    keep_going : bool
-        Where a neighbouring frame cannot be denoised, leave it out of the average.
+    With `rows` only so many rows of a frame are worked on at a time, with the same result. With `keep_going` a
+    neighbouring frame that cannot be denoised is left out of the average.
 
-    Notes
-    -----
     With d the denoised windows, W the warp to the frame t, R the relighting to its light (`nlm.relight`) and c the
     confidence of their comparison (`hybrid.alignment.align.align_results`), 1 for the frame itself, the result of t is
     Σ c_s R W d_s / Σ c_s over s = t − 1, t, t + 1, corrected by the samples (`nlm.samples`). The result of t therefore
@@ -124,11 +114,8 @@ class FrameDenoiser:
     def make(self, number: int) -> FrameResult:
         """Denoise frame `number`.
 
-        Raises
-        ------
-        ValueError, OSError
-            If the frame, or a neighbour, cannot be denoised, or its light is not that of the noisy frame
-            (`hybrid.validation.find_lost_light`).
+        Raises ValueError or OSError if the frame, or a neighbour, cannot be denoised, or its light is not that of the
+        noisy frame (`hybrid.validation.find_lost_light`).
         """
         averaged = self.neighbours(number)
         self._results = {n: result for n, result in self._results.items() if n in averaged}

@@ -33,19 +33,7 @@ Value = TypeVar("Value")
 
 
 class FirstPass(Protocol):
-    """A source of denoised single frames (`hybrid.first_pass` has three kinds).
-
-    Attributes
-    ----------
-    holds : int
-        Bytes that it takes for itself while it works.
-    files : Shot or None
-        The finished sequence that it reads, if it does.
-    from_noisy : bool
-        Whether it denoises windows of noisy frames.
-    reads_frame : bool
-        Whether it reads `FrameStream.as_read`.
-    """
+    """A source of denoised single frames (`hybrid.first_pass` has three kinds)."""
 
     @property
     def holds(self) -> int:
@@ -71,22 +59,10 @@ class FirstPass(Protocol):
 
 
 class FrameStream:
-    """The frames of a shot, and what is made of each.
+    """The frames of a shot, read lazily, and what is made of each.
 
-    Parameters
-    ----------
-    shot : Frames
-        Read lazily.
-    rules : Rules
-        What is forced.
-    first_pass : FirstPass, optional
-        A source of denoised frames.
-    radius : int
-        Frames on each side of the centre of a window.
-    refine : callable
-        Corrects vectors as `flow.tvl1.refine_flow` does.
-    timings : Timings, optional
-        Counts the stages "read", "prepare", "plan", "estimate", "flow", "warp" and "confidence".
+    `radius` counts the frames on each side of the centre of a window; `refine` corrects vectors as
+    `flow.tvl1.refine_flow` does.
     """
 
     def __init__(
@@ -179,21 +155,9 @@ class FrameStream:
     # Windows.
 
     def window(self, number: int, radius: int | None = None, *, noisy: bool = False) -> Window:
-        """Collect the window around a frame.
+        """Collect the window around a frame, `radius` or that of the stream; `noisy` without the first pass.
 
-        Parameters
-        ----------
-        number : int
-            A frame of the shot.
-        radius : int, optional
-            Frames on each side; that of the stream without.
-        noisy : bool
-            Whether to leave the first pass out.
-
-        Raises
-        ------
-        ValueError, OSError
-            If a frame cannot be read, or does not fit the others.
+        Raises ValueError or OSError if a frame cannot be read, or does not fit the others.
         """
         numbers = self.around(number, radius)
         with_first_pass = not noisy and self.source is not None
@@ -329,19 +293,7 @@ class FrameStream:
 
 
 def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int) -> float:
-    """Count the float32 planes that stay in memory while windows slide: frames, flows and results.
-
-    Parameters
-    ----------
-    shot : Shot
-        Its headers are read.
-    stages : collection of str
-        The stages that may run.
-    first_pass : FirstPass or None
-        Of the shot.
-    radius : int
-        Frames on each side of the centre.
-    """
+    """Count the float32 planes that stay in memory while windows slide: frames, flows and results."""
     layers = shot.layers(shot.numbers[0])
     support = radius if first_pass is None else first_pass.reach(radius)
     frames = min(2 * support + 1, shot.count)
@@ -361,13 +313,7 @@ def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: i
 
 
 def can_refine(stages: Collection[str]) -> bool:
-    """Whether TV-L1 may run.
-
-    Parameters
-    ----------
-    stages : collection of str
-        The stages that may run.
-    """
+    """Whether TV-L1 may run."""
     return bool({"refine", "dense-flow"} & {*stages})
 
 
@@ -385,21 +331,7 @@ def plan_shot(
 ) -> Plan:
     """Plan every frame of a shot, with the frames on which each stage runs.
 
-    Parameters
-    ----------
-    shot : Frames
-        All of its frames are read.
-    rules : Rules, optional
-        What is forced.
-    context : Context
-        The windows.
-    advance : callable
-        Called after each frame.
-
-    Returns
-    -------
-    Plan
-        One decision for each of `STAGES`, with the figure of the window that calls for it most.
+    All frames are read; each decision has the figure of the window that calls for it most.
     """
     stream = FrameStream(shot, rules or Rules(), radius=context.radius)
     plans = {}

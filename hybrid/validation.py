@@ -137,36 +137,21 @@ def validate_layers(shot: Shot) -> ValidationReport:
 
 
 def find_cut(a: int, b: int) -> Finding:
-    """Report that two neighbouring frames are a cut (`hybrid.alignment.measure.PairFacts`).
-
-    Parameters
-    ----------
-    a, b : int
-    """
+    """Report that two neighbouring frames are a cut (`hybrid.alignment.measure.PairFacts`)."""
     message = f"cut between frames {a} and {b}: nothing is averaged across it"
     return Finding("color", message, left_out=False)
 
 
 def find_repeat(a: int, b: int) -> Finding:
-    """Report that frame `b` repeats frame `a` (`PairFacts.repeated`).
-
-    Parameters
-    ----------
-    a, b : int
-    """
+    """Report that frame `b` repeats frame `a` (`PairFacts.repeated`)."""
     message = f"frame {b} repeats frame {a}: the same noise, whose samples count once"
     return Finding("color", message, left_out=False)
 
 
 def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str | None:
-    """Report whether denoised pictures of a shot each show the frame before or after; None if they do not.
+    """Report whether the denoised picture (H, W, 3) of each frame of a shot shows the frame before or after; else None.
 
-    Parameters
-    ----------
-    shot : Shot
-        The noisy frames, of which as many pairs are read as by `validate_layers`.
-    finished : callable
-        Frame number → denoised picture (H, W, 3), or None.
+    As many pairs of noisy frames are read as by `validate_layers`.
     """
     edges = []
     for pair in _pair_numbers(shot):
@@ -179,14 +164,9 @@ def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str
 
 
 def find_sequence_grade(shot: Shot, finished: Callable[[int], Array | None]) -> Grade | None:
-    """Compare the level of denoised pictures with that of a shot's samples; None if they agree.
+    """Compare the level of denoised pictures (H, W, 3) with that of a shot's samples; None if they agree.
 
-    Parameters
-    ----------
-    shot : Shot
-        The noisy frames; those that `validate_layers` may read are read.
-    finished : callable
-        Frame number → denoised picture (H, W, 3), or None.
+    The noisy frames are those that `validate_layers` may read.
     """
     numbers = sorted({number for pair in _pair_numbers(shot) for number in pair}) or [shot.available[0]]
     pictures = []
@@ -540,19 +520,9 @@ def find_nonfinite(picture: Array) -> str | None:
 def find_lost_light(picture: Array, noisy: Array, valid: Mask, around: Callable[[], float] = lambda: 0.0) -> str | None:
     """Report the channel in which a denoised picture has another brightness than the noisy one; None if none.
 
-    Parameters
-    ----------
-    picture, noisy : (H, W, 3) array
-        Radiance, finite.
-    valid : (H, W) bool array
-        Where the noisy picture has been rendered.
-    around : callable
-        Returns the mean of the brightest picture whose light may have leaked in; called only in doubt.
-
-    Notes
-    -----
-    With means a of the picture and b of the noisy one, a channel is at fault where |a − b| exceeds `ERRORS` standard
-    errors of b and `LEAK` times `around`, and a > `LIGHT`·b or b > `LIGHT`·a.
+    `around` returns the mean of the brightest picture whose light may have leaked in; it is called only in doubt. With
+    means a of the picture and b of the noisy one, where `valid`, a channel is at fault where |a − b| exceeds `ERRORS`
+    standard errors of b and `LEAK` times `around`, and a > `LIGHT`·b or b > `LIGHT`·a.
     """
     if (count := np.count_nonzero(valid)) == 0:
         return None

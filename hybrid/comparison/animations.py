@@ -26,15 +26,7 @@ LIMIT = 4e6  # bytes of all embedded animations
 
 
 def mid_exposure(exposure: float, level: float) -> float:
-    """Return the stops, in halves, that bring a shot's mean level to middle gray on the tone curve of the metrics.
-
-    Parameters
-    ----------
-    exposure : float
-        The factor e of the curve e·x / (1 + e·x).
-    level : float
-        Mean radiance.
-    """
+    """Return the stops, in halves, that bring a shot's mean level to middle gray on the tone curve of the metrics."""
     return round(2 * float(np.log2(0.35 / (exposure * level)))) / 2
 
 
@@ -67,16 +59,7 @@ def embed_animations(images: ShotImages) -> Embedded:
 
 
 def write_movies(folder: Path, images: ShotImages, rate: float) -> dict[str, str]:
-    """Write an MP4 of the reference and of every method in their own size; return the file names by method.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    images : ShotImages
-    rate : float
-        Frames per second.
-    """
+    """Write an MP4 of the reference and of every method in their own size; return the file names by method."""
     encode = _encoder(images)
 
     def write(index: int, source: MethodImages) -> str:

@@ -61,20 +61,10 @@ def families(results: Sequence[MethodResult]) -> list[str]:
 
 
 def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, legend: bool = False) -> Figure | None:
-    """Draw the chart; None if no method has a finite value.
+    """Draw the chart, better up, cost on a logarithmic axis; None if no method has a finite value.
 
     Groups of the SVG are named for the page's script: ``point-i``, ``bar-i`` and ``name-i`` belong to result i,
     ``series-f`` to family f.
-
-    Parameters
-    ----------
-    results : sequence of MethodResult
-    metric : Metric
-        Better is up: the axis of an error points down.
-    cost : str
-        One of `COSTS`, on a logarithmic axis.
-    legend : bool
-        Add a legend of the families below.
     """
     shown = {i: r for i, r in enumerate(results) if _is_drawable(r, metric)}
     if not shown:
@@ -223,14 +213,7 @@ def _draw_legend(figure: Figure, names: Sequence[str]) -> None:
 
 
 def to_svg(figure: Figure, prefix: str) -> Markup:
-    """Return the chart as an SVG element for a page.
-
-    Parameters
-    ----------
-    figure : Figure
-    prefix : str
-        Prefix of the ids, different for each chart of a page.
-    """
+    """Return the chart as an SVG element for a page, on which the prefix of its ids is its own."""
     out = io.StringIO()
     for artist in figure.findobj(lambda artist: artist.get_gid() is not None):
         artist.set_gid(f"{prefix}-{artist.get_gid()}")
@@ -251,15 +234,7 @@ def to_png(figure: Figure) -> bytes:
 
 
 def marker(family: int, size: float = 6.5) -> str:
-    """Return the points of an SVG polygon with the marker of a family, around the origin.
-
-    Parameters
-    ----------
-    family : int
-        Index of the family.
-    size : float
-        About the radius.
-    """
+    """Return the points of an SVG polygon with the marker of a family, by its index, around the origin."""
     style = MarkerStyle(MARKERS[family % len(MARKERS)])
     scale = 2 * size * SIZES[family % len(SIZES)]
     path = style.get_path().transformed(style.get_transform() + Affine2D().scale(scale, -scale))

@@ -54,36 +54,17 @@ def compare_shot(
     folder: Path | None = None,
     on_step: OnStep | None = None,
 ) -> Comparison:
-    """Run every method on a shot and evaluate its frames against the reference.
+    """Run every method on a shot and evaluate its frames against the reference; one result per method, in their order.
 
-    Parameters
-    ----------
-    shot : Frames
-        The noisy shot.
-    reference : Frames or tuple of two Frames
-        The same frames with little noise; frames without a reference are not evaluated. Two independent renders remove
-        the reference's noise from PSNR, relMSE and temporal PSNR (`hybrid.comparison.metrics`). That noise matters: 512
-        samples per pixel of a bathroom had half of the squared error that OIDN's best mode showed against them.
-    methods : mapping of str to Method
-    options : CompareOptions, optional
-    folder : Path, optional
-        A new or empty folder that receives the frames and maps of every method and the reference, for a `FrameStore`;
-        default: a temporary one.
-    on_step : callable, optional
-        Called at each step; steps that turn out to be unnecessary are skipped.
+    Frames without a reference are not evaluated. Two independent renders as reference remove its noise from PSNR,
+    relMSE and temporal PSNR (`hybrid.comparison.metrics`). That noise matters: 512 samples per pixel of a bathroom had
+    half of the squared error that OIDN's best mode showed against them. The new or empty `folder`, or a temporary one,
+    receives frames and maps for a `FrameStore`. Steps of `on_step` that turn out to be unnecessary are skipped. A
+    method that is not installed, or whose process died, has an `absent_reason` instead of measurements.
 
-    Returns
-    -------
-    Comparison
-        One result per method, in their order. A method that is not installed, or whose process died, has an
-        `absent_reason` instead of measurements.
-
-    Raises
-    ------
-    ValueError
-        Before any method runs: if shot and reference have no frame in common; if another input lacks a frame or differs
-        in size; if levels are given without samples or without the method "noisy". Afterwards: if a method has left out
-        frames.
+    Raises ValueError before any method runs: if shot and reference have no frame in common; if another input lacks a
+    frame or differs in size; if levels are given without samples or without the method "noisy". Afterwards: if a method
+    has left out frames.
     """
     options = options or CompareOptions()
     halves = reference if isinstance(reference, tuple) else (reference,)
@@ -254,12 +235,6 @@ def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
     """Return the frames whose maps are stored: all, or the middle one of frames above `LARGE` pixels.
 
     A map takes longer than denoising the frame.
-
-    Parameters
-    ----------
-    numbers : sequence of int
-    pixels : int
-        Pixels of a frame.
     """
     return list(numbers) if pixels <= LARGE else [numbers[len(numbers) // 2]]
 

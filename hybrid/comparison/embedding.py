@@ -156,12 +156,7 @@ def _cut(image: Array, box: Box, shape: tuple[int, ...], name: str) -> Array:
 def to_codes(image: Array, level: float) -> Codes:
     """Encode radiance as integers in [0, `CODES`), uniform in log(1 + x / black); `NOT_FINITE` for NaN and infinity.
 
-    Parameters
-    ----------
-    image : (H, W, 3) array
-        Linear radiance; negative values count as 0.
-    level : float
-        Mean level of the shot; black is 1/64 of it.
+    Black is 1/64 of the shot's mean level; negative values count as 0.
     """
     finite = np.isfinite(image)
     scaled = np.maximum(np.where(finite, image, 0), 0) / (level / 64)
@@ -202,20 +197,11 @@ def _shrink(box: Box, frames: list[int], ratio: float, towards: tuple[int, int])
 
 
 def compress(codes: Codes, levels: int) -> str:
-    """Compress integers without loss to base64, which `pictures.js` decodes.
+    """Compress integers in [0, levels), (H, W, C), without loss to base64, which `pictures.js` decodes.
 
-    Parameters
-    ----------
-    codes : (H, W, C) array of int32
-        In [0, levels).
-    levels : int
-        A power of two.
-
-    Notes
-    -----
     Red and blue are stored as differences to green, each plane as differences to a prediction from the pixels left,
-    above and above left (the median predictor of JPEG-LS, Weinberger et al. 2000, doi:10.1109/83.855427), all
-    modulo `levels`, signs folded so that small differences are small numbers; then low bytes, high bytes, and
+    above and above left (the median predictor of JPEG-LS, Weinberger et al. 2000, doi:10.1109/83.855427), all modulo
+    `levels`, a power of two, signs folded so that small differences are small numbers; then low bytes, high bytes, and
     zlib. A PNG would reach the page's script with 8 bits per channel only.
     """
     half = levels // 2

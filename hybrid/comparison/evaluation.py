@@ -63,7 +63,7 @@ CHANGE_GAIN = 25
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Evaluates the frames of methods in a store."""
+    """Evaluates the frames of methods in a store; ValueError if a method has left out a frame."""
 
     store: FrameStore  # holds the methods' frames, the reference, and the flow of each pair
     numbers: Sequence[int]  # frames to evaluate
@@ -72,39 +72,16 @@ class Evaluator:
     static: NDArray[np.bool_]  # (H, W): static pixels, from `find_static_pixels`
 
     def map_flip(self, names: Sequence[str]) -> None:
-        """Store the FLIP maps of several methods at once: they share the computations on the reference.
-
-        Raises
-        ------
-        ValueError
-            If a method has left out a frame.
-        """
+        """Store the FLIP maps of several methods at once: they share the computations on the reference."""
         for name in names:
             self._check_frames(name)
         with ThreadPoolExecutor(AT_ONCE) as threads:
             list(threads.map(partial(self._map_flip, names), self.numbers))
 
     def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
-        """Measure the frames of a method, and pairs of frames.
+        """Measure the frames of a method, and pairs of frames; measures over time only with pairs or static pixels.
 
-        Parameters
-        ----------
-        name : str
-            Name of the method.
-        flip : bool
-            Include FLIP, from the maps of `map_flip`.
-        change : bool
-            Store the maps of changes between frames.
-
-        Returns
-        -------
-        dict of str to Statistic
-            By measure; measures over time only with pairs or static pixels.
-
-        Raises
-        ------
-        ValueError
-            If the method has left out a frame.
+        With `flip` by the maps of `map_flip`; with `change` the maps of changes between frames are stored.
         """
         self._check_frames(name)
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
@@ -171,24 +148,10 @@ class Evaluator:
         levels: Sequence[Level],
         reference_samples: float | None,
     ) -> tuple[NoiseLaw, str]:
-        """Measure the error of the noisy render against its samples.
+        """Measure the error of the noisy render against its samples, and describe the reference's noise.
 
-        Parameters
-        ----------
-        noisy : Statistic
-            PSNR of the noisy frames.
-        samples : float, optional
-            Samples per pixel of the noisy frames; if unknown, `worth` is a ratio without a scale in samples.
-        levels : sequence of (Frames, float)
-            Renders of the shot at other samples per pixel.
-        reference_samples : float, optional
-            Samples per pixel of the reference.
-
-        Returns
-        -------
-        NoiseLaw
-        str
-            Description of the reference's noise.
+        From the PSNR of the noisy frames and of renders at other samples per pixel. If the samples of the noisy frames
+        are unknown, `worth` is a ratio without a scale in samples.
         """
         errors = [(samples or 1.0, error_of(noisy))]
         for shot, count in levels:
@@ -242,15 +205,7 @@ def _mean_error(scores: Sequence[float]) -> float:
 
 
 def store_reference(store: FrameStore, halves: Sequence[Frames], numbers: Sequence[int]) -> None:
-    """Store the reference of every frame: the mean of its halves, and the halves if there are two.
-
-    Parameters
-    ----------
-    store : FrameStore
-    halves : sequence of Frames
-        One reference, or two independent halves.
-    numbers : sequence of int
-    """
+    """Store the reference of every frame: the mean of its halves, and the halves if there are two."""
     for number in numbers:
         images = [half.read(number).color for half in halves]
         store.save(REFERENCE, number, np.mean(images, axis=0))
@@ -260,14 +215,7 @@ def store_reference(store: FrameStore, halves: Sequence[Frames], numbers: Sequen
 
 
 def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Store flow and validity of neighbouring frames from the shot's vectors; return the pairs that have a flow.
-
-    Parameters
-    ----------
-    store : FrameStore
-    shot : Frames
-    numbers : sequence of int
-    """
+    """Store flow and validity of neighbouring frames from the shot's vectors; return the pairs that have a flow."""
     pairs = []
     for a, b in pairwise(numbers):
         motion = motion_between(shot.read(a), shot.read(b)) if b == a + 1 else None
@@ -280,21 +228,10 @@ def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list
 def find_static_pixels(
     store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
 ) -> NDArray[np.bool_]:
-    """Find pixels without motion and without a change of the reference's light, from the first frame to the last.
+    """Find pixels (H, W) without motion and without a change of the reference's light, from the first frame to the
+    last.
 
-    Parameters
-    ----------
-    store : FrameStore
-        Holds the reference and the flows.
-    numbers : sequence of int
-    pairs : sequence of (int, int)
-        From `store_flows`; unless all neighbouring frames have a flow, no pixel counts as static.
-    exposure : float
-        Factor before the tone curve.
-
-    Returns
-    -------
-    (H, W) array of bool
+    Unless all neighbouring frames have a flow (`store_flows`), no pixel counts as static.
     """
     shape = store.load(REFERENCE, numbers[0]).shape
     if not pairs or len(pairs) < len(numbers) - 1:
@@ -311,24 +248,11 @@ def find_static_pixels(
 
 
 def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.bool_]] | None:
-    """Return the flow from `current` to `previous` by the renderer's vectors, and its validity; None without vectors.
+    """Return the flow (H, W, 2) from `current` to `previous` by the renderer's vectors, and its validity; None without.
 
-    Parameters
-    ----------
-    previous, current : Frame
-        Neighbours in time.
-
-    Returns
-    -------
-    flow : (H, W, 2) array
-        Pixels.
-    valid : (H, W) array of bool
-        True where the flow leads to the same point of the scene: inside the frame, and back again by the previous
-        frame's vectors, or without these to the same albedo.
-
-    References
-    ----------
-    Sundaram et al. 2010, doi:10.1007/978-3-642-15549-9_32, eq. 5
+    Valid (H, W) is where the flow leads to the same point of the scene: inside the frame, and back again by the
+    previous frame's vectors (Sundaram et al. 2010, doi:10.1007/978-3-642-15549-9_32, eq. 5), or without these to the
+    same albedo.
     """
     current_flows, previous_flows = current.flows(), previous.flows()
     forward = current_flows and current_flows.to_previous

@@ -3,10 +3,8 @@
 Written from the papers, with separable filters of OpenCV, and the reference processed once for all methods: the
 authors' code (the package flip-evaluator, which tests compare with) takes 18 CPU seconds for an image of 1920×1080.
 
-References
-----------
-Andersson et al. 2020, FLIP: A Difference Evaluator for Alternating Images, doi:10.1145/3406183
-Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images, doi:10.2312/egs.20211015
+Andersson et al. 2020, FLIP: A Difference Evaluator for Alternating Images, doi:10.1145/3406183;
+2021, Visualizing Errors in Rendered High Dynamic Range Images, doi:10.2312/egs.20211015.
 """
 
 from __future__ import annotations
@@ -51,26 +49,12 @@ BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes rad
 
 
 def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> list[Array]:
-    """HDR-FLIP error of each pixel of several images of one frame, in [0, 1]; the reference is processed once.
+    """HDR-FLIP error (H, W) of each pixel of several images of one frame, the greatest over all exposures, in [0, 1].
 
-    Parameters
-    ----------
-    images : sequence of (H, W, 3) array
-        Linear radiance in sRGB primaries; negative values count as 0. Read `ROWS` at a time, so memory maps will do.
-    reference : (H, W, 3) array
-        Determines the exposures.
-    scale : float
-        Factor on all images.
-
-    Returns
-    -------
-    list of (H, W) array of float32
-        The greatest error over all exposures; NaN everywhere for an image that is not finite everywhere.
-
-    Raises
-    ------
-    ValueError
-        If shapes differ, or the reference is not finite.
+    The reference determines the exposures and is processed once. Images are linear radiance in sRGB primaries, times
+    `scale`; negative values count as 0. They are read `ROWS` at a time, so memory maps will do. The error is NaN
+    everywhere for an image that is not finite everywhere. Raises ValueError if shapes differ, or the reference is not
+    finite.
     """
     for image in images:
         check_images(image, reference)

@@ -66,15 +66,7 @@ def noisy(shot: Frames) -> Iterator[tuple[int, Array]]:
 
 
 def finished(shot: Frames, *, other: Shot) -> Iterator[tuple[int, Array]]:
-    """Yield the frames that another denoiser has written (`hybrid.first_pass.read_denoised`).
-
-    Parameters
-    ----------
-    shot : Frames
-        The noisy shot.
-    other : Shot
-        The denoised frames.
-    """
+    """Yield the frames that another denoiser has written (`hybrid.first_pass.read_denoised`)."""
     for number in shot.numbers:
         if other.has(number):
             yield number, read_denoised(other, number)
@@ -192,23 +184,11 @@ def aligned_robust_average(aligned: AlignedWindow) -> Array:
 
 
 def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Array]:
-    """Map the confidence in the neighbours, and their contribution to the result of a denoiser.
+    """Map (H, W), in [0, 1], the confidence in the neighbours of a window, and their contribution to a denoiser's
+    result.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        At least three frames.
-    denoise : callable
-
-    Returns
-    -------
-    dict of str to (H, W) array
-        "Confidence": mean over the neighbours; "Temporal contribution": fraction of the result that comes from the
-        neighbours. Both in [0, 1].
-
-    Notes
-    -----
-    The contribution is the relative change of the result for a relative change of the neighbours' light. For a
+    "Confidence" is the mean over the neighbours; "Temporal contribution" the fraction of the result that comes from the
+    neighbours: the relative change of the result for a relative change of the neighbours' light. For a
     weighted mean that is the fraction of their weight in the light, and it is defined for any denoiser.
     """
     is_neighbour = np.arange(len(aligned.confidence)) != aligned.centre
@@ -230,14 +210,7 @@ def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Arra
 
 
 def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:
-    """Run OIDN on each frame by itself; settings as for `hybrid.oidn.denoise_oidn`.
-
-    Parameters
-    ----------
-    shot : Frames
-        The noisy shot.
-    quality, prefilter : str
-    """
+    """Run OIDN on each frame by itself; settings as for `hybrid.oidn.denoise_oidn`."""
     for number in shot.numbers:
         yield number, denoise_frame_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 

@@ -33,12 +33,7 @@ RESAMPLES = 2000
 def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
     """Map linear radiance to [0, 1) by the curve T(x) = e·x / (1 + e·x).
 
-    Parameters
-    ----------
-    x : (...) array
-        Linear radiance. Negative values count as 0: the curve has a pole at −1/e.
-    exposure : float
-        The factor e.
+    Negative values count as 0: the curve has a pole at −1/e.
     """
     scaled = np.maximum(np.asarray(x, np.float64) * exposure, 0.0)
     with np.errstate(invalid="ignore"):  # inf / inf gives NaN, as intended for non-finite pixels
@@ -48,38 +43,17 @@ def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
 def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
     """Peak signal-to-noise ratio of the tone-mapped image: −10 log₁₀ mean (T(x) − T(r))² dB, with peak 1.
 
-    Parameters
-    ----------
-    image : (H, W, 3) array
-    reference : (H, W, 3) array or two of them
-    exposure : float
-
-    Returns
-    -------
-    float
-        Infinite where the error is zero, or where the estimate from two halves is not positive.
+    Infinite where the error is zero, or where the estimate from two halves is not positive.
     """
     errors = _tone_errors(image, reference, exposure)
     return _decibels(np.mean(errors[0] * errors[-1]))
 
 
 def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
-    """Mean structural similarity of the tone-mapped image, 1 at best.
+    """Mean structural similarity of the tone-mapped image, at least 11 × 11 pixels, 1 at best; by scikit-image.
 
-    Parameters
-    ----------
-    image, reference : (H, W, 3) array
-        At least 11 × 11 pixels.
-    exposure : float
-
-    Notes
-    -----
-    As in the paper: Gaussian window with σ = 1.5 (11 × 11), K = (0.01, 0.03), population covariance,
-    mean over the channels. Computed by scikit-image.
-
-    References
-    ----------
-    Wang et al. 2004, doi:10.1109/TIP.2003.819861
+    As in the paper (Wang et al. 2004, doi:10.1109/TIP.2003.819861): Gaussian window with σ = 1.5 (11 × 11),
+    K = (0.01, 0.03), population covariance, mean over the channels.
     """
     x, r = (tone_map(v, exposure) for v in _checked(image, reference)[:2])
     settings = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -87,17 +61,10 @@ def ssim(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
 
 
 def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: float = 1.0) -> float:
-    """Relative mean squared error: mean (x − r)² / (r² + 0.01).
+    """Relative mean squared error: mean (x − r)² / (r² + 0.01); the mean of two halves is the r of the denominator.
 
-    Parameters
-    ----------
-    image : (H, W, 3) array
-    reference : (H, W, 3) array or two of them
-        The mean of two halves is the r of the denominator.
-    trim : float
-        Fraction of the pixels, with the largest errors, that is excluded, in [0, 1); 0.001 is usual, since a single
-        firefly can outweigh the rest of the frame.
-    exposure : float
+    The fraction `trim` of the pixels, with the largest errors, in [0, 1), is excluded; 0.001 is usual, since a single
+    firefly can outweigh the rest of the frame.
     """
     if not 0.0 <= trim < 1.0:
         raise ValueError(f"trim must be in [0, 1), is {trim}")
@@ -109,24 +76,13 @@ def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: f
 
 
 def smape(image: Array, reference: Array, *, exposure: float = 1.0) -> float:
-    """Symmetric mean absolute percentage error: mean |x − r| / (|x| + |r| + 0.01), in [0, 1].
-
-    Parameters
-    ----------
-    image, reference : (H, W, 3) array
-    exposure : float
-    """
+    """Symmetric mean absolute percentage error: mean |x − r| / (|x| + |r| + 0.01), in [0, 1]."""
     x, r, _ = _checked(image, reference, exposure)
     return float(np.mean(np.abs(x - r) / (np.abs(x) + np.abs(r) + EPSILON)))
 
 
 def mean_bias(image: Array, reference: Array) -> float:
-    """Relative error of the mean radiance: (mean x − mean r) / mean r; NaN for a black reference.
-
-    Parameters
-    ----------
-    image, reference : (H, W, 3) array
-    """
+    """Relative error of the mean radiance: (mean x − mean r) / mean r; NaN for a black reference."""
     x, r, _ = _checked(image, reference)
     return float(np.mean(x) / np.mean(r) - 1.0) if r.any() else float("nan")
 
@@ -139,31 +95,11 @@ def temporal_psnr(
     *,
     exposure: float = 1.0,
 ) -> NDArray[np.float64]:
-    """PSNR of motion-compensated frame differences against those of the reference, for each pair of frames.
+    """PSNR of motion-compensated frame differences against those of the reference, for each pair of N frames.
 
-    Parameters
-    ----------
-    frames : N arrays (H, W, 3)
-        Consecutive in time.
-    references : N references
-    flows : N − 1 arrays (H, W, 2)
-        Pixels; flow k leads from frame k + 1 back to frame k.
-    valid : N − 1 arrays (H, W) of bool
-        True where the flow leads to the same point of the scene.
-    exposure : float
+    Flow k of N − 1 leads from frame k + 1 back to frame k, pixels, and is valid where to the same point of the scene.
+    Infinite where the differences equal the reference's, NaN where a frame is not finite or no pixel is valid.
 
-    Returns
-    -------
-    (N − 1,) array
-        dB. Infinite where the differences equal the reference's, NaN where a frame is not finite or no pixel is valid.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of frames, references, flows and masks do not correspond.
-
-    Notes
-    -----
     With W the bilinear warp of frame t − 1 to frame t, D_t(x) = T(x_t) − W T(x_{t−1}), and the value is
     −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels. Subtracting the reference's differences excludes real changes:
     light, reflections, the interpolation itself; without it, blur would score above the truth. An error that is the
@@ -189,20 +125,9 @@ def temporal_psnr(
 def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> NDArray[np.float64]:
     """Standard deviation over time of static pixels, on the tone curve, frame by frame.
 
-    Parameters
-    ----------
-    frames : N ≥ 2 arrays (H, W, 3)
-        Their static pixels are held in memory.
-    static : (H, W) array of bool
-        True where neither the scene nor its light changes.
-    exposure : float
-
-    Returns
-    -------
-    (N,) array
-        RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of
-        the squares is the unbiased variance over time. NaN without static pixels, for fewer than two frames, or if a
-        frame is not finite.
+    RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of
+    the squares is the unbiased variance over time. NaN without static pixels, for fewer than two frames, or if a
+    frame is not finite.
     """
     values = []
     for frame in frames:
@@ -217,15 +142,7 @@ def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: 
 
 
 def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) -> float:
-    """Average the means of the shots.
-
-    Parameters
-    ----------
-    values : sequence of float
-        One per frame.
-    shots : sequence of int
-        Number of values of each shot; default: all values belong to one shot.
-    """
+    """Average the means of the shots, of which `shots` has the numbers of values; none: all are of one shot."""
     data = np.asarray(values, np.float64)
     return float(np.mean([part.mean() for part in _by_shot(data, shots)]))
 
@@ -240,25 +157,12 @@ def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np
 
 
 def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] = ()) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean of `values`.
+    """95 % percentile bootstrap interval of the mean of `values`, one per frame; NaN if a value is NaN.
 
-    Parameters
-    ----------
-    values : N ≥ 1 floats
-        One per frame. To decide whether A is better than B, pass the differences A − B frame by frame: both have the
-        same frames, and most of their spread cancels. An interval that contains 0 is a tie.
-    shots : sequence of int
-        Number of values of each shot. Of several shots, the shots are resampled first, then the frames within each:
-        frames of one shot are correlated, and more of them say little about another shot.
-
-    Returns
-    -------
-    low, high : float
-        NaN if a value is NaN.
-
-    References
-    ----------
-    Efron 1979, doi:10.1214/aos/1176344552
+    To decide whether A is better than B, pass the differences A − B frame by frame: both have the same frames, and most
+    of their spread cancels. An interval that contains 0 is a tie. Of several shots (`shots` has their numbers of
+    values), the shots are resampled first, then the frames within each: frames of one shot are correlated, and more of
+    them say little about another shot. Efron 1979, doi:10.1214/aos/1176344552.
     """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or data.size == 0:
@@ -283,13 +187,7 @@ def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] 
 
 
 def check_images(image: Array, reference: Reference) -> None:
-    """Raise ValueError if the shapes differ or the reference is not finite.
-
-    Parameters
-    ----------
-    image : (H, W, C) array
-    reference : (H, W, C) array or two of them
-    """
+    """Raise ValueError if the shapes differ or the reference is not finite."""
     for half in reference if isinstance(reference, tuple) else (reference,):
         if half.shape != image.shape or image.ndim != 3:
             raise ValueError(f"image and reference must be (H, W, C) alike: {image.shape}, {half.shape}")

@@ -64,16 +64,7 @@ class Report:
 def write_report(folder: Path | str, report: Report) -> Path:
     """Write ``report.html``, ``results.json`` and ``chart.png`` into a folder; return the path of the page.
 
-    Parameters
-    ----------
-    folder : Path or str
-        Created if it does not exist.
-    report : Report
-
-    Raises
-    ------
-    ValueError
-        If two results have one name, images have no result or no frames, or images differ in shape.
+    Raises ValueError if two results have one name, images have no result or no frames, or images differ in shape.
     """
     folder, results = Path(folder), report.comparison.results
     _check(results, report.images)
@@ -91,14 +82,7 @@ def write_report(folder: Path | str, report: Report) -> Path:
 
 
 def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
-    """Raise ValueError or OSError if a report would overwrite an input, or files of another origin.
-
-    Parameters
-    ----------
-    folder : Path
-        As for `write_report`.
-    inputs : sequence of Path
-    """
+    """Raise ValueError or OSError if a report would overwrite an input, or files of another origin."""
     check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
     there = [folder / name for name in (*FILES, MOVIES) if (folder / name).exists()]
     if there and not is_comparison(folder / "results.json"):
@@ -108,19 +92,7 @@ def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
 def report_images(
     store: FrameStore, comparison: Comparison, frames: Sequence[int], exposure: float = 1.0
 ) -> ShotImages:
-    """Return the images that `compare_shot` has stored; points of sweeps are left out: they are many and look alike.
-
-    Parameters
-    ----------
-    store : FrameStore
-        Of the folder given to `compare_shot`.
-    comparison : Comparison
-        The result of `compare_shot`.
-    frames : sequence of int
-        Numbers of the evaluated frames.
-    exposure : float
-        Of the comparison.
-    """
+    """Return the images that `compare_shot` has stored; points of sweeps are left out: they are many and look alike."""
     methods = []
     for result in comparison.results:
         if result.absent_reason is None and not result.sweep:

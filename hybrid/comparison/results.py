@@ -48,43 +48,21 @@ class Metric:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Accuracy and cost of one method, with one choice of settings, on a shot.
-
-    Attributes
-    ----------
-    name : str
-    settings : mapping of str to object
-        For a point of a sweep: the settings that differ from those of `base`.
-    family : str
-        Methods of one family share color and marker on the chart.
-    sweep, base : str
-        The setting that is varied, and the method that is varied; "" outside sweeps.
-    seconds_per_megapixel, cpu_seconds_per_megapixel : float, optional
-        Median of the runs; 0 for frames that existed before, None where unknown.
-    spread : (float, float), optional
-        Least and greatest seconds per megapixel of repeated runs.
-    peak_bytes : int, optional
-        Peak memory; None where unknown.
-    metrics : mapping of str to Statistic
-        By `Metric.key`.
-    worth : float, optional
-        The noisy render would need this many times its samples for the same error.
-    absent_reason : str, optional
-        Why a requested method has no measurements.
-    """
+    """Accuracy and cost of one method, with one choice of settings, on a shot."""
 
     name: str
-    settings: Mapping[str, object] = field(default_factory=dict)
-    family: str = "Methods"
-    sweep: str = ""
-    base: str = ""
+    settings: Mapping[str, object] = field(default_factory=dict)  # in a sweep, those that differ from those of `base`
+    family: str = "Methods"  # methods of one family share color and marker on the chart
+    sweep: str = ""  # the setting that is varied; "" outside sweeps
+    base: str = ""  # the method that is varied
+    # median of the runs; 0 for frames that existed before, None where unknown
     seconds_per_megapixel: float | None = None
-    spread: tuple[float, float] | None = None
+    spread: tuple[float, float] | None = None  # least and greatest seconds per megapixel of repeated runs
     cpu_seconds_per_megapixel: float | None = None
-    peak_bytes: int | None = None
-    metrics: Mapping[str, Statistic] = field(default_factory=dict)
-    worth: float | None = None
-    absent_reason: str | None = None
+    peak_bytes: int | None = None  # None where unknown
+    metrics: Mapping[str, Statistic] = field(default_factory=dict)  # by `Metric.key`
+    worth: float | None = None  # the noisy render would need this many times its samples for the same error
+    absent_reason: str | None = None  # why a requested method has no measurements
 
 
 @dataclass(frozen=True)
@@ -113,15 +91,7 @@ CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # in the order of t
 
 
 def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
-    """Summarize values of a measure: mean over the shots' means, range, and 95 % bootstrap interval of the mean.
-
-    Parameters
-    ----------
-    values : sequence of float
-        N ≥ 1 values, one per frame.
-    shots : sequence of int
-        Number of values of each shot, if there are several shots.
-    """
+    """Summarize values, one per frame: mean over the shots' means, range, and 95 % bootstrap interval of the mean."""
     if len(values) == 0:
         raise ValueError("values must hold at least one frame, is empty")
     data = np.asarray(values, np.float64)
@@ -168,20 +138,10 @@ def _mean_of_all(values: Sequence[float | None]) -> float | None:
 
 
 def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str | None, set[str]]:
-    """Name the best method by a measure, and the methods that tie with it.
+    """Name the best method by a measure, None where no method has a mean, and the methods that tie with it.
 
-    Parameters
-    ----------
-    results : sequence of MethodResult
-    metric : Metric
-
-    Returns
-    -------
-    best : str, optional
-        None where no method has a mean.
-    ties : set of str
-        Methods tie where the bootstrap interval of their differences, frame by frame, contains 0; without values of
-        the frames, where the intervals of the means overlap.
+    Methods tie where the bootstrap interval of their differences, frame by frame, contains 0; without values of
+    the frames, where the intervals of the means overlap.
     """
     rated = {r.name: r.metrics[metric.key] for r in results if metric.key in r.metrics}
     rated = {name: s for name, s in rated.items() if not math.isnan(s.mean)}
@@ -194,13 +154,7 @@ def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str 
 def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
     """Name the methods that no other method beats at the same cost or less, by rising cost.
 
-    Parameters
-    ----------
-    results : sequence of MethodResult
-        Methods of unknown cost or with a mean that is not finite are excluded.
-    metric : Metric
-    cost : str
-        One of `COSTS`.
+    Methods of unknown cost or with a mean that is not finite are excluded.
     """
     points = [
         (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
@@ -278,13 +232,7 @@ def _tied(a: Statistic, b: Statistic) -> bool:
 
 
 def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list[Metric]:
-    """Return those of the metrics that at least one result has.
-
-    Parameters
-    ----------
-    results : sequence of MethodResult
-    metrics : sequence of Metric
-    """
+    """Return those of the metrics that at least one result has."""
     return [m for m in metrics if any(m.key in r.metrics for r in results)]
 
 
@@ -333,15 +281,7 @@ def to_plain_numbers(value: object) -> object:
 
 
 def to_json(document: object, indent: int | None = None) -> str:
-    """Write JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both parse.
-
-    Parameters
-    ----------
-    document : object
-        Dicts, lists, strings and numbers.
-    indent : int, optional
-        Spaces per level; default: all on one line.
-    """
+    """Write JSON in which numbers that are not finite are strings that ``float`` and ``Number`` both parse."""
     return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -355,13 +295,7 @@ def is_comparison(path: Path) -> bool:
 
 
 def read_comparison(path: Path) -> Comparison:
-    """Read a ``results.json``; settings are text.
-
-    Raises
-    ------
-    ValueError
-        If the file holds anything else.
-    """
+    """Read a ``results.json``, settings as text; ValueError if the file holds anything else."""
     text = path.read_text(encoding="utf-8")
     try:
         document = json.loads(text)

@@ -53,11 +53,6 @@ def run_in_process(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) 
     """Call a module-level function in a fresh process; BrokenProcessPool if the process dies.
 
     The process is not forked from this one, whose peak memory Linux would count as its own.
-
-    Parameters
-    ----------
-    function : callable
-    *args, **kwargs : object
     """
     let_waiting_threads_sleep()  # libraries read the setting when the new process first uses them
     with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=reuse_freed_memory) as pool:
@@ -115,19 +110,9 @@ def _middle_of(shot: Frames) -> MappedShot:
 
 
 def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore | None = None) -> RunCost:
-    """Run a method over a shot in this process.
+    """Run a method over a shot in this process; a store receives the frames under the method's name.
 
     A crop of the first frame is denoised before the clock starts, which excludes compilation and loading of weights.
-
-    Parameters
-    ----------
-    method : Method
-    shot : Frames
-        The noisy shot.
-    name : str
-        Name of the method in the store.
-    store : FrameStore, optional
-        Receives the frames.
     """
     if method.threads:
         limit_threads(method.threads)
@@ -164,17 +149,8 @@ def time_methods(
 ) -> TimedRuns:
     """Run the methods in turns, so that other load of the machine affects all of them.
 
-    Parameters
-    ----------
-    methods : mapping of str to Method
-    shot : Frames
-        The noisy shot.
-    rounds : int
-        Runs of each method; fewer once the runs have taken `ENOUGH` seconds.
-    store : FrameStore, optional
-        Receives the frames of the first round.
-    on_step : callable, optional
-        Called before each run.
+    A method runs `rounds` times, fewer once its runs have taken `ENOUGH` seconds; a store receives the frames of the
+    first.
     """
     runs: dict[str, list[RunCost]] = {}
     absent: dict[str, str] = {}
@@ -203,8 +179,6 @@ def time_methods(
 def summarize_runs(runs: Sequence[RunCost]) -> Seconds:
     """Reduce the runs of a method to seconds per megapixel.
 
-    Notes
-    -----
     The median alone. Normalizing by the load of a round (measured over all methods), or of a run (by a fixed piece of
     work between its frames), made ratios no more repeatable on a machine under eight times its load, which changes
     within seconds. More rounds do help.

@@ -67,17 +67,7 @@ class NoiseLaw:
 
 
 def reference_floor(error: float, samples: float, reference_samples: float) -> float:
-    """Return the reference's part a/m of a mean squared error a/n + a/m.
-
-    Parameters
-    ----------
-    error : float
-        a/n + a/m.
-    samples : float
-        n, of the evaluated render.
-    reference_samples : float
-        m, of the reference.
-    """
+    """Return the reference's part a/m of a mean squared error a/n + a/m; n and m are samples."""
     return error * samples / (samples + reference_samples)
 
 

@@ -27,13 +27,7 @@ from hybrid.comparison.results import (
 
 
 def format_value(value: float, metric: Metric) -> str:
-    """Format a value with the digits of its metric, "–" for NaN.
-
-    Parameters
-    ----------
-    value : float
-    metric : Metric
-    """
+    """Format a value with the digits of its metric, "–" for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
     text = f"{value:.3g}" if metric.logarithmic else f"{value:.{metric.digits}f}"
@@ -41,13 +35,7 @@ def format_value(value: float, metric: Metric) -> str:
 
 
 def format_change(value: float, metric: Metric) -> str:
-    """Format a difference of two values, with its sign.
-
-    Parameters
-    ----------
-    value : float
-    metric : Metric
-    """
+    """Format a difference of two values, with its sign."""
     text = format_value(value, metric)
     return f"+{text}" if value > 0 else text
 
@@ -127,12 +115,6 @@ def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
     """Write the README's table: PSNR and temporal PSNR on each shot, then the costs on the first one.
 
     The best of a column is bold, ties are marked "≈"; absent methods follow with the reason.
-
-    Parameters
-    ----------
-    comparisons : sequence of Comparison
-    cost : str
-        CPU time if that is given, else wall time.
     """
     shots = [_Columns.of([r for r in c.results if not r.sweep], MARKDOWN_METRICS) for c in comparisons]
     cpu = cost == "cpu_seconds_per_megapixel"

@@ -48,14 +48,7 @@ def data_window(part: Part) -> Window:
 
 
 def place(array: np.ndarray, source: Window, target: Window) -> np.ndarray:
-    """Move an image from one window to another, cut or filled with 0.
-
-    Parameters
-    ----------
-    array : (H, W, ...) array
-        On `source`.
-    source, target : Window
-    """
+    """Move an image (H, W, ...) from one window to another, cut or filled with 0."""
     if source[:2] == target[:2] and array.shape[:2] == target.shape:
         return array
     (height, width), out = target.shape, np.zeros((*target.shape, *array.shape[2:]), array.dtype)
@@ -68,36 +61,14 @@ def place(array: np.ndarray, source: Window, target: Window) -> np.ndarray:
 
 
 def decode_layer(image: ExrImage, layer: Layer, canvas: Window) -> np.ndarray:
-    """Return a layer on the canvas, (H, W, C) float32.
-
-    Parameters
-    ----------
-    image : ExrImage
-    layer : Layer
-    canvas : Window
-    """
+    """Return a layer on the canvas, (H, W, C) float32."""
     return place(image.pixels(layer.channels), data_window(image.parts[layer.part]), canvas)
 
 
 def decode_frame(
     image: ExrImage, layers: Layers, canvas: Window, number: int, sidecars: Mapping[str, ExrImage]
 ) -> Frame:
-    """Make a frame from its file.
-
-    Parameters
-    ----------
-    image : ExrImage
-    layers : Layers
-    canvas : Window
-    number : int
-    sidecars : mapping of str to ExrImage
-        Role → other file that holds its layer.
-
-    Raises
-    ------
-    ExrError
-        If an AOV holds whole numbers.
-    """
+    """Make a frame from its file, and other files that hold the layer of a role; ExrError if an AOV has integers."""
     for name, layer in layers.aovs.items():
         if any(image.channel(channel).dtype == np.uint32 for channel in layer.channels):
             raise ExrError(f"{image.path}: aov {name!r} is {layer}, whole numbers, of which averages mean nothing")

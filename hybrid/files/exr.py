@@ -212,17 +212,13 @@ class ExrImage:
         return out
 
     def layer(self, name: str) -> Layer:
-        """Return the layer with this name, or a channel as a layer of its own.
+        """Return the layer with this name, or a channel as a layer of its own; ExrError, with what is there, if not
+        one.
 
         Tried in this order: the name of a layer, or ``RGBA`` or ``RGB`` for the bare channels; the name of a layer
         without its view; the name of a channel; a layer with its channels (``ViewLayer.Combined.RGBA``, as listed);
         the name of a part; all of these in any case; the end of a layer's name (``DiffDir`` for
         ``ViewLayer.DiffDir``). The default stereo view goes before the others.
-
-        Raises
-        ------
-        ExrError
-            If there is no such layer, or several; lists what is there.
         """
         end = "." + name.lower()
         for fold in (str, str.lower):
@@ -290,23 +286,12 @@ def without_view(layer: Layer) -> str:
 
 
 def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIXELS) -> ExrImage:
-    """Read an OpenEXR file: scan lines or tiles, one part or several, half, float and uint channels.
+    """Read an OpenEXR file, or its headers only: scan lines or tiles, one part or several, half, float and uint
+    channels.
 
-    Parameters
-    ----------
-    path : str or Path
-    pixels : bool
-        False reads the headers only.
-    max_pixels : int
-        The largest data window accepted. Memory is bounded by 64 bytes for each of these pixels.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-    ExrError
-        If it is no OpenEXR file, is damaged or truncated (also where only one part of it is), too large,
-        deep in all parts, mip-mapped or chroma-subsampled.
+    `max_pixels` is the largest data window accepted; memory is bounded by 64 bytes for each of these pixels. Raises
+    OSError if the file cannot be opened; ExrError if it is no OpenEXR file, is damaged or truncated (also where only
+    one part of it is), too large, deep in all parts, mip-mapped or chroma-subsampled.
     """
     path = Path(path)
     refuse_other_kinds(path)

@@ -15,48 +15,26 @@ from hybrid.files.passes import NO_PASSES, Passes
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame of a shot, of float32; all arrays of all frames of a shot are of one size.
-
-    Attributes
-    ----------
-    number : int
-        Frame number.
-    color : (H, W, 3) array
-        Linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered.
-    albedo, normal, variance, estimate : (H, W, 3) array, optional
-        Variance is that of the color's mean, in squared radiance.
-    depth, alpha : (H, W) array, optional
-    motion : (H, W, C) array, optional
-        As rendered, C at least 2, in the convention `motion_convention`.
-    resolution : (int, int), optional
-        Height and width of the whole picture in pixels, of which NDC motion is a fraction; default: of `color`.
-    aovs : mapping of str to (H, W, C) array
-        The AOVs that were asked for, by name.
-    pass_colors : mapping of str to (H, W, 3) array
-        Colors by which AOVs are multiplied that hold light without color.
-    passes : Passes
-        How `aovs` add up to the beauty.
-    source : Path, optional
-        The file.
-    beyond : (H, W, 3) array of bool, optional
-        Where the color is +Inf because its light exceeds the range of half; the color is NaN there.
-    """
+    """One frame of a shot, of float32; all arrays of all frames of a shot are of one size."""
 
     number: int
-    color: np.ndarray
-    albedo: np.ndarray | None = None
-    normal: np.ndarray | None = None
-    depth: np.ndarray | None = None
-    motion: np.ndarray | None = None
+    color: np.ndarray  # (H, W, 3): linear scene-referred radiance, unbounded; may hold NaN and Inf as rendered
+    albedo: np.ndarray | None = None  # (H, W, 3)
+    normal: np.ndarray | None = None  # (H, W, 3)
+    depth: np.ndarray | None = None  # (H, W)
+    motion: np.ndarray | None = None  # (H, W, C): as rendered, C at least 2, in the convention `motion_convention`
     motion_convention: MotionConvention | None = None
+    # height and width of the whole picture in pixels, of which NDC motion is a fraction; default: of `color`
     resolution: tuple[int, int] | None = None
-    variance: np.ndarray | None = None
-    alpha: np.ndarray | None = None
-    estimate: np.ndarray | None = None
-    aovs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    variance: np.ndarray | None = None  # (H, W, 3): of the color's mean, in squared radiance
+    alpha: np.ndarray | None = None  # (H, W)
+    estimate: np.ndarray | None = None  # (H, W, 3)
+    aovs: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, C): those asked for, by name
+    # (H, W, 3): colors by which AOVs are multiplied that hold light without color
     pass_colors: Mapping[str, np.ndarray] = field(default_factory=dict)
-    passes: Passes = NO_PASSES
-    source: Path | None = None
+    passes: Passes = NO_PASSES  # how `aovs` add up to the beauty
+    source: Path | None = None  # the file
+    # (H, W, 3): where the color is +Inf because its light exceeds the range of half; the color is NaN there
     beyond: np.ndarray | None = None
 
     def __post_init__(self) -> None:

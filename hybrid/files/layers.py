@@ -108,37 +108,22 @@ def find_layers(
     aovs: Collection[str] = (),
     sidecars: Mapping[str, Layer] | None = None,
 ) -> Layers:
-    """Find the layer of each role by its name.
+    """Find the layer of each role by its name; a file's pixels are not needed.
 
-    Parameters
-    ----------
-    image : ExrImage
-        Pixels are not needed.
-    overrides : mapping of str to str or Layer, optional
-        Role → name of a layer (`ExrImage.layer`), or a layer that was found in such a file before.
-    profile : Profile, optional
-        Names of the layers; default: the profile that fits the file.
-    aovs : collection of str
-        Names of further layers to denoise; `ALL` for every layer that has a name for light.
-    sidecars : mapping of str to Layer, optional
-        Role → layer of another file, used instead of this file's.
+    `overrides` maps roles to names (`ExrImage.layer`) or to layers that were found in such a file before; `aovs` are
+    names of further layers to denoise, `ALL` for every layer that has a name for light; `sidecars` maps roles to layers
+    of other files. Without a profile the one that fits the file is used.
 
-    Raises
-    ------
-    ExrError
-        If there is no color, if a role fits several layers, if an override names a missing layer or one with other
-        channels than the role needs, or if an AOV is a layer that is written anyway.
-    ValueError
-        If an override names an unknown role.
-
-    Notes
-    -----
     Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate (``Image``, where
     Blender's File Output node has written them). The other layers come from the color's own view layer and stereo view
     only. Gray is read as a color, of one channel three times, where there is no other.
 
     Two layers that could be the color (of two view layers; ``beauty`` beside bare R, G, B) are refused: the other one
     would stay noisy in the file. A known renderer's name of its color goes before names that others use.
+
+    Raises ExrError if there is no color, if a role fits several layers, if an override names a missing layer or one
+    with other channels than the role needs, or if an AOV is a layer that is written anyway; ValueError for an unknown
+    role.
     """
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLES):
@@ -226,17 +211,7 @@ def _find_denoised(image: ExrImage, color: Layer) -> Layer | None:
 def fit_sidecar(image: ExrImage, role: str, name: str | None, profile: Profile) -> Layer:
     """Find the layer of a file that holds one role alone: by `name`, by the role's names, or by its channels.
 
-    Parameters
-    ----------
-    image : ExrImage
-    role : str
-    name : str, optional
-    profile : Profile
-
-    Raises
-    ------
-    ExrError
-        If there is none, or several fit.
+    Raises ExrError if there is none, or several fit.
     """
     layers = list(image.layers) if name is None else [image.layer(name)]
     fitting = {layer: fitted for layer in layers if (fitted := _fit_file(image, role, layer))}
@@ -256,18 +231,7 @@ def _fit_file(image: ExrImage, role: str, layer: Layer) -> Layer | None:
 
 
 def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
-    """Find the color of each stereo view and view layer.
-
-    Parameters
-    ----------
-    image : ExrImage
-    profile : Profile
-
-    Raises
-    ------
-    ExrError
-        If several layers could be the color of one of them.
-    """
+    """Find the color of each stereo view and view layer; ExrError if several could be the color of one of them."""
     colors = []
     for view in image.views or (None,):
         named = _name_colors(image, profile, view, []) or _name_grays(image, profile, view)
@@ -425,14 +389,7 @@ def _convention(found: dict[str, Layer | None], profile: Profile) -> MotionConve
 
 
 def samples_of(image: ExrImage, profile: Profile) -> float | None:
-    """Return the samples per pixel, at least 1; None if the header has no such attribute.
-
-    Parameters
-    ----------
-    image : ExrImage
-        Pixels are not needed.
-    profile : Profile
-    """
+    """Return the samples per pixel, at least 1; None if the header has no such attribute."""
     for part in image.parts:
         for name in fnmatch.filter(part.header, profile.samples or ""):
             try:

@@ -30,16 +30,10 @@ def check_movie(path: Path) -> None:
 
 
 def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
-    """Write a movie, and make its folder. Errors are those of `check_movie`.
+    """Write sRGB pictures (H, W, 3) of one size as a movie, and make its folder; errors are those of `check_movie`.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in .mp4 (H.264, for any player and browser) or .webp (loops in a page).
-    pictures : iterable of (H, W, 3) uint8 arrays
-        sRGB encoded, all of one size, at least one. Sizes above `LARGEST` are reduced.
-    rate : float
-        Pictures per second.
+    The name ends in .mp4 (H.264, for any player and browser) or .webp (loops in a page). Sizes above `LARGEST` are
+    reduced.
     """
     check_movie(path)
     path.parent.mkdir(parents=True, exist_ok=True)

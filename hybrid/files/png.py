@@ -33,14 +33,7 @@ def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, picture: NDArray[Any]) -> None:
-    """Write a picture with 8 bits, and make its folder.
-
-    Parameters
-    ----------
-    path : Path
-    picture : (H, W, 3) array
-        Encoded, in [0, 1].
-    """
+    """Write a picture (H, W, 3), encoded, in [0, 1], with 8 bits, and make its folder."""
     _, data = cv2.imencode(".png", np.round(picture[..., ::-1] * 255).astype(np.uint8))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, data.tobytes())

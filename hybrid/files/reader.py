@@ -286,13 +286,7 @@ class ShotReader:
 
 
 def sizes_differ(files: Mapping[int, Path], first: Path) -> list[int]:
-    """Return the numbers of files whose display window is not of the size of the first one's; from headers.
-
-    Parameters
-    ----------
-    files : mapping of int to Path
-    first : Path
-    """
+    """Return the numbers of files whose display window is not of the size of the first one's; from headers."""
     if not files:
         return []
     expected = _size_of(first)

@@ -27,17 +27,9 @@ _LOCK = ".lock"
 def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[str, Path]]) -> None:
     """Raise an error if an output would overwrite an input or another output, or is not a regular file.
 
-    Parameters
-    ----------
-    outputs, inputs : iterable of (str, Path)
-        Name for the message (``output``, ``preview``), and file. Inputs may be read by another run.
-
-    Raises
-    ------
-    ValueError
-        If an output is an input by any name (links, another spelling), or another output.
-    OSError
-        If an output is a folder, a device, a pipe or a socket.
+    Files come with a name for the message (``output``, ``preview``). Inputs may be read by another run. Raises
+    ValueError if an output is an input by any name (links, another spelling), or another output; OSError if an output
+    is a folder, a device, a pipe or a socket.
     """
     names: dict[object, str] = {}
     for name, path in inputs:
@@ -108,13 +100,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file by `replace_file`; text as UTF-8.
-
-    Parameters
-    ----------
-    path : Path
-    content : str or bytes
-    """
+    """Write a file by `replace_file`; text as UTF-8."""
     with replace_file(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 

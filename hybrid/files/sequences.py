@@ -94,18 +94,11 @@ class Pattern:
 def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
     """Find a sequence: return frame number → file of all existing frames, and the range in `spec`, if any.
 
-    Parameters
-    ----------
-    spec : str
-        A pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), a folder that holds one sequence, a file, or a
-        glob. A range may be part of it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
+    `spec` is a pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), a folder that holds one sequence, a file,
+    or a glob. A range may be part of it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
 
-    Raises
-    ------
-    FileNotFoundError
-        If nothing matches; lists the sequences of the folder.
-    ValueError
-        If several sequences match, `spec` is both a file and the pattern of others, or its hyphen would be a sign.
+    Raises FileNotFoundError, with the sequences of the folder, if nothing matches; ValueError if several sequences
+    match, `spec` is both a file and the pattern of others, or its hyphen would be a sign.
     """
     path = Path(spec)
     if path.is_dir():
@@ -190,12 +183,7 @@ def find_views(spec: str) -> list[str]:
 
 
 def name_view(text: str, view: str) -> str:
-    """Replace %V in a pattern by the name of a view, %v by its first letter.
-
-    Parameters
-    ----------
-    text, view : str
-    """
+    """Replace %V in a pattern by the name of a view, %v by its first letter."""
     return text.replace("%V", view).replace("%v", view[0])
 
 
@@ -280,11 +268,6 @@ def name_holes(numbers: Iterable[int], step: int) -> str:
     """Name the frames missing between existing ones, `step` apart; "" if none is missing.
 
     Only the ends of holes are computed: between two files that are numbered by dates lie millions.
-
-    Parameters
-    ----------
-    numbers : iterable of int
-    step : int
     """
     holes = [range(a + step, b, step) for a, b in pairwise(sorted(numbers)) if b - a > step]
     names = [f"{h[0]}-{h[-1]}{f'x{step}' if step > 1 else ''}" if len(h) > 1 else f"{h[0]}" for h in holes]

@@ -193,14 +193,8 @@ class Shot:
     def read(self, number: int) -> Frame:
         """Read a frame, or return it from memory.
 
-        Raises
-        ------
-        FileNotFoundError
-            If it is missing.
-        ExrError
-            If the file is damaged, or lacks a layer.
-        ValueError
-            If its size is not that of the first frame.
+        Raises FileNotFoundError if it is missing, ExrError if the file is damaged, or lacks a layer, and ValueError if
+        its size is not that of the first frame.
         """
         return self.reader.read(number)
 

@@ -46,13 +46,9 @@ def names_sequence(value: str) -> bool:
 
 
 def open_sidecar(role: str, value: str) -> SidecarSequence:
-    """Find the sequence that the user names for a role; raise FileNotFoundError if there is none.
+    """Find the sequence that the user names for a role; FileNotFoundError if there is none.
 
-    Parameters
-    ----------
-    role : str
-    value : str
-        ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
+    The name is ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
     """
     match = re.fullmatch(r"(.*\.exr):(.+)", value, re.IGNORECASE)
     spec, layer = (match[1], match[2]) if match else (value, None)
@@ -62,26 +58,11 @@ def open_sidecar(role: str, value: str) -> SidecarSequence:
 def find_companions(
     files: Mapping[int, Path], named: Collection[str] = ()
 ) -> tuple[Profile | None, list[SidecarSequence]]:
-    """Find the sidecars that a renderer writes next to the color, under names made from the color's name.
+    """Find the sidecars that a renderer writes next to the color's files, under names made from the color's name.
 
-    Parameters
-    ----------
-    files : mapping of int to Path
-        Files of the color.
-    named : collection of str
-        Roles whose layers the user names; these are not searched for.
-
-    Returns
-    -------
-    Profile or None
-        The renderer, which a sidecar may reveal although the color's header does not.
-    list of SidecarSequence
-        Without the layers that the color's files hold themselves.
-
-    Raises
-    ------
-    ValueError
-        If several sequences have the name of one layer.
+    Roles whose layers the user has `named`, and layers that the color's files hold themselves, are left out. The
+    profile is that of the renderer, which a sidecar may reveal although the color's header does not. Raises ValueError
+    if several sequences have the name of one layer.
     """
     color = pattern_of(files[min(files)])
     stem = color.before.rstrip("._-")

@@ -93,14 +93,9 @@ def identify(path: Path) -> Source:
 
 
 def describe_sources(files: Mapping[str, Source], **facts: object) -> str:
-    """Return JSON for `MADE_FROM`: the same for the same files and facts, to the byte.
+    """Return JSON for `MADE_FROM`, of files by their use and of all else that the pixels depend on.
 
-    Parameters
-    ----------
-    files : mapping of str to Source
-        Use of a file (``frame 1001``) → file.
-    **facts : object
-        All else that the pixels depend on.
+    The same for the same files and facts, to the byte.
     """
     listed = {use: [s.name, s.size, s.modified, s.hash] for use, s in files.items()}
     return json.dumps({**facts, "files": listed}, sort_keys=True)
@@ -119,15 +114,10 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def why_stale(path: Path, attributes: Mapping[str, str], *, whole: bool = True) -> str | None:
-    """Return the reason why a result must be made again; "" if it is missing, None if it is whole and up to date.
+    """Return why a result must be made again; "" if it is missing, None if it is whole and up to date.
 
-    Parameters
-    ----------
-    path : Path
-    attributes : mapping of str to str
-        Header strings of a result made now, `MADE_FROM` among them.
-    whole : bool
-        Read the pixels too, to check that the file is not damaged.
+    The attributes are header strings of a result made now, `MADE_FROM` among them. With `whole` the pixels are read
+    too, to check that the file is not damaged.
     """
     try:
         header = read_exr(path, pixels=whole).parts[0].header

@@ -49,11 +49,7 @@ def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
 def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict[tuple[int, str], str]]]:
     """Yield a copy of a file whose strings are UTF-8, and (part, name) → original string of the changed ones.
 
-    Parameters
-    ----------
-    path : Path
-    header_only : bool
-        The copy need not have anything behind the headers.
+    With `header_only` the copy need not have anything behind the headers.
     """
     with path.open("rb") as file:
         data = bytearray(file.read(_HEADERS if header_only else -1))
@@ -72,14 +68,7 @@ def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict
 
 
 def restore_strings(path: Path, headers: Sequence[dict[str, str]]) -> None:
-    """Put strings into a file that was written without their surrogates.
-
-    Parameters
-    ----------
-    path : Path
-    headers : sequence of dict of str to str
-        Name → string, for each part.
-    """
+    """Put strings, by name for each part, into a file that was written without their surrogates."""
     with path.open("r+b") as file:
         for part, name, where in find_strings(file.read(_HEADERS)):
             if name in headers[part]:

@@ -27,16 +27,9 @@ class SharedLight(NamedTuple):
 
 
 def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
-    """Average the AOVs of a window over time, and filter each guided by the denoised light; alpha is only averaged.
+    """Average the AOVs of a window over time, and filter each guided by the denoised light (H, W, 3), except alpha.
 
     Returns the AOVs by name; `BEAUTY`, where some sums are incomplete, is the color filtered alike.
-
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        The window.
-    irradiance : (H, W, 3) array
-        The denoised centre.
     """
     means = {name: average(layer, aligned.confidence) for name, layer in aligned.aovs.items()}
     names = [name for name in means if name != ALPHA]
@@ -57,16 +50,8 @@ def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
 def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Array, *, add: bool) -> SharedLight:
     """Make filtered AOVs that are parts of the color, or of another AOV, add up to it.
 
-    Parameters
-    ----------
-    aligned : AlignedWindow
-        The window.
-    filtered : dict of str to (H, W, C) array
-        The AOVs, without texture where they are textured.
-    irradiance : (H, W, 3) array
-        The denoised centre.
-    add : bool
-        Whether the color becomes the sum of its parts; otherwise the parts are scaled to it.
+    The AOVs, (H, W, C), are without texture where they are textured. With `add` the color becomes the sum of its parts;
+    otherwise the parts are scaled to it.
     """
     sums, exposure = aligned.passes.sums, aligned.exposure
     aovs = {name: layer for name, layer in filtered.items() if name != BEAUTY}

@@ -58,33 +58,12 @@ def write_clips(
     seed: int = 0,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Path]:
-    """Write the training clips of a shot.
+    """Write the training clips of a shot; return the shards (paper, section 6, "Training Data").
 
-    Returns the shards. Raises ValueError if the levels have no frame in common, frames are smaller than a tile, there
-    is no first pass, or both a reference and a target.
-
-    Parameters
-    ----------
-    source : ClipSource
-        The renders.
-    folder : Path
-        Output folder of the shards.
-    radius : int
-        Frames on each side of the centre.
-    tile : int
-        Side of a clip, pixels; 0 for whole frames.
-    tiles : int
-        Clips of each frame, placed by `network.training.clips.importance`.
-    estimate : str
-        Source of the first passes (`hybrid.first_pass.find_first_pass`); not "none".
-    seed : int
-        Of the places.
-    advance : callable
-        Called after each frame.
-
-    References
-    ----------
-    Kalojanov and Thurston 2023, section 6, "Training Data".
+    Of each frame `tiles` clips of `tile` pixels a side (0: the whole frame) are placed by
+    `network.training.clips.importance` with a seed. `estimate` is the source of the first passes
+    (`hybrid.first_pass.find_first_pass`); not "none". Raises ValueError if the levels have no frame in common, frames
+    are smaller than a tile, there is no first pass, or both a reference and a target.
     """
     if source.reference is not None and source.target is not None:
         raise ValueError("target: expected none beside a reference, which is the target")

@@ -35,12 +35,7 @@ TILE = 2048
 def torch_backend(device: str, *, exact: bool) -> Callable[..., Array] | None:
     """Function that replaces OIDN for the first pass, or None where OIDN itself has to run.
 
-    Parameters
-    ----------
-    device : str
-        Of the networks: a GPU is left to OIDN.
-    exact : bool
-        Whether float32 was asked for: then first passes are OIDN's own.
+    That is on GPUs, and where float32 (`exact`) was asked for: then first passes are OIDN's own.
     """
     return denoise_unet if device == "cpu" and not exact and has_oidn_networks() else None
 
@@ -56,13 +51,8 @@ def denoise_unet(
 ) -> Array:
     """Denoise one frame with OIDN's networks; in bfloat16 63 to 66 dB from OIDN's own image.
 
-    Without OIDN's weights it raises as `network.oidn_weights.load_oidn`; see `has_oidn_networks`. Returns linear
-    radiance.
-
-    Parameters
-    ----------
-    color, albedo, normal, quality, prefilter, clean : array, str or bool
-        As for `hybrid.oidn.denoise_oidn`.
+    Parameters are those of `hybrid.oidn.denoise_oidn`. Without OIDN's weights it raises as
+    `network.oidn_weights.load_oidn`; see `has_oidn_networks`.
     """
     guides = {name: layer for name, layer in (("albedo", albedo), ("normal", normal)) if layer is not None}
     if prefilter is not None:
@@ -78,14 +68,9 @@ def denoise_unet(
 
 
 def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced") -> dict[str, Array]:
-    """Denoise guides, each by itself, with OIDN's networks; raises as `denoise_unet`.
+    """Denoise "albedo" and "normal", each by itself, with OIDN's networks, at "high" quality the large ones.
 
-    Parameters
-    ----------
-    guides : mapping of str to (H, W, 3) array
-        "albedo" and "normal", or one of them.
-    quality : str
-        "high" runs the large networks.
+    Raises as `denoise_unet`.
     """
     size = "_large" if quality == "high" else ""
     filters: dict[str, tuple[str, Callable[..., Tensor]]] = {
@@ -105,14 +90,8 @@ def bundled_preset(quality: Quality) -> str:
 def denoise_bundled(
     color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
-    """Denoise one frame with the backbone of a preset, which needs only torch. Returns linear radiance.
-
-    Parameters
-    ----------
-    color, albedo, normal : array
-        As for `hybrid.oidn.denoise_oidn`.
-    quality : str
-        Chooses the `bundled_preset`.
+    """Denoise one frame with the backbone of a preset, which needs only torch; the quality chooses the
+    `bundled_preset`.
     """
     # Missing guides are 0.5 to a backbone, as in `network.robust_unet.pack_inputs`; a normal of 0 is 0.5 to it.
     albedo = np.full_like(color, 0.5) if albedo is None else albedo

@@ -13,15 +13,7 @@ Block = tuple[slice, slice]
 
 
 def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
-    """Convert layers (T, H, W, C) to a tensor ``(1, T, C, H, W)``.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) array
-        Layers.
-    copied : bool
-        Whether planes become contiguous; otherwise the tensor is a view of the array.
-    """
+    """Convert layers (T, H, W, C) to a tensor ``(1, T, C, H, W)``, a view of the array unless `copied`."""
     planes = window.transpose(0, 3, 1, 2)
     return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
 
@@ -32,15 +24,7 @@ def image_of(tensor: torch.Tensor) -> Array:
 
 
 def pad(window: Array, multiple: int) -> Array:
-    """Repeat the bottom and right edges of layers up to multiples of a size.
-
-    Parameters
-    ----------
-    window : (T, H, W, C) array
-        Layers.
-    multiple : int
-        Of height and width.
-    """
+    """Repeat the bottom and right edges of layers (T, H, W, C) up to multiples of a size."""
     bottom, right = (-size % multiple for size in window.shape[1:3])
     return np.pad(window, ((0, 0), (0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else window
 
@@ -48,26 +32,11 @@ def pad(window: Array, multiple: int) -> Array:
 def tiles(
     rows: slice, height: int, width: int, tile: int, halo: int, multiple: int
 ) -> Iterator[tuple[Block, Block, Block]]:
-    """Cover some rows of an image with tiles.
+    """Cover some rows of an image with tiles: their part of the image, their input with the halo, the part within the
+    input.
 
-    Parameters
-    ----------
-    rows : slice
-        Rows to cover.
-    height, width : int
-        Of the image.
-    tile : int
-        Side of a tile, pixels, rounded up to `multiple`.
-    halo : int
-        Pixels around a tile that its result depends on, rounded up to `multiple`.
-    multiple : int
-        Tiles and halos start at multiples of this, so that every tile samples its coarse scales where the whole image
-        would.
-
-    Yields
-    ------
-    tuple of three pairs of slices
-        The tile's part of the image, its input with the halo, and the part within the input.
+    `halo` is how many pixels around a tile its result depends on. Tiles and halos start at multiples of `multiple`, to
+    which both sizes are rounded up, so that every tile samples its coarse scales where the whole image would.
     """
     halo = -(-halo // multiple) * multiple
     tile = -(-tile // multiple) * multiple

@@ -38,28 +38,11 @@ def train_network(
     resume: bool,
     log: Callable[[int, dict[str, float]], None],
 ) -> list[float]:
-    """Train a preset, or given weights, on the clips of a folder.
+    """Train a preset, or given weights, on the clips of a folder; return the losses.
 
-    Returns the losses. Raises ValueError if settings, clips and model do not fit together.
-
-    Parameters
-    ----------
-    inputs : TrainInputs
-        Clips and initial weights.
-    output : Path
-        Weights to write.
-    config : TrainConfig
-        All other settings; its seed is that of the initial weights too.
-    threads : int, optional
-        Of torch and numba.
-    resume : bool
-        Whether to continue an interrupted training, as for `network.training.loop.train`.
-    log : callable
-        Called with a step and figures.
-
-    Notes
-    -----
-    Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over nccl with GPUs and gloo without.
+    The seed of `config` is that of the initial weights too; `threads` are those of torch and numba; `resume` and `log`
+    as for `network.training.loop.train`. Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over
+    nccl with GPUs and gloo without. Raises ValueError if settings, clips and model do not fit together.
     """
     if threads is not None:
         limit_threads(threads)

@@ -49,27 +49,14 @@ def simulate(
     python: str | None = None,
     on_event: Any = None,
 ) -> None:
-    """Render shots, each into a folder of its own.
+    """Render shots, each into a folder of its own, which holds `LEVEL.####.exr` and `meta.json`; skip finished frames.
 
-    Parameters
-    ----------
-    shots : sequence of (ShotSettings, Path)
-        Settings and folder of each. A folder holds `LEVEL.####.exr` and `meta.json`; finished frames are skipped.
-    jobs : int
-        Blender processes at a time. With fewer shots than jobs, the frames of a shot are divided between processes.
-    threads : int, optional
-        Threads of each process; None divides the machine's cores between the jobs.
-    python : str, optional
-        An interpreter that has bpy; None: this one.
-    on_event : callable, optional
-        Called as `on_event(kind, shot folder, message)`, kind being `plan` or `frame`.
+    `jobs` is the number of Blender processes at a time. With fewer shots than jobs, the frames of a shot are divided
+    between processes; without `threads` the machine's cores between the jobs. `python` is an interpreter that has bpy,
+    by default this one. `on_event(kind, shot folder, message)` is called with the kinds `plan` and `frame`.
 
-    Raises
-    ------
-    SimulationError
-        bpy is missing, or Blender failed.
-    ValueError
-        A folder holds a shot with other settings.
+    Raises SimulationError if bpy is missing, or Blender failed; ValueError if a folder holds a shot with other
+    settings.
     """
     python = python or sys.executable
     check_blender(python)

@@ -96,12 +96,8 @@ class Sequence:
         are sRGB encoded. Vectors have their zero at middle gray. Single channels are gray: in [0, 1] unchanged,
         others scaled, like vectors, by the range of the first frame that was shown.
 
-        Raises
-        ------
-        KeyError
-            If there is no such frame or layer.
-        OSError, ExrError
-            If the file cannot be read, for instance because it is incomplete so far.
+        Raises KeyError if there is no such frame or layer; OSError or ExrError if the file cannot be read, for instance
+        because it is incomplete so far.
         """
         path = self._path(number)
         key = path, _version(path.stat()), name
@@ -235,14 +231,7 @@ def _on_display_window(picture: Image8, part: Part) -> Image8:
 
 
 def encode_picture(picture: Image8, suffix: str) -> bytes:
-    """Encode an image for a browser.
-
-    Parameters
-    ----------
-    picture : (H, W, 3) array of uint8
-    suffix : str
-        "png" (lossless), or "jpg" (small and fast).
-    """
+    """Encode an 8-bit image (H, W, 3) for a browser, as "png" (lossless), or "jpg" (small and fast)."""
     settings = {
         "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
         "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],

@@ -44,15 +44,7 @@ _templates.filters |= {
 
 
 def render(template: str, **values: object) -> Markup:
-    """Fill a template of this folder; a value that is missing raises `jinja2.UndefinedError`.
-
-    Parameters
-    ----------
-    template : str
-        Name of the file.
-    **values : object
-        Text is escaped unless it is `markupsafe.Markup`.
-    """
+    """Fill a template of this folder; text is escaped, and a missing value raises `jinja2.UndefinedError`."""
     return Markup(_templates.get_template(template).render(values))
 
 
