@@ -22,15 +22,13 @@ class Source:
     """The source that ravg is installed from."""
 
     version: str  # of this extension, such as 0.2.0
-    wheel: Path | None  # requirements are taken from wheels in its folder first; None: the package index
-    online: bool  # whether the package index may be used
+    wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder first
+    online: bool  # whether the package index may be used for requirements
 
     def requirements(self) -> list[str]:
-        """Return pip's arguments. FileNotFoundError or ValueError for a wrong wheel or no source at all."""
-        if self.wheel is None:
-            if not self.online:
-                raise ValueError("allow Online Access in Preferences > System > Network, or choose a wheel file")
-            return [f"ravg[neural]=={series(self.version)}.*", "pyoidn"]
+        """Return pip's arguments. FileNotFoundError or ValueError for a wrong wheel or none."""
+        if self.wheel is None:  # ravg is on no package index, where anybody could publish the name
+            raise ValueError(f"choose a wheel file of ravg, such as ravg-{self.version}-py3-none-any.whl")
         if not self.wheel.is_file():
             raise FileNotFoundError(f"no wheel file {self.wheel}")
         if not re.fullmatch(r"ravg-[^-]+-.+\.whl", self.wheel.name):
@@ -88,7 +86,7 @@ def explain(log: str, *, online: bool) -> str:
     """Return in one line why pip failed."""
     errors = re.findall(r"^ERROR: (.*)", log, re.MULTILINE)
     if online and _NO_NETWORK.search(log):
-        return "the package index cannot be reached: check the network, or choose a wheel file"
+        return "the package index cannot be reached: check the network, or put wheels of all requirements beside ravg's"
     lines = errors or [line for line in log.splitlines() if line.strip()] or ["no message"]
     missing = "" if online else " (Online Access is off: only wheels beside the chosen file were used)"
     return f"{lines[0]}{missing}"

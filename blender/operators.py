@@ -87,14 +87,14 @@ class Denoise(_WhenIdle, bpy.types.Operator):
 
 
 class Install(_WhenIdle, bpy.types.Operator):
-    """Install ravg for Blender alone, in its configuration folder, from the package index or from a wheel file"""
+    """Install ravg for Blender alone, in its configuration folder, from a wheel file"""
 
     bl_idname = "ravg.install"
     bl_label = "Install ravg"
 
     wheel: bpy.props.StringProperty(
         name="Wheel",
-        description="A wheel file of ravg, with those of its requirements in its folder; default: the package index",
+        description="A wheel file of ravg; its requirements come from wheels beside it, else from the package index",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -109,10 +109,11 @@ class Install(_WhenIdle, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column()
-        column.label(text="With torch, some gigabytes are downloaded")
-        column.prop(self, "wheel", placeholder="from the package index")
-        if not bpy.app.online_access:
-            column.label(text="Online Access is off: a wheel file is needed", icon="ERROR")
+        column.prop(self, "wheel", placeholder="ravg-…-py3-none-any.whl")
+        if bpy.app.online_access:
+            column.label(text="With torch, some gigabytes are downloaded")
+        else:
+            column.label(text="Online Access is off: wheels of all requirements are needed beside it", icon="ERROR")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return _follow(self, context, lambda: jobs.begin_install(self.wheel))

@@ -916,19 +916,19 @@ answer = [install(wheel=GOOD), there(), ran(), jobs.ravg_problem(wait=True), ins
     assert (left, still) == (["current.txt", "environment-2"], f"ravg {VERSION}")
 
 
-def test_without_a_network_the_error_says_so(blender):
+def test_without_a_wheel_or_a_network_the_error_says_so(blender, tmp_path):
+    needy = wheel(tmp_path, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: torch\n")
     code = (
         INSTALLING
         + """
 before = there() if settings.home().exists() else []
-offline = install()
 bpy.context.preferences.system.use_online_access = True
 os.environ["PIP_INDEX_URL"] = "http://127.0.0.1:9/"
-answer = [offline, install(), before, there()]
+answer = [install(), install(wheel=WHEEL), before, there()]
 """
     )
-    offline, failed, before, left = blender.run(code, command="")
-    assert "allow Online Access in Preferences" in offline
+    without, failed, before, left = blender.run(code, command="", WHEEL=str(needy))
+    assert "choose a wheel file of ravg" in without
     assert "the package index cannot be reached: check the network" in failed
     assert left == before
 

@@ -52,12 +52,14 @@ def test_an_environment_that_was_removed_is_not_used(tmp_path):
     assert install.installed(tmp_path) == ""
 
 
-def test_the_index_is_asked_only_where_that_is_allowed(tmp_path):
+def test_the_index_is_asked_only_where_that_is_allowed_and_never_for_ravg(tmp_path):
     wheel = tmp_path / "ravg-0.1.0-py3-none-any.whl"
     wheel.touch()
-    assert install.Source("0.1.4", None, True).requirements() == ["ravg[neural]==0.1.*", "pyoidn"]
-    with pytest.raises(ValueError, match="allow Online Access"):
-        install.Source("0.1.4", None, False).requirements()
+    for online in (True, False):
+        with pytest.raises(ValueError, match=r"choose a wheel file of ravg, such as ravg-0\.1\.4-py3"):
+            install.Source("0.1.4", None, online).requirements()
+        asked = install.Source("0.1.4", wheel, online).requirements()
+        assert [word for word in asked if word.startswith("ravg")] == [f"ravg[neural] @ {wheel.as_uri()}"]
     assert "--no-index" in install.Source("0.1.4", wheel, False).requirements()
     assert "--no-index" not in install.Source("0.1.4", wheel, True).requirements()
 
