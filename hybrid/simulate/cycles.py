@@ -192,12 +192,13 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
 
 
 @contextmanager
-def renamed_when_whole(path: Path) -> Iterator[Path]:
+def renamed_when_whole(path: Path, mark: str) -> Iterator[Path]:
     """Yield a new file beside `path` to render to, renamed to `path` at the end, or removed after an error.
 
-    The random name prevents Blender from writing through a link that somebody placed there.
+    Its name begins with the `mark` of the job, by which unfinished files are found after this process was killed. The
+    rest is random: Blender cannot write through a link that somebody placed there.
     """
-    partial = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}-{path.name}")
+    partial = path.with_name(f".{mark}-{secrets.token_hex(8)}-{path.name}")
     partial.touch(exist_ok=False)  # O_EXCL follows no link
     try:
         yield partial
@@ -220,10 +221,10 @@ def render_halves(scene: Any, path: Path, samples: int, seed: int) -> tuple[dict
     return header, channels
 
 
-def render_level(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int) -> None:
+def render_level(scene: Any, shot: ShotSettings, path: Path, samples: int, seed: int, mark: str = "") -> None:
     """Render the current frame to `path`, with half buffers and an unblurred guide pass where the shot needs them."""
     blur = scene.render.use_motion_blur
-    with renamed_when_whole(path) as partial:
+    with renamed_when_whole(path, mark) as partial:
         if shot.halves:
             header, channels = render_halves(scene, partial, samples, seed)
         else:
@@ -241,13 +242,13 @@ def render_level(scene: Any, shot: ShotSettings, path: Path, samples: int, seed:
             OpenEXR.File({**header, SAMPLES: str(samples)}, channels).write(str(partial))
 
 
-def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -> None:
+def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int, mark: str) -> None:
     """Render two halves of the reference with independent seeds, and write their mean; color only."""
     halves, half = [], max(shot.reference // 2, 1)
     for name in ("reference_a", "reference_b"):
         path = folder / f"{name}.{frame:04d}.exr"
         if not path.exists():
-            with renamed_when_whole(path) as partial:
+            with renamed_when_whole(path, mark) as partial:
                 render_frame(scene, partial, half, frame_seed(shot.seed, name, frame))
                 header, channels = read_channels(partial)
                 color = {key: values for key, values in channels.items() if ".Combined." in key}
@@ -255,12 +256,12 @@ def render_reference(scene: Any, shot: ShotSettings, folder: Path, frame: int) -
         halves.append(read_channels(path))
     (header, a), (_, b) = halves
     mean = {name: ((a[name].astype(np.float32) + b[name]) / 2).astype(np.float16) for name in a}
-    with renamed_when_whole(folder / f"reference.{frame:04d}.exr") as partial:
+    with renamed_when_whole(folder / f"reference.{frame:04d}.exr", mark) as partial:
         OpenEXR.File({**header, SAMPLES: str(2 * half)}, mean).write(str(partial))
 
 
 def main(job: dict[str, Any]) -> None:
-    """Do one job: `shot`, `out`, `frames`, `threads`, and `plan` where the shot is planned already."""
+    """Do one job: `shot`, `out`, `frames`, `threads`, `mark`, and `plan` where the shot is planned already."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # Blender prints to standard output; redirected to the log
 
@@ -283,9 +284,9 @@ def main(job: dict[str, Any]) -> None:
                 continue
             started = time.perf_counter()
             if name == "reference":
-                render_reference(scene, shot, out, frame)
+                render_reference(scene, shot, out, frame, job["mark"])
             else:
-                render_level(scene, shot, path, samples, frame_seed(shot.seed, name, frame))
+                render_level(scene, shot, path, samples, frame_seed(shot.seed, name, frame), job["mark"])
             answer(file=path.name, samples=samples, seconds=round(time.perf_counter() - started, 3))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import subprocess
 import sys
 import tempfile
@@ -142,7 +143,10 @@ class _Worker:
         self.out = out
         self._folder = tempfile.TemporaryDirectory(prefix="ravg-")
         job, self._log, answers = (Path(self._folder.name) / name for name in ("job.json", "log", "answers"))
+        # Not the number of the process: behind a launcher, as in an environment on Windows, the renderer has another.
+        self._mark = secrets.token_hex(8)
         data = {"shot": shot.to_json(), "out": str(out.resolve()), "frames": frames, "plan": plan, "threads": threads}
+        data["mark"] = self._mark
         job.write_text(json.dumps(data), encoding="utf-8")
         path = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]))
         # Files rather than pipes: reading a file never blocks, on any system.
@@ -183,7 +187,7 @@ class _Worker:
             self._process.kill()
             self._process.wait()
         self._answers.close()
-        for partial in self.out.glob(f".{self._process.pid}-*"):
+        for partial in self.out.glob(f".{self._mark}-*"):
             partial.unlink()
         self._folder.cleanup()
 

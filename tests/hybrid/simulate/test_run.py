@@ -263,6 +263,38 @@ def test_a_renderer_that_fails_is_reported_with_its_last_word(tmp_path, stub):
         simulate([(SHOT, tmp_path)], python=stub(fail="True"))
 
 
+# A renderer behind a launcher, as in Windows' virtual environments: its number is not that of the process that was
+# started. It leaves an unfinished file when it is killed.
+LAUNCHED = """
+import json, os, sys, time
+if sys.argv[1] == "-c":
+    sys.exit(0)
+job, launcher = json.load(open(sys.argv[3])), os.getppid()
+open(os.path.join(job["out"], f".{job['mark']}-1-a.0001.exr"), "w").close()
+print(json.dumps({"plan": {"attempt": 0, "description": {}, "printed": []}}), flush=True)
+while os.getppid() == launcher:
+    time.sleep(0.05)
+"""
+
+
+@pytest.mark.posix
+def test_unfinished_files_of_a_renderer_behind_a_launcher_are_removed(tmp_path):
+    script, python = tmp_path / "stub.py", tmp_path / "python"
+    script.write_text(LAUNCHED)
+    python.write_text(f'#!/bin/sh\n"{sys.executable}" "{script}" "$@"\n')
+    python.chmod(0o755)
+    there = []
+
+    def interrupt(kind, out, message):
+        there.extend(path.name for path in out.glob(".*.exr"))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate([(SHOT, tmp_path / "s")], python=str(python), on_event=interrupt)
+    assert len(there) == 1
+    assert not list((tmp_path / "s").glob(".*.exr"))
+
+
 def test_without_blender_the_message_says_how_to_get_it(stub):
     with pytest.raises(SimulationError, match=r"pip install \"bpy==5\.0\.1\".*Python 3\.11.*--python"):
         check_blender(stub(found=3))
