@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import socket
 import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -44,7 +45,7 @@ class ViewServer(ThreadingHTTPServer):
     """Serves sequences (the first is the result) to a browser on this machine; port 0: any free port."""
 
     daemon_threads = True
-    allow_reuse_address = sys.platform != "win32"  # there two servers could share a port
+    allow_reuse_address = sys.platform != "win32"  # there it lets two servers share a port
 
     def __init__(self, sequences: list[Sequence], *, rate: float = 24, port: int = 0) -> None:
         self.sequences = sequences
@@ -52,6 +53,12 @@ class ViewServer(ThreadingHTTPServer):
         self.secret = secrets.token_urlsafe(16)
         self._exposure: float | None = None
         super().__init__((LOOPBACK, port), _Handler)
+
+    def server_bind(self) -> None:
+        """Bind the port; on Windows so that no other program can bind it as well."""
+        if sys.platform == "win32":
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        super().server_bind()
 
     @property
     def port(self) -> int:
