@@ -131,5 +131,5 @@ def _measured(decision: Decision) -> str:
     """A measurement and its threshold."""
     if decision.figure is None or decision.threshold is None:
         return "–"
-    sign = ">" if decision.figure > decision.threshold else "≤"
+    sign = ">" if decision.figure > decision.threshold else "<="
     return f"{decision.figure:.3g} {sign} {decision.threshold:.3g}"

@@ -103,7 +103,8 @@ def result_table(results: Sequence[MethodResult]) -> Table:
             table.add_row(escape(r.name), *("–" for _ in table.columns[1:]), style="dim")
             continue
         costs = format_seconds(r.seconds_per_megapixel), format_seconds(r.cpu_seconds_per_megapixel)
-        cells = columns.cells(r.name, "[bold]{}[/]", "≈{}")
+        # Columns stay in line where a terminal lacks the sign.
+        cells = [cell.replace("∞", "inf") for cell in columns.cells(r.name, "[bold]{}[/]", "≈{}")]
         table.add_row(escape(r.name), *cells, *costs, format_bytes(r.peak_bytes), format_worth(r.worth))
     absent = [f"{r.name}: {r.absent_reason}" for r in results if r.absent_reason is not None]
     if absent:

@@ -144,6 +144,15 @@ def test_terminals_that_know_only_ascii(shot_folder, environment):
     assert done.stdout.isascii()
 
 
+def test_tables_stay_in_line_where_signs_are_replaced(shot_folder):
+    """The encoding of pipes on Windows has no "≤"; two letters in its place shifted the columns behind it."""
+    command, options = ravg("inspect", shot_folder, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
+    printed = subprocess.run(command, **options, capture_output=True, check=True).stdout.decode("cp1252")
+    rows = [line for line in printed.partition("Plan")[2].splitlines() if line.startswith("|") and "-+-" not in line]
+    assert any(" <= " in row for row in rows)
+    assert len({tuple(i for i, sign in enumerate(row) if sign == "|") for row in rows}) == 1
+
+
 def test_the_first_run_says_that_it_compiles_and_later_ones_do_not(shot_folder, tmp_path):
     cache = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command, options = ravg("denoise", shot_folder, "-o", tmp_path / "out", "--preset", "draft", env=cache)
