@@ -20,7 +20,7 @@ from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frame import Frames
 from hybrid.files.sources import versions
-from hybrid.runtime.system import load_average
+from hybrid.runtime.system import load_average, processor_name
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
 LARGE = 1 << 20  # pixels of a frame; above, maps of all frames would take longer than the rest of a comparison
@@ -281,16 +281,7 @@ def _facts_of_runs(options: CompareOptions, load: float | None) -> dict[str, str
         f"frame, up to {WARM_UP} pixels per side. Compilation, loading of weights and reading of files do not count. "
         "Median, and the range of the runs. Peak memory as counted by the operating system. Waiting threads sleep "
         f"(OMP_WAIT_POLICY=PASSIVE, GOMP_SPINCOUNT={os.environ.get('GOMP_SPINCOUNT', '0')}).",
-        "Machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}"
+        "Machine": f"{processor_name()}, {os.cpu_count()} cores, {platform.system()}"
         + ("" if load is None else f"; load average {load:.1f} at the start"),
         "Versions": ", ".join([f"Python {platform.python_version()}", *packages]),
     }
-
-
-def _processor() -> str:
-    """Name of the processor on Linux, else the architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.machine()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import platform
 import signal
 import stat
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -27,6 +29,7 @@ _INTERVAL = 0.05
 if sys.platform == "win32":
     import ctypes
     import msvcrt
+    import winreg
     from ctypes import wintypes
 
     _KERNEL = ctypes.WinDLL("kernel32", use_last_error=True)
@@ -228,3 +231,20 @@ def load_average() -> float | None:
         return None
     else:
         return os.getloadavg()[0]
+
+
+def processor_name() -> str:
+    """Return the processor's name, or its architecture if the system names none."""
+    try:
+        if sys.platform == "win32":
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"HARDWARE\DESCRIPTION\System\CentralProcessor\0") as key:
+                name = str(winreg.QueryValueEx(key, "ProcessorNameString")[0])
+        elif sys.platform == "darwin":
+            command = ["sysctl", "-n", "machdep.cpu.brand_string"]
+            name = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL)
+        else:
+            lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+            name = next(line.partition(":")[2] for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration, subprocess.CalledProcessError):
+        name = ""
+    return name.strip() or platform.machine()

@@ -16,6 +16,7 @@ from hybrid.runtime.system import (
     open_file,
     peak_memory,
     process_lives,
+    processor_name,
     replace_path,
     same_file,
     start_context,
@@ -151,6 +152,23 @@ def test_processes_are_forked_from_a_server_on_linux_alone(monkeypatch):
 def test_the_load_is_unknown_on_windows(monkeypatch):
     monkeypatch.setattr(system.sys, "platform", "win32")
     assert load_average() is None
+
+
+def test_the_processor_has_a_name(monkeypatch):
+    """Not only an architecture: reports and records of two machines differ in it."""
+    assert len(processor_name()) > len("x86_64")
+    asked = []
+    monkeypatch.setattr(system.sys, "platform", "darwin")
+    monkeypatch.setattr(system.subprocess, "check_output", lambda command, **_: asked.append(command) or "Apple M4\n")
+    assert processor_name() == "Apple M4"
+    assert asked == [["sysctl", "-n", "machdep.cpu.brand_string"]]
+
+    def fail(*_, **__):
+        raise FileNotFoundError("sysctl")
+
+    monkeypatch.setattr(system.subprocess, "check_output", fail)
+    monkeypatch.setattr(system.platform, "machine", lambda: "arm64")
+    assert processor_name() == "arm64"
 
 
 @pytest.mark.parametrize("name", ["aux.exr", "con", "COM1.exr", "nul"])
