@@ -72,6 +72,7 @@ def temporary(tmp_path):
     return folder
 
 
+@pytest.mark.posix
 def test_where_neither_home_nor_installation_can_be_written_to_loops_are_kept_among_temporary_files(
     installed, temporary
 ):
@@ -85,6 +86,7 @@ def test_where_neither_home_nor_installation_can_be_written_to_loops_are_kept_am
     assert run(installed, **home)[2] == 1  # the next run has it
 
 
+@pytest.mark.posix
 def test_where_nothing_can_be_written_to_loops_are_compiled_in_each_run(installed):
     value, _, found, said = run(installed, HOME="/nonexistent", NO_TEMPORARY_FILES="1")
     assert (value, found) == ("42", 0)
