@@ -22,22 +22,18 @@ from uuid import uuid4
 import typer
 
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import RESOURCES
+from hybrid.commands.options import resource_option
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 SchedulerOption = Annotated[
     str | None,
-    typer.Option(
+    resource_option(
+        "Dask scheduler, such as tcp://host:8786, whose workers run the command over shared folders",
         metavar="ADDRESS",
         envvar="RAVG_SCHEDULER",
-        help="Dask scheduler, such as tcp://host:8786, whose workers run the command over shared folders",
-        rich_help_panel=RESOURCES,
     ),
 ]
-ChunkOption = Annotated[
-    int,
-    typer.Option(min=1, metavar="N", help="frames in a chunk of --scheduler", rich_help_panel=RESOURCES),
-]
+ChunkOption = Annotated[int, resource_option("frames in a chunk of --scheduler", min=1, metavar="N")]
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
 # Seconds that a connection may take.

@@ -15,9 +15,6 @@ from rich.console import Console
 
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import (
-    INPUT,
-    OUTPUT,
-    WHAT,
     FramesOption,
     LayerOption,
     MotionOption,
@@ -25,6 +22,9 @@ from hybrid.commands.options import (
     RateOption,
     StrictOption,
     choose,
+    input_option,
+    output_option,
+    work_option,
 )
 from hybrid.commands.shots import log_cuts, open_input, validate_renders
 from hybrid.comparison.compare import CompareOptions, compare_shot
@@ -51,85 +51,47 @@ def compare(
     ] = None,
     reference: Annotated[
         list[str] | None,
-        typer.Option(
+        input_option(
+            "the same frames at many samples; given twice: two independent halves, whose noise cancels",
             metavar="PATTERN",
-            help="the same frames at many samples; given twice: two independent halves, whose noise cancels",
-            rich_help_panel=INPUT,
         ),
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="REPORT",
-            help="folder for a page with chart and pictures",
-            rich_help_panel=OUTPUT,
-        ),
+        Path | None, output_option("folder for a page with chart and pictures", "-o", "--output", metavar="REPORT")
     ] = None,
     methods: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="methods to run, separated by commas; default: all", rich_help_panel=WHAT),
+        str | None, work_option("methods to run, separated by commas; default: all", metavar="NAMES")
     ] = None,
     external: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=PATTERN",
-            help="finished frames of another denoiser; may be repeated",
-            rich_help_panel=INPUT,
-        ),
+        list[str] | None, input_option("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
     ] = None,
-    sweep: Annotated[
-        bool, typer.Option("--sweep", help="also vary stages and settings, one at a time", rich_help_panel=WHAT)
-    ] = False,
-    rounds: Annotated[
-        int, typer.Option(min=1, help="runs of each method, in turns; the time is their median", rich_help_panel=WHAT)
-    ] = 3,
+    sweep: Annotated[bool, work_option("also vary stages and settings, one at a time", "--sweep")] = False,
+    rounds: Annotated[int, work_option("runs of each method, in turns; the time is their median", min=1)] = 3,
     samples: Annotated[
         float | None,
-        typer.Option(
-            metavar="SPP",
-            min=1,
-            help="samples per pixel of SHOT, unless its files state them, as those of Cycles do",
-            rich_help_panel=INPUT,
+        input_option(
+            "samples per pixel of SHOT, unless its files state them, as those of Cycles do", metavar="SPP", min=1
         ),
     ] = None,
     level: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PATTERN=SPP",
-            help="SHOT at other samples per pixel, to measure how the noise falls; may be repeated",
-            rich_help_panel=INPUT,
+        input_option(
+            "SHOT at other samples per pixel, to measure how the noise falls; may be repeated", metavar="PATTERN=SPP"
         ),
     ] = None,
-    exposure: Annotated[
-        float, typer.Option(help="exposure factor of the measures, applied before the tone curve", rich_help_panel=WHAT)
-    ] = 1.0,
-    clock: Annotated[
-        Literal["wall", "cpu"],
-        typer.Option(help="time in chart.png and in the Markdown table", rich_help_panel=OUTPUT),
-    ] = "wall",
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="print the table as Markdown", rich_help_panel=OUTPUT)
-    ] = False,
+    exposure: Annotated[float, work_option("exposure factor of the measures, applied before the tone curve")] = 1.0,
+    clock: Annotated[Literal["wall", "cpu"], output_option("time in chart.png and in the Markdown table")] = "wall",
+    markdown: Annotated[bool, output_option("print the table as Markdown", "--markdown")] = False,
     name: Annotated[
-        str | None,
-        typer.Option(help="name of the shot in tables and on the page; default: its folder", rich_help_panel=OUTPUT),
+        str | None, output_option("name of the shot in tables and on the page; default: its folder")
     ] = None,
     with_report: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="REPORT",
-            help="folder of a finished comparison of another shot, to include; may be repeated",
-            rich_help_panel=INPUT,
-        ),
+        input_option("folder of a finished comparison of another shot, to include; may be repeated", metavar="REPORT"),
     ] = None,
     fps: RateOption = 24,
     movies: Annotated[
-        bool,
-        typer.Option(
-            "--movies", help="also write a movie of each method in full size, next to the page", rich_help_panel=OUTPUT
-        ),
+        bool, output_option("also write a movie of each method in full size, next to the page", "--movies")
     ] = False,
     frames: FramesOption = None,
     layer: LayerOption = None,

@@ -16,9 +16,6 @@ from rich.table import Table
 from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable
 from hybrid.commands.options import (
-    OUTPUT,
-    RESOURCES,
-    WHAT,
     AovOption,
     DeviceOption,
     FirstPassOption,
@@ -39,7 +36,10 @@ from hybrid.commands.options import (
     SheetOption,
     ShotArgument,
     StrictOption,
+    output_option,
+    resource_option,
     usage,
+    work_option,
 )
 from hybrid.commands.shots import (
     ShotInput,
@@ -101,71 +101,59 @@ def denoise(
     strict: StrictOption = False,
     method: Annotated[
         Literal["network", "classical", "pooled"] | None,
-        typer.Option(
-            help="network: Robust Average (needs torch); classical: align, average, non-local means, guided filter; "
-            "pooled: OIDN on the samples of all frames of the window (default: that of the preset, or network)",
-            rich_help_panel=WHAT,
+        work_option(
+            "network: Robust Average (needs torch); classical: align, average, non-local means, guided filter; pooled: "
+            "OIDN on the samples of all frames of the window (default: that of the preset, or network)"
         ),
     ] = None,
     preset: Annotated[
         Literal["fast", "balanced", "quality", "tkpcn", "auto", "draft", "standard", "final", "pooled", "gathered"]
         | None,
-        typer.Option(
+        work_option(
+            "network: fast (default), balanced, quality, or auto, with --budget; classical: draft, standard (default), "
+            "final; pooled",
             metavar="NAME",
-            help="network: fast (default), balanced, quality, or auto, with --budget; classical: draft, "
-            "standard (default), final; pooled",
-            rich_help_panel=WHAT,
         ),
     ] = None,
     budget: Annotated[
         str | None,
-        typer.Option(
-            metavar="TIME",
-            help="time per frame, such as 10s: --preset auto takes the most accurate preset that fits",
-            rich_help_panel=WHAT,
+        work_option(
+            "time per frame, such as 10s: --preset auto takes the most accurate preset that fits", metavar="TIME"
         ),
     ] = None,
     weights: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="weights file of ravg train, in place of a preset", rich_help_panel=WHAT),
+        Path | None, work_option("weights file of ravg train, in place of a preset", metavar="FILE")
     ] = None,
     threshold: Annotated[
         float | None,
-        typer.Option(
+        work_option(
+            "threshold of weights that predict kernels; higher drops more taps (default: as trained)",
             min=0,
             max=0.99,
             metavar="SHARE",
-            help="threshold of weights that predict kernels; higher drops more taps (default: as trained)",
-            rich_help_panel=WHAT,
         ),
     ] = None,
     first_pass: FirstPassOption = None,
     keep_first_pass: KeepOption = None,
     passes: Annotated[
         int,
-        typer.Option(
+        work_option(
+            "denoise the result again: a wider window in time, and a softer image; --resume skips frames of the last "
+            "pass",
             min=1,
             metavar="N",
-            help="denoise the result again: a wider window in time, and a softer image; --resume skips frames of the "
-            "last pass",
-            rich_help_panel=WHAT,
         ),
     ] = 1,
     breakdown: Annotated[
         Path | None,
-        typer.Option(
-            metavar="PNG",
-            help="image of the share of each frame in the result, with layers and a table of weights",
-            rich_help_panel=OUTPUT,
+        output_option(
+            "image of the share of each frame in the result, with layers and a table of weights", metavar="PNG"
         ),
     ] = None,
     aov: AovOption = None,
     aov_sum: Annotated[
         Literal["layers", "beauty"],
-        typer.Option(
-            help="keep AOVs consistent: scale light passes to the denoised beauty, or make the beauty their sum",
-            rich_help_panel=WHAT,
-        ),
+        work_option("keep AOVs consistent: scale light passes to the denoised beauty, or make the beauty their sum"),
     ] = "layers",
     preview: PreviewOption = None,
     fps: RateOption = 24,
@@ -174,20 +162,15 @@ def denoise(
     no_stages: OffOption = None,
     tile: Annotated[
         int | None,
-        typer.Option(
+        resource_option(
+            "side in pixels of the tiles of the network (default: 2048, of kernels 640, with --max-memory 384)",
             min=16,
             metavar="N",
-            help="side in pixels of the tiles of the network (default: 2048, of kernels 640, with --max-memory 384)",
-            rich_help_panel=RESOURCES,
         ),
     ] = None,
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
-        typer.Option(
-            envvar="RAVG_PRECISION",
-            help="precision of the network; auto: bfloat16 where the processor has it",
-            rich_help_panel=RESOURCES,
-        ),
+        resource_option("precision of the network; auto: bfloat16 where the processor has it", envvar="RAVG_PRECISION"),
     ] = "auto",
     device: DeviceOption = "auto",
     resume: ResumeOption = False,

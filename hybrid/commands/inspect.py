@@ -15,7 +15,6 @@ from rich.text import Text
 
 from hybrid.commands.log import LOG, Progress, printable
 from hybrid.commands.options import (
-    OUTPUT,
     FramesOption,
     LayerOption,
     MotionOption,
@@ -25,6 +24,7 @@ from hybrid.commands.options import (
     ProfileOption,
     ShotArgument,
     StrictOption,
+    output_option,
 )
 from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, rules_of, views_of
 from hybrid.files.layers import Layers, describe_layers
@@ -42,7 +42,7 @@ def inspect(
     strict: StrictOption = False,
     stages: OnOption = None,
     no_stages: OffOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object", rich_help_panel=OUTPUT)] = False,
+    as_json: Annotated[bool, output_option("print one JSON object", "--json")] = False,
     max_pixels: PixelsOption = None,
 ) -> None:
     """Show which layer has which role, and which stages run, with measurements and reasons.

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from hybrid.commands.options import panel
 from hybrid.runtime.streams import open_standard_streams
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ LOG = logging.getLogger("ravg")
 LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
-PANEL = "Messages"
+message_option = panel("Messages")
 RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
@@ -60,19 +61,13 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
             LOG.warning(line)
         command(**arguments, **({"context": context} if "context" in signature.parameters else {}))
 
-    form = typer.Option(
-        "--log-format", envvar="RAVG_LOG_FORMAT", help="format of progress and messages", rich_help_panel=PANEL
-    )
-    file = typer.Option(
-        "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE", help="append messages to a file", rich_help_panel=PANEL
-    )
-    less = typer.Option("-q", "--quiet", help="only warnings and errors", rich_help_panel=PANEL)
-    more = typer.Option("-v", "--verbose", help="also details", rich_help_panel=PANEL)
+    form = message_option("format of progress and messages", "--log-format", envvar="RAVG_LOG_FORMAT")
+    file = message_option("append messages to a file", "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE")
     options = {
         "log_format": (Annotated[LogFormat, form], "text"),
         "log_file": (Annotated[Path | None, file], None),
-        "quiet": (Annotated[bool, less], False),
-        "verbose": (Annotated[bool, more], False),
+        "quiet": (Annotated[bool, message_option("only warnings and errors", "-q", "--quiet")], False),
+        "verbose": (Annotated[bool, message_option("also details", "-v", "--verbose")], False),
     }
     parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
     added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]

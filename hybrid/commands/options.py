@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
 Thing = TypeVar("Thing")
 
-# Groups of options in the help.
-INPUT, WHAT, OUTPUT, RESOURCES = "Input", "What to run", "Output", "Resources"
+
+def panel(title: str) -> Callable[..., Any]:
+    """Return a function that makes an option of a panel of the help, from its help text and its names."""
+
+    def option(text: str, *names: str, **settings: Any) -> Any:
+        return typer.Option(*names, help=text, rich_help_panel=title, **settings)
+
+    return option
+
+
+input_option, work_option = panel("Input"), panel("What to run")
+output_option, resource_option = panel("Output"), panel("Resources")
 
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
 DeviceOption = Annotated[
     Device,
-    typer.Option(
+    resource_option(
+        "device for ravg's networks and OIDN's; auto: the first available of cuda, hip, sycl, cpu",
         "--device",
         envvar="RAVG_DEVICE",
-        help="device for ravg's networks and OIDN's; auto: the first available of cuda, hip, sycl, cpu",
-        rich_help_panel=RESOURCES,
     ),
 ]
 
@@ -44,147 +53,112 @@ ShotArgument = Annotated[
 ]
 OutputOption = Annotated[
     str,
-    typer.Option(
+    output_option(
+        "denoised frames: OUT.####.exr, or a folder, which keeps the names of the input",
         "-o",
         "--output",
         metavar="OUT",
         callback=_check_output,
-        help="denoised frames: OUT.####.exr, or a folder, which keeps the names of the input",
-        rich_help_panel=OUTPUT,
     ),
 ]
 FramesOption = Annotated[
-    str | None,
-    typer.Option("--frames", metavar="RANGE", help="frames, such as 1001-1010x2 (default: all)", rich_help_panel=INPUT),
+    str | None, input_option("frames, such as 1001-1010x2 (default: all)", "--frames", metavar="RANGE")
 ]
 LayerOption = Annotated[
     list[str] | None,
-    typer.Option(
+    input_option(
+        "use a layer as color, albedo, normal, depth, motion, variance, half_a, half_b or estimate; or the layer of "
+        "another sequence: albedo=path/alb.####.exr, with :LAYER if that has several; repeatable (default: by the "
+        "names of the renderer)",
         "--layer",
         metavar="ROLE=LAYER",
-        help="use a layer as color, albedo, normal, depth, motion, variance, half_a, half_b or estimate; or the layer "
-        "of another sequence: albedo=path/alb.####.exr, with :LAYER if that has several; repeatable "
-        "(default: by the names of the renderer)",
-        rich_help_panel=INPUT,
     ),
 ]
 ProfileOption = Annotated[
     str | None,
-    typer.Option(
+    input_option(
+        "renderer whose layer names and conventions apply, or a TOML file (docs/renderers.md; default: detect)",
         metavar="NAME|FILE",
         envvar="RAVG_PROFILE",
-        help="renderer whose layer names and conventions apply, or a TOML file (docs/renderers.md; default: detect)",
-        rich_help_panel=INPUT,
     ),
 ]
 MotionOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="WORDS",
-        help="motion-vector convention, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: detect; none: ignore "
+    input_option(
+        "motion-vector convention, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: detect; none: ignore "
         "the vectors (default: the renderer's)",
-        rich_help_panel=INPUT,
+        metavar="WORDS",
     ),
 ]
 StrictOption = Annotated[
     bool,
-    typer.Option(
-        "--strict",
-        help="stop at layers that make no sense and at cuts (default: leave such layers out, and warn)",
-        rich_help_panel=INPUT,
+    input_option(
+        "stop at layers that make no sense and at cuts (default: leave such layers out, and warn)", "--strict"
     ),
 ]
 PreviewOption = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames",
-        rich_help_panel=OUTPUT,
+    output_option(
+        "noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames", metavar="FILE"
     ),
 ]
-RateOption = Annotated[
-    float,
-    typer.Option("--fps", min=1, max=240, help="frames per second of movies and players", rich_help_panel=OUTPUT),
-]
+RateOption = Annotated[float, output_option("frames per second of movies and players", "--fps", min=1, max=240)]
 SheetOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--contact-sheet", metavar="PNG", help="one image of frames from all over the shot", rich_help_panel=OUTPUT
-    ),
+    Path | None, output_option("one image of frames from all over the shot", "--contact-sheet", metavar="PNG")
 ]
 OnOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--stages", metavar="NAME", help="stages to run, whatever was measured; see ravg inspect", rich_help_panel=WHAT
-    ),
+    list[str] | None, work_option("stages to run, whatever was measured; see ravg inspect", "--stages", metavar="NAME")
 ]
-OffOption = Annotated[
-    list[str] | None,
-    typer.Option("--no-stages", metavar="NAME", help="stages not to run", rich_help_panel=WHAT),
-]
+OffOption = Annotated[list[str] | None, work_option("stages not to run", "--no-stages", metavar="NAME")]
 FirstPassOption = Annotated[
     str | None,
-    typer.Option(
+    work_option(
+        "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
+        "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
+        "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
         "--first-pass",
         metavar="SOURCE",
-        help="denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
-        "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or a "
-        "finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
-        rich_help_panel=WHAT,
     ),
 ]
 KeepOption = Annotated[
     str | None,
-    typer.Option(
+    output_option(
+        "keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
         "--keep-first-pass",
         metavar="OUT",
-        help="keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
-        rich_help_panel=OUTPUT,
     ),
 ]
 ResumeOption = Annotated[
-    bool,
-    typer.Option(
-        "--resume",
-        help="skip frames that an earlier run with the same options has finished",
-        rich_help_panel=OUTPUT,
-    ),
+    bool, output_option("skip frames that an earlier run with the same options has finished", "--resume")
 ]
 KeepGoingOption = Annotated[
     bool,
-    typer.Option(
+    output_option(
+        "continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
         "--keep-going",
         envvar="RAVG_KEEP_GOING",
-        help="continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
-        rich_help_panel=OUTPUT,
     ),
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(
+    resource_option(
+        "limit, such as 8G: frames are denoised in bands of rows (default: whole frames)",
         metavar="SIZE",
         envvar="RAVG_MAX_MEMORY",
-        help="limit, such as 8G: frames are denoised in bands of rows (default: whole frames)",
-        rich_help_panel=RESOURCES,
     ),
 ]
 PixelsOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=1,
-        envvar="RAVG_MAX_PIXELS",
-        help="refuse files that claim more pixels (default: 2^28)",
-        rich_help_panel=RESOURCES,
+    resource_option(
+        "refuse files that claim more pixels (default: 2^28)", metavar="N", min=1, envvar="RAVG_MAX_PIXELS"
     ),
 ]
 AovOption = Annotated[
     list[str] | None,
-    typer.Option(
+    work_option(
+        "denoise this layer too; all: every layer whose name is known for a part of the light; repeatable",
         "--aov",
         metavar="LAYER",
-        help="denoise this layer too; all: every layer whose name is known for a part of the light; repeatable",
-        rich_help_panel=WHAT,
     ),
 ]
 

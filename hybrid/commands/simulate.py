@@ -10,7 +10,7 @@ import typer
 
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import INPUT, OUTPUT, RESOURCES, WHAT, usage
+from hybrid.commands.options import input_option, output_option, resource_option, usage, work_option
 from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
@@ -22,91 +22,46 @@ def simulate(
         str, typer.Argument(metavar="SCENE", help="a .blend file, random, hard, validation, test, or one as test:NAME")
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            "--out",
-            metavar="OUT",
-            help="folder for the frames and meta.json",
-            rich_help_panel=OUTPUT,
-        ),
+        Path, output_option("folder for the frames and meta.json", "-o", "--output", "--out", metavar="OUT")
     ],
-    frames: Annotated[
-        str, typer.Option("--frames", metavar="RANGE", help="such as 1001-1010x2", rich_help_panel=INPUT)
-    ] = "1-7",
-    size: Annotated[
-        str, typer.Option(metavar="WxH", help="pixels of the rendered image", rich_help_panel=WHAT)
-    ] = "320x180",
+    frames: Annotated[str, input_option("such as 1001-1010x2", "--frames", metavar="RANGE")] = "1-7",
+    size: Annotated[str, work_option("pixels of the rendered image", metavar="WxH")] = "320x180",
     film: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="pixels of the whole camera, of which --size is a crop", rich_help_panel=WHAT),
+        str | None, work_option("pixels of the whole camera, of which --size is a crop", metavar="WxH")
     ] = None,
     center: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y", help="center of the crop in the film, as fractions, y down", rich_help_panel=WHAT),
+        str | None, work_option("center of the crop in the film, as fractions, y down", metavar="X,Y")
     ] = None,
-    spp: Annotated[
-        str,
-        typer.Option(metavar="N", help="samples per pixel, n; LOW-HIGH: drawn for each shot", rich_help_panel=WHAT),
-    ] = "16",
-    levels: Annotated[
-        str, typer.Option(help="noise levels, such as n,n/e,4 or noisy=n", rich_help_panel=WHAT)
-    ] = "n,n/e,4",
-    reference: Annotated[
-        int,
-        typer.Option(min=0, metavar="SPP", help="samples per pixel of a reference; 0: none", rich_help_panel=WHAT),
-    ] = 0,
+    spp: Annotated[str, work_option("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
+    levels: Annotated[str, work_option("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
+    reference: Annotated[int, work_option("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
     reference_frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NUMBERS", help="frames with a reference, such as 1,4,7; default: all", rich_help_panel=WHAT
-        ),
+        str | None, work_option("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
     ] = None,
-    seed: Annotated[int, typer.Option(help="seed of all random numbers", rich_help_panel=INPUT)] = 1,
-    shots: Annotated[
-        int, typer.Option(min=1, metavar="N", help="number of shots, with seeds that count up", rich_help_panel=INPUT)
-    ] = 1,
-    camera: Annotated[str | None, typer.Option(help="a camera of the file, or random", rich_help_panel=INPUT)] = None,
+    seed: Annotated[int, input_option("seed of all random numbers")] = 1,
+    shots: Annotated[int, input_option("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
+    camera: Annotated[str | None, input_option("a camera of the file, or random")] = None,
     motion: Annotated[
-        Literal["auto", "keep", "add"],
-        typer.Option("--animate", help="auto: add motion to a file that has none", rich_help_panel=WHAT),
+        Literal["auto", "keep", "add"], work_option("auto: add motion to a file that has none", "--animate")
     ] = "auto",
     moving_objects: Annotated[
-        int | None,
-        typer.Option(min=0, metavar="N", help="number of moving objects in added motion", rich_help_panel=WHAT),
+        int | None, work_option("number of moving objects in added motion", min=0, metavar="N")
     ] = None,
-    motion_blur: Annotated[
-        bool, typer.Option("--motion-blur", help="render with motion blur", rich_help_panel=WHAT)
-    ] = False,
-    halves: Annotated[
-        bool, typer.Option("--halves", help="add half buffers, for the variance", rich_help_panel=WHAT)
-    ] = False,
+    motion_blur: Annotated[bool, work_option("render with motion blur", "--motion-blur")] = False,
+    halves: Annotated[bool, work_option("add half buffers, for the variance", "--halves")] = False,
     effects: Annotated[
-        Literal["auto", "all"],
-        typer.Option(help="auto: the effects that the scene needs; all: every effect", rich_help_panel=WHAT),
+        Literal["auto", "all"], work_option("auto: the effects that the scene needs; all: every effect")
     ] = "auto",
-    jobs: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Blender processes at a time", rich_help_panel=RESOURCES)
-    ] = 1,
+    jobs: Annotated[int, resource_option("Blender processes at a time", min=1, metavar="N")] = 1,
     threads: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            envvar="RAVG_THREADS",
-            help="threads of each process; default: the cores divided by --jobs",
-            rich_help_panel=RESOURCES,
+        resource_option(
+            "threads of each process; default: the cores divided by --jobs", min=1, metavar="N", envvar="RAVG_THREADS"
         ),
     ] = None,
     python: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE",
-            envvar="RAVG_BLENDER_PYTHON",
-            help="Python interpreter with bpy; default: this one",
-            rich_help_panel=RESOURCES,
-        ),
+        resource_option("Python interpreter with bpy; default: this one", metavar="FILE", envvar="RAVG_BLENDER_PYTHON"),
     ] = None,
     scheduler: SchedulerOption = None,
 ) -> None:

@@ -16,10 +16,6 @@ import typer
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import (
-    INPUT,
-    OUTPUT,
-    RESOURCES,
-    WHAT,
     DeviceOption,
     FramesOption,
     LayerOption,
@@ -27,7 +23,12 @@ from hybrid.commands.options import (
     ProfileOption,
     StrictOption,
     check_first_pass,
+    input_option,
+    output_option,
+    panel,
+    resource_option,
     usage,
+    work_option,
 )
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.comparison.samples import samples_of
@@ -39,7 +40,7 @@ from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.stream import plan_shot
 from network.training.config import SamplerConfig, TrainConfig
 
-TRAINING = "Training"
+training_option = panel("Training")
 
 
 class Levels(NamedTuple):
@@ -101,52 +102,27 @@ def make_clips(
         list[str],
         typer.Argument(metavar="SHOTS...", help="folders, each with LEVEL.####.exr at one or more noise levels"),
     ],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="CLIPS", help="folder of training clips", rich_help_panel=OUTPUT),
-    ],
+    output: Annotated[Path, output_option("folder of training clips", "-o", "--output", metavar="CLIPS")],
     levels: Annotated[
         str | None,
-        typer.Option(
-            help="a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers",
-            rich_help_panel=INPUT,
-        ),
+        input_option("a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers"),
     ] = None,
-    tile: Annotated[
-        int,
-        typer.Option(min=0, help="pixels on a side of a clip; 0: whole frames, to validate on", rich_help_panel=WHAT),
-    ] = 128,
-    tiles: Annotated[
-        int,
-        typer.Option(min=1, help="clips of each frame, placed by noise, detail and motion", rich_help_panel=WHAT),
-    ] = 4,
-    window: Annotated[int, typer.Option(help="frames of a window: 1, 3, 5 or 7", rich_help_panel=WHAT)] = 5,
+    tile: Annotated[int, work_option("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
+    tiles: Annotated[int, work_option("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
+    window: Annotated[int, work_option("frames of a window: 1, 3, 5 or 7")] = 5,
     first_pass: Annotated[
-        str,
-        typer.Option(
-            metavar="SOURCE",
-            callback=check_first_pass,
-            help="first pass, as for denoise; clips hold it",
-            rich_help_panel=WHAT,
-        ),
+        str, work_option("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=check_first_pass)
     ] = "auto",
     reference: Annotated[
-        bool,
-        typer.Option(
-            "--reference",
-            help="target SHOT/reference.####.exr, and only frames that it has",
-            rich_help_panel=INPUT,
-        ),
+        bool, input_option("target SHOT/reference.####.exr, and only frames that it has", "--reference")
     ] = False,
     target: Annotated[
         str | None,
-        typer.Option(
-            metavar="LEVEL",
-            help="level whose pseudo-references are the targets of the others; itself it is no input",
-            rich_help_panel=INPUT,
+        input_option(
+            "level whose pseudo-references are the targets of the others; itself it is no input", metavar="LEVEL"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="seed of the places", rich_help_panel=WHAT)] = 0,
+    seed: Annotated[int, work_option("seed of the places")] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -244,7 +220,7 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
             setting, *_ = getattr(hints[item.name], "__metadata__", (None,))
             if setting is not None:
                 names = setting.names or (f"--{item.name.replace('_', '-')}",)
-                option = typer.Option(*names, help=setting.help, rich_help_panel=TRAINING)
+                option = training_option(setting.help, *names)
                 annotation = Annotated[hints[item.name].__origin__, option]  # type: ignore[valid-type]
                 kind = inspect.Parameter.KEYWORD_ONLY
                 parameters.append(inspect.Parameter(item.name, kind, default=item.default, annotation=annotation))
@@ -255,36 +231,22 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
 @_with_settings
 def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="W.safetensors", help="weights to write", rich_help_panel=OUTPUT)
-    ],
-    preset: Annotated[
-        str, typer.Option(help="fast, balanced, quality, unet, multiscale, paper or tkpcn", rich_help_panel=WHAT)
-    ] = "fast",
+    output: Annotated[Path, output_option("weights to write", "-o", "--output", metavar="W.safetensors")],
+    preset: Annotated[str, work_option("fast, balanced, quality, unet, multiscale, paper or tkpcn")] = "fast",
     init: Annotated[
         str | None,
-        typer.Option(
-            help="initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone",
-            rich_help_panel=INPUT,
-        ),
+        input_option("initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone"),
     ] = None,
     window: Annotated[
-        int | None,
-        typer.Option(help="frames of a window: 1, 3, 5 or 7, the middle ones of the clips'", rich_help_panel=WHAT),
+        int | None, work_option("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
     ] = None,
     validation: Annotated[
-        list[str] | None,
-        typer.Option(help="shots kept out of training; again or with commas for more", rich_help_panel=INPUT),
+        list[str] | None, input_option("shots kept out of training; again or with commas for more")
     ] = None,
     device: DeviceOption = "auto",
-    threads: Annotated[int | None, typer.Option(min=1, help="of torch and numba", rich_help_panel=RESOURCES)] = None,
-    tensorboard: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="write TensorBoard's logs there", rich_help_panel=OUTPUT)
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="continue from W.safetensors.state, same options", rich_help_panel=OUTPUT),
-    ] = False,
+    threads: Annotated[int | None, resource_option("of torch and numba", min=1)] = None,
+    tensorboard: Annotated[Path | None, output_option("write TensorBoard's logs there", metavar="FOLDER")] = None,
+    resume: Annotated[bool, output_option("continue from W.safetensors.state, same options", "--resume")] = False,
     **settings: Any,
 ) -> None:
     """Train a network on clips.

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid.commands.options import INPUT, RESOURCES, WHAT, RateOption
+from hybrid.commands.options import RateOption, input_option, resource_option, work_option
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 
@@ -18,19 +18,14 @@ def view(
     output: Annotated[str, typer.Argument(metavar="OUT", help="denoised frames: OUT.####.exr, or a folder")],
     beside: Annotated[
         list[str] | None,
-        typer.Option(
+        input_option(
+            "frames to compare with, such as the noisy ones, or those of another denoiser; may be repeated",
             metavar="SHOT",
-            help="frames to compare with, such as the noisy ones, or those of another denoiser; may be repeated",
-            rich_help_panel=INPUT,
         ),
     ] = None,
     fps: RateOption = 24,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port", rich_help_panel=RESOURCES)
-    ] = 0,
-    browser: Annotated[
-        bool, typer.Option(help="open the page in a browser, if there is a screen", rich_help_panel=WHAT)
-    ] = True,
+    port: Annotated[int, resource_option("port of the page; 0: any free port", min=0, max=65535)] = 0,
+    browser: Annotated[bool, work_option("open the page in a browser, if there is a screen")] = True,
 ) -> None:
     """Play frames in a browser: wipe, exposure, layers, weights, stages.
 
