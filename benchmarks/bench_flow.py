@@ -2,40 +2,26 @@
 
     python benchmarks/bench_flow.py --size 1920x1080 --threads 1
 
-CPU seconds of the process, after a warm-up (which compiles): median, least and greatest of the repeats.
+CPU seconds of the process, after a warm-up: median, least and greatest of the repeats.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
-import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.cpu_time import measure
+from benchmarks.cpu_time import arguments, report, size_of
 from flow.confidence import estimate_confidence, mix_centre
 from flow.guide import make_guide, pair_guides
 from flow.motion import CYCLES, compose_flow, forward_backward_error, invert_flow, normalize_motion
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
-
-
-def parse_arguments(argv: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--size", default="1920x1080")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=5)
-    return parser.parse_args(argv)
 
 
 def make_pair(width: int, height: int) -> dict[str, np.ndarray]:
@@ -55,11 +41,8 @@ def make_pair(width: int, height: int) -> dict[str, np.ndarray]:
 
 
 def main(argv: list[str]) -> int:
-    options = parse_arguments(argv)
-    width, height = map(int, options.size.split("x"))
-    cv2.setNumThreads(options.threads)
-    numba.set_num_threads(options.threads)
-    pair = make_pair(width, height)
+    options = arguments(__doc__).parse_args(argv)
+    pair = make_pair(*size_of(options))
     flow, color, albedo, normal = (pair[name] for name in ("flow", "color", "albedo", "normal"))
     neighbour_color, neighbour_albedo = pair["neighbour_color"], pair["neighbour_albedo"]
     guides = pair_guides(
@@ -71,7 +54,7 @@ def main(argv: list[str]) -> int:
     stack = np.dstack([color, albedo, normal, color[..., :1]])
     warped, inside = warp(albedo, flow)
     light = {"scales": 2, "warps": 2, "iterations": 15}
-    stages: dict[str, Callable[[], object]] = {
+    stages = {
         "normalize_motion": lambda: normalize_motion(pair["vectors"], CYCLES),
         "compose_flow": lambda: compose_flow(flow, flow),
         "invert_flow": lambda: invert_flow(flow),
@@ -91,17 +74,7 @@ def main(argv: list[str]) -> int:
         ),
         "mix_centre": lambda: mix_centre(warped, albedo, inside.astype(np.float32)),
     }
-    cpu_seconds = {name: measure(function, options.repeats) for name, function in stages.items()}
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    report = {
-        "size": [width, height], "threads": options.threads, "repeats": options.repeats, "seed": 0,
-        "cpu_seconds": cpu_seconds, "commit": commit, "machine": platform.machine(),
-        "python": platform.python_version(),
-        "numpy": np.__version__, "opencv": cv2.__version__, "numba": numba.__version__,
-    }  # fmt: skip
-    json.dump(report, sys.stdout, indent=2)
-    sys.stdout.write("\n")
-    return 0
+    return report(options, stages.items())
 
 
 if __name__ == "__main__":

@@ -8,23 +8,17 @@ at the size of its crops and in inference at the size of its tiles; "naive" is t
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numba
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.cpu_time import measure
-from hybrid.runtime.allocator import reuse_freed_memory
+from benchmarks.cpu_time import arguments, report
 from network.paper.blocks import RobustAverage
 from network.paper.kernels import apply_kernels, predict_kernel, threshold_kernel
 from network.paper.models import for_inference as prepare_kernels
@@ -35,15 +29,6 @@ from network.training.clips import Sample
 from network.training.config import TrainConfig
 from network.training.loop import batch_loss, predict
 from network.training.losses import relmse
-
-
-def parse_arguments(argv: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--tile", type=int, default=256)
-    parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["fast"], help="paper takes a minute")
-    return parser.parse_args(argv)
 
 
 def naive_ravg(frames: list[Tensor]) -> Tensor:
@@ -86,25 +71,25 @@ def inference(function: Callable[[Tensor], object], x: Tensor) -> Callable[[], N
     return step
 
 
-def parts(tile: int) -> Iterator[tuple[str, Callable[[], object], int]]:
-    """Name, what to run, and pixels."""
+def parts(tile: int) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Name, and what to run."""
     for size, mode, name in ((tile, inference, ""), (128, training, ", training")):
         x = torch.randn(5, 32, size // 2, size // 2).bfloat16().contiguous(memory_format=torch.channels_last)
         block = RobustAverage(32).bfloat16().to(memory_format=torch.channels_last)
-        yield f"ravg of four{name}", mode(lambda x: ravg(list(x.chunk(5))[:4]), x), size**2
-        yield f"ravg of four, naive{name}", mode(lambda x: naive_ravg(list(x.chunk(5))[:4]), x), size**2
-        yield f"RA block{name}", mode(lambda x, block=block: block(x, 5), x), size**2
-        yield f"RA block, naive{name}", mode(lambda x, block=block: naive_block(block, x), x), size**2
+        yield f"ravg of four{name}", mode(lambda x: ravg(list(x.chunk(5))[:4]), x)
+        yield f"ravg of four, naive{name}", mode(lambda x: naive_ravg(list(x.chunk(5))[:4]), x)
+        yield f"RA block{name}", mode(lambda x, block=block: block(x, 5), x)
+        yield f"RA block, naive{name}", mode(lambda x, block=block: naive_block(block, x), x)
         weights, frames = torch.rand(1, 125, size, size), torch.rand(1, 5, 3, size, size)
-        yield f"predict_kernel{name}", mode(lambda x: predict_kernel(x, centre=62), weights), size**2
-        yield f"threshold_kernel{name}", mode(lambda x: threshold_kernel(x, centre=62), weights), size**2
-        yield f"apply_kernels{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights), size**2
-        yield f"apply_kernels, unfolded{name}", mode(lambda x, f=frames: unfolded(x, f), weights), size**2
+        yield f"predict_kernel{name}", mode(lambda x: predict_kernel(x, centre=62), weights)
+        yield f"threshold_kernel{name}", mode(lambda x: threshold_kernel(x, centre=62), weights)
+        yield f"apply_kernels{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights)
+        yield f"apply_kernels, unfolded{name}", mode(lambda x, f=frames: unfolded(x, f), weights)
         weights, frames = torch.rand(1, 125, 540, 960), torch.rand(1, 5, 3, 540, 960)
-        yield f"apply_kernels, 960×540{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights), 540 * 960
+        yield f"apply_kernels, 960×540{name}", mode(lambda x, f=frames: apply_kernels(x, f), weights)
 
 
-def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], object], int]]:
+def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], object]]]:
     for name in presets:
         for bfloat16 in (False, True):
             model = build_preset(name)
@@ -113,7 +98,6 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
             yield (
                 f"{name}, {'bfloat16' if bfloat16 else 'float32'}",
                 lambda m=model, b=batch: torch.no_grad()(predict)(m, b),
-                tile**2,
             )
         for count in (1, 2):
             model, config = channels_last(build_preset(name)), TrainConfig(steps=1)
@@ -121,7 +105,6 @@ def networks(tile: int, presets: list[str]) -> Iterator[tuple[str, Callable[[], 
             yield (
                 f"{name}, training, batch of {count}",
                 lambda m=model, b=batch, c=config: batch_loss(m, b, c, relmse).backward(),
-                count * 128**2,
             )
 
 
@@ -133,30 +116,12 @@ def batch_of(count: int, size: int, frames: int) -> Sample:
 
 
 def main(argv: list[str]) -> int:
-    options = parse_arguments(argv)
-    reuse_freed_memory()  # as the commands do
+    parser = arguments(__doc__)
+    parser.add_argument("--tile", type=int, default=256)
+    parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["fast"], help="paper takes a minute")
+    options = parser.parse_args(argv)
     torch.set_num_threads(options.threads)
-    numba.set_num_threads(min(options.threads, numba.get_num_threads()))
-    results = {}
-    for name, function, pixels in (*parts(options.tile), *networks(options.tile, options.presets)):
-        seconds = measure(function, options.repeats)
-        results[name] = {**seconds, "per_megapixel": seconds["median"] / pixels * 1e6}
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    header = {
-        "unit": "CPU seconds",
-        "tile": options.tile,
-        "crop": 128,
-        "threads": options.threads,
-        "repeats": options.repeats,
-        "machine": platform.processor() or platform.machine(),
-        "cpu": torch.backends.cpu.get_cpu_capability(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "commit": commit,
-    }
-    json.dump({**header, "results": results}, sys.stdout, indent=2)
-    sys.stdout.write("\n")
-    return 0
+    return report(options, (*parts(options.tile), *networks(options.tile, options.presets)))
 
 
 if __name__ == "__main__":

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from hybrid.denoisers import WindowDenoiser
-from hybrid.files.frame import Frame, Frames, MappedShot
+from hybrid.files.frame import cut_middle
 from hybrid.files.shots import Shot
 from hybrid.first_pass import FirstPassSource, PerFrame
 from hybrid.plan import Rules
@@ -47,7 +47,7 @@ def measure_presets(
     middle = len(shot.numbers) // 2
     numbers = shot.numbers[max(0, middle - 1) : middle + 1]
     height, width = shot.shape
-    part = cut_out(shot, SIDE)
+    part = cut_middle(shot, SIDE)
     share = min(SIDE, height) * min(SIDE, width) / (height * width)
     start = time.perf_counter()
     shot.read(numbers[-1])
@@ -66,16 +66,3 @@ def measure_presets(
         # The last frame of a shot is denoised together with the one before: then the mean of both counts.
         seconds = spent[-1] if part.has(numbers[-1] + part.step) else sum(spent) / len(spent)
         yield Measured(preset, reading + max(seconds - reading, 0) / share)
-
-
-def cut_out(shot: Frames, side: int) -> MappedShot:
-    """Cut the middle, at most `side` pixels each way, out of each frame of a shot."""
-    height, width = shot.shape
-    top, left = max(0, height - side) // 2, max(0, width - side) // 2
-    here = slice(top, top + side), slice(left, left + side)
-
-    def cut(frame: Frame) -> Frame:
-        layers = {name: value[here] for name, value in vars(frame).items() if hasattr(value, "shape")}
-        return replace(frame, **layers, aovs={name: layer[here] for name, layer in frame.aovs.items()})
-
-    return MappedShot(shot, cut, shape=(min(side, height), min(side, width)))

@@ -186,11 +186,29 @@ def find_first_pass(
     """
     if spec not in SPECS:
         source = _sequence(spec, shot)
-    elif spec == "none":
-        source = FirstPassSource("none", None, "asked for")
     elif spec == "auto" and shot.layers(shot.numbers[0]).estimate is not None:
         source = FirstPassSource("file", PerFrame(lambda frame: frame.estimate), "the file holds a denoised picture")
-    elif spec in OIDN_MODES or (spec == "auto" and why_no_oidn() is None):
+    else:
+        keep = None if kept is None else partial(_KeptPictures, shot, kept, forced)
+        source = named_first_pass(spec, classical=classical, mode=mode, keep=keep, backends=backends, device=device)
+    if kept is not None and source.name not in OIDN_MODES:
+        return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
+    return source
+
+
+def named_first_pass(
+    spec: str,
+    *,
+    classical: ClassicalPreset = FINAL,
+    mode: str = "oidn-clean",
+    keep: Callable[[str, bool, str], _KeptPictures] | None = None,
+    backends: Backends = NO_BACKENDS,
+    device: str = "cpu",
+) -> FirstPassSource:
+    """Find a first pass that is made of frames alone, as `find_first_pass`; `keep` opens the pictures of a mode."""
+    if spec == "none":
+        return FirstPassSource("none", None, "asked for")
+    if spec in OIDN_MODES or (spec == "auto" and why_no_oidn() is None):
         if spec != "auto" and (lacking := why_no_oidn()) is not None:
             raise ImportError(f'first pass {spec}: {lacking}; expected: pip install "pyoidn"')
         device = find_device(device)
@@ -199,21 +217,17 @@ def find_first_pass(
         if spec == "auto":
             reason = "OIDN is installed; its networks run in torch" if in_torch else "OIDN is installed"
         name = mode if spec == "auto" else spec
-        store = None if kept is None else _KeptPictures(shot, kept, forced, name, in_torch, device)
+        store = None if keep is None else keep(name, in_torch, device)
         source = _oidn(name, (backends.torch or run) if in_torch else run, in_torch, store)
-        source = replace(source, reason=reason, device=device)
-    elif spec == "bundled" or (spec == "auto" and backends.bundled is not None):
+        return replace(source, reason=reason, device=device)
+    if spec == "bundled" or (spec == "auto" and backends.bundled is not None):
         if backends.bundled is None:
             raise ImportError("first pass bundled: torch is needed, which this command does without; expected another")
         run = partial(denoise_frame_oidn, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
         reason = "asked for" if spec == "bundled" else f"{why_no_oidn()}; a network comes with ravg"
-        source = FirstPassSource("bundled", PerFrame(run), reason)
-    else:
-        reason = "asked for" if spec == "nlm" else f"no denoised picture in the file, and {why_no_oidn()}"
-        source = FirstPassSource("nlm", Classical(classical), reason)
-    if kept is not None and source.name not in OIDN_MODES:
-        return replace(source, reason=f"{source.reason}; nothing of it is kept, as OIDN's pictures would be")
-    return source
+        return FirstPassSource("bundled", PerFrame(run), reason)
+    reason = "asked for" if spec == "nlm" else f"no denoised picture in the file, and {why_no_oidn()}"
+    return FirstPassSource("nlm", Classical(classical), reason)
 
 
 def _sequence(spec: str, shot: Shot) -> FirstPassSource:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
-from hybrid.first_pass import OIDN_MODE_OF_PRESET, Backends, denoise_frame_oidn, find_first_pass, read_denoised
+from hybrid.first_pass import OIDN_MODE_OF_PRESET, Backends, denoise_frame_oidn, named_first_pass, read_denoised
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
@@ -97,23 +97,18 @@ class WindowSettings:
         """The aligned windows of a shot."""
         frames = shot if self.vectors else MappedShot(shot, _without_vectors)
         rules = replace(self.rules, on=self.rules.on | {"refine"}) if self.solver else self.rules
-        bundled = _bundled_network() if self.source == "bundled" else None
-        # Sources that methods name do not read the shot's files.
-        chosen = find_first_pass(
-            self.source, cast(Shot, shot), mode=OIDN_MODE_OF_PRESET["fast"], backends=Backends(bundled=bundled)
-        )
+        backends = Backends()
+        if self.source == "bundled":
+            from hybrid.neural import denoise_bundled  # torch may be absent
+
+            backends = Backends(bundled=denoise_bundled)
+        chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_PRESET["fast"], backends=backends)
         refine = partial(refine_flow, **self.solver)
         return FrameStream(frames, rules, chosen.first_pass, radius=self.radius, refine=refine)
 
 
 def _without_vectors(frame: Frame) -> Frame:
     return replace(frame, motion=None, motion_convention=None)
-
-
-def _bundled_network() -> Callable[..., Array]:
-    from hybrid.neural import denoise_bundled  # torch may be absent
-
-    return denoise_bundled
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
-from typing import Any, ParamSpec, Self, TypeVar
+from dataclasses import dataclass
+from typing import ParamSpec, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frame import Frame, Frames, MappedShot
+from hybrid.files.frame import Frame, Frames, cut_middle
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import peak_memory, start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
@@ -89,26 +88,6 @@ class _TimedFrames:
             return self._shot.read(number)
 
 
-def _middle_of(shot: Frames) -> MappedShot:
-    """The middle of every frame, at most `WARM_UP` pixels per side, for the warm-up of a method."""
-    height, width = (min(size, WARM_UP) for size in shot.shape)
-
-    def cut(frame: Frame) -> Frame:
-        whole = frame.color.shape[:2]
-        top, left = (whole[0] - height) // 2, (whole[1] - width) // 2
-
-        def part(array: NDArray[Any]) -> NDArray[Any]:
-            return np.ascontiguousarray(array[top : top + height, left : left + width])
-
-        cuts: dict[str, Any] = {
-            name: part(value) for name, value in vars(frame).items() if isinstance(value, np.ndarray)
-        }
-        cuts |= {name: {key: part(a) for key, a in getattr(frame, name).items()} for name in ("aovs", "pass_colors")}
-        return replace(frame, **cuts, resolution=frame.resolution or whole)
-
-    return MappedShot(shot, cut, shape=(height, width))
-
-
 def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore | None = None) -> RunCost:
     """Run a method over a shot in this process; a store receives the frames under the method's name.
 
@@ -116,7 +95,7 @@ def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore |
     """
     if method.threads:
         limit_threads(method.threads)
-    next(method.run(_middle_of(shot)), None)
+    next(method.run(cut_middle(shot, WARM_UP)), None)
     clock, pixels, timed = _Clock(), 0, _TimedFrames(shot)
     frames = method.run(timed)
     while True:

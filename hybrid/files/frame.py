@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -98,3 +98,22 @@ class MappedShot:
     def read(self, number: int) -> Frame:
         """Read and change a frame."""
         return self._change(self._shot.read(number))
+
+
+def cut_middle(shot: Frames, side: int) -> MappedShot:
+    """Cut the middle, at most `side` pixels each way, out of each frame of a shot."""
+    height, width = shot.shape
+    top, left = max(0, height - side) // 2, max(0, width - side) // 2
+
+    def cut(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: cut(layer) for name, layer in value.items()}
+        if not isinstance(value, np.ndarray):
+            return value
+        return np.ascontiguousarray(value[top : top + side, left : left + side])
+
+    def part(frame: Frame) -> Frame:
+        cuts = {name: cut(value) for name, value in vars(frame).items()}
+        return Frame(**{**cuts, "resolution": frame.resolution or frame.color.shape[:2]})
+
+    return MappedShot(shot, part, shape=(min(side, height), min(side, width)))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hybrid import budget, cli, job
-from hybrid.budget import Measured, cut_out, measure_presets, parse_budget
+from hybrid.budget import Measured, measure_presets, parse_budget
+from hybrid.files.frame import cut_middle
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import find_first_pass
 from hybrid.job import MEASURED, DenoiseOptions
@@ -33,11 +34,11 @@ def test_what_is_no_time_is_refused(text):
 
 def test_a_part_is_cut_out_of_the_middle(tmp_path):
     shot = open_shot(SCENE.write(tmp_path))
-    whole, part = (s.read(SCENE.first) for s in (shot, cut_out(shot, 16)))
+    whole, part = (s.read(SCENE.first) for s in (shot, cut_middle(shot, 16)))
     np.testing.assert_array_equal(part.color, whole.color[12:28, 20:36])
     np.testing.assert_array_equal(part.motion, whole.motion[12:28, 20:36])
     assert part.depth.shape == (16, 16)
-    np.testing.assert_array_equal(cut_out(shot, 99).read(SCENE.first).color, whole.color)
+    np.testing.assert_array_equal(cut_middle(shot, 99).read(SCENE.first).color, whole.color)
 
 
 class Fake:
