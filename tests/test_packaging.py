@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from configparser import ConfigParser
@@ -54,10 +55,16 @@ def files_of_packages(tree: Path) -> set[str]:
     return {path.relative_to(tree).as_posix() for name in OURS for path in (tree / name).rglob("*") if path.is_file()}
 
 
+@pytest.fixture(scope="module")
+def wheel(tree: Path) -> Path:
+    """The wheel of the copy."""
+    place = tree.parent
+    run(place, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index", "-w", place, tree)
+    return place / f"ravg-{VERSION}-py3-none-any.whl"
+
+
 @pytest.mark.slow
-def test_the_wheel_holds_the_packages_and_runs_from_a_file(tree, tmp_path):
-    run(tmp_path, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index", "-w", tmp_path, tree)
-    wheel = tmp_path / f"ravg-{VERSION}-py3-none-any.whl"
+def test_the_wheel_holds_the_packages_and_runs_from_a_file(wheel, tree, tmp_path):
     place = tmp_path / "installed"
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(place)
@@ -76,6 +83,70 @@ def test_the_wheel_holds_the_packages_and_runs_from_a_file(tree, tmp_path):
     (place / "flow" / "__init__.py").unlink()
     said = run(tmp_path, "-m", "ravg", "--version", path=place, code=1)
     assert said.startswith(f"error: ravg needs its own package flow, expected {place / 'flow' / '__init__.py'}, found ")
+
+
+def distribution_of_others(folder: Path, names: list[str]) -> Path:
+    """A wheel of packages that have the names of ours."""
+    info = "theirs-1.dist-info"
+    files = {
+        f"{info}/METADATA": "Metadata-Version: 2.1\nName: theirs\nVersion: 1\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    for name in names:
+        files |= {f"{name}/__init__.py": "OWNER = 'theirs'\n", f"{name}/of_theirs.py": ""}
+    path = folder / "theirs-1-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        for inside, text in files.items():
+            archive.writestr(inside, text)
+        archive.writestr(f"{info}/RECORD", "".join(f"{inside},,\n" for inside in [*files, f"{info}/RECORD"]))
+    return path
+
+
+@pytest.mark.slow
+def test_beside_a_distribution_with_packages_of_the_same_names(wheel, tmp_path):
+    """As docs/install.md says: pip replaces files without a word, and removes them with the other distribution."""
+    names = ["flow", "network", "loops"]
+    theirs = distribution_of_others(tmp_path, names)
+    place = tmp_path / "environment"
+    run(tmp_path, "-m", "venv", "--without-pip", place)
+    python = place / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    packages = Path(sysconfig.get_path("purelib", vars={"base": str(place), "platbase": str(place)}))
+    (packages / "requirements.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+
+    def pip(command: str, *words: str | Path) -> None:
+        run(tmp_path, "-m", "pip", "--python", python, command, "-q", *words)
+
+    def install(file: Path) -> None:
+        pip("install", "--no-index", "--no-deps", "--ignore-installed", file)
+
+    def call(*words: str) -> subprocess.CompletedProcess[str]:
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        return subprocess.run(
+            [python, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+
+    def owners() -> str:
+        code = f"import {', '.join(names)}; print(*(getattr(m, 'OWNER', 'ours') for m in ({', '.join(names)})))"
+        return call("-c", code).stdout.strip()
+
+    version = call("-m", "ravg", "--version")
+    assert version.returncode == 1, version.stdout
+    install(theirs)
+    assert owners() == "theirs theirs theirs"
+    install(wheel)
+    assert owners() == "ours ours ours"
+    assert call("-c", "import flow.of_theirs, network.of_theirs, loops.of_theirs").returncode == 0
+    assert call("-m", "ravg", "--version").stdout == f"ravg {VERSION}\n"
+    install(theirs)
+    assert owners() == "theirs theirs theirs"
+    assert call("-c", "import ravg; print(ravg.denoise_shot.__module__)").stdout == "hybrid.job\n"
+    pip("uninstall", "-y", "theirs")
+    done = call("-m", "ravg", "--version")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: ravg needs its own package loops, expected ")
+    assert done.stderr.endswith("install ravg again, in an environment of its own\n")
+    install(wheel)
+    assert call("-m", "ravg", "--version").stdout == f"ravg {VERSION}\n"
 
 
 @pytest.mark.slow
