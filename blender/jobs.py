@@ -311,9 +311,9 @@ def restore_all(*_: Any) -> None:
 @bpy.app.handlers.persistent
 def protect(scene: bpy.types.Scene, *_: Any) -> None:
     """Keep ravg's frames when a render that is not its own would overwrite them."""
-    if not scene.ravg.lent and (kept := scenes.would_be_written_over(scene)):
-        scenes.keep_existing(scene)
-        print(f"ravg: {len(kept)} of its frames in {kept[0].parent} are not written over: name another Output Path")
+    if not scene.ravg.lent:
+        for message in scenes.keep_existing(scene):
+            print(f"ravg: {message}")
 
 
 @bpy.app.handlers.persistent

@@ -48,6 +48,9 @@ def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
         found.append(Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False))
     if would_be_written_over(scene):
         found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
+    if nodes := file_outputs(scene):
+        text = f"{', '.join(nodes)}: the folder is that of ravg's frames, and nothing is written, name another"
+        found.append(Problem(text, False))
     return found
 
 
@@ -175,6 +178,22 @@ def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
     return sorted(path for path in kept & written if path.is_file())
 
 
+def file_outputs(scene: bpy.types.Scene) -> dict[str, str]:
+    """Name of a File Output node that writes to a folder of ravg's frames → path of the node in the scene."""
+    tree = "compositing_node_group" if hasattr(scene, "compositing_node_group") else "node_tree"  # since Blender 5.0
+    nodes = getattr(getattr(scene, tree), "nodes", ())
+    if not nodes or not is_placed(scene):
+        return {}
+    kept = {Path(noisy_pattern(scene)).parent, output_folder(scene)}
+    found = {}
+    for node in nodes:
+        if node.type == "OUTPUT_FILE":
+            folder = node.directory if hasattr(node, "directory") else node.base_path  # before Blender 5.0
+            if _absolute(folder or "//") in kept:
+                found[node.name] = f'{tree}.nodes["{bpy.utils.escape_identifier(node.name)}"]'
+    return found
+
+
 def override(scene: bpy.types.Scene, *, replace: bool) -> None:
     """Set the render settings for noisy frames until `restore`; with `replace`, existing frames are rendered again.
 
@@ -205,9 +224,19 @@ def override(scene: bpy.types.Scene, *, replace: bool) -> None:
         raise OSError(f"Blender would write {written}, expected {expected}: give Noisy Frames a plainer name")
 
 
-def keep_existing(scene: bpy.types.Scene) -> None:
-    """Let Blender's own render skip existing frames, until `restore`."""
-    _override(scene, {"render.use_overwrite": False})
+def keep_existing(scene: bpy.types.Scene) -> list[str]:
+    """Let Blender's own render write over no frame of ravg, until `restore`; return messages about what is skipped."""
+    settings: dict[str, object] = {}
+    said = []
+    if kept := would_be_written_over(scene):
+        settings["render.use_overwrite"] = False
+        said.append(f"{len(kept)} frames of ravg in {kept[0].parent} are not written over: name another Output Path")
+    for name, path in file_outputs(scene).items():
+        settings[f"{path}.mute"] = True
+        said.append(f"{name} does not write into the folder of ravg's frames: name another folder in the node")
+    if settings:
+        _override(scene, settings)
+    return said
 
 
 def restore(scene: bpy.types.Scene) -> None:

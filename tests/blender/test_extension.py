@@ -730,6 +730,34 @@ answer = [said, scene.render.use_overwrite, scene.ravg.lent]
     assert (overwrite, lent) == (True, "")
 
 
+def test_a_file_output_node_does_not_write_over_the_frames_of_ravg(blender, shot):
+    """The node's files have the names of the noisy frames: the panel says so, and the node is muted for the render."""
+    shutil.copytree(shot.parent / "frames", shot.parent / "frames" / "denoised")
+    before = contents(shot.parent / "frames")
+    code = f"""{PROBLEMS}
+exec({COMPOSE!r})
+files = tree.nodes.new("CompositorNodeOutputFile")
+files.name = 'Out.001 "mine"'
+files.format.media_type = "MULTI_LAYER_IMAGE"
+files.file_output_items.new("RGBA", "Image")
+tree.links.new(next(n for n in tree.nodes if n.type == "IMAGE").outputs["Combined"], files.inputs[0])
+answer = []
+for files.directory in ("//else/", "//frames/"):
+    files.file_name, scene.render.filepath = "shot_", f"//movie/{{len(answer)}}_"
+    answer += [[problem.text for problem in scenes.problems(scene)]]
+    bpy.ops.render.render(animation=True)
+answer += [files.mute, scene.render.use_overwrite, scene.ravg.lent]
+"""
+    clean, warned, *after = blender.run(code, blend=shot)
+    assert {path.name for path in (shot.parent / "else").iterdir()} == before.keys()
+    assert len(list((shot.parent / "movie").iterdir())) == 6
+    assert clean == []
+    assert len(warned) == 1
+    assert warned[0].startswith('Out.001 "mine": the folder is that of ravg\'s frames')
+    assert contents(shot.parent / "frames") == before
+    assert after == [False, True, ""]
+
+
 # What an artist's file may have: nodes on two view layers, a File Output node, a strip in the sequencer.
 NODES = """
 layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
