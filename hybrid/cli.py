@@ -29,26 +29,28 @@ COMMANDS = {
     "inspect": Entry(
         "inspect:inspect",
         "Frames",
-        "Show which layer has which role, and which stages run, with measurements and reasons.",
+        "Check a shot before denoising: its layers, motion vectors, and the stages that it needs.",
     ),
     "denoise": Entry(
         "denoise:denoise",
         "Frames",
         "Denoise the frames of a shot, and write each as an EXR file with all its other layers.",
     ),
-    "view": Entry("view:view", "Frames", "Play frames in a browser: wipe, exposure, layers, weights, stages."),
+    "view": Entry(
+        "view:view", "Frames", "Play denoised frames beside noisy ones in a browser, also while they are being made."
+    ),
     "status": Entry("status:status", "Frames", "Show which frames are finished, running, missing and failed."),
     "compare": Entry(
         "compare:compare",
         "Frames",
-        "Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference.",
+        "Compare denoisers with a reference: accuracy, stability and time, as a table and a page.",
     ),
     "make-clips": Entry("train:make_clips", "Networks", "Make training clips of shots at several noise levels."),
     "train": Entry("train:train", "Networks", "Train a network on clips."),
     "simulate": Entry(
         "simulate:simulate",
         "Networks",
-        "Render shots with Cycles: noise levels, guides, motion vectors, references; with the effects a scene needs.",
+        "Render shots with Cycles for training and comparison: several noise levels, and references.",
     ),
 }
 # Old name → new name, and options that stand for the old defaults; accepted for one release.
@@ -106,7 +108,11 @@ class LazyCommand(TyperCommand):
         command = getattr(import_module(f"hybrid.commands.{module}"), function)
         single = typer.Typer(add_completion=False)
         single.command(self.name, cls=Command)(logged(command))
-        return typer.main.get_command(single)
+        made: Any = typer.main.get_command(single)
+        for parameter in made.params:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = " "  # no "<bool>" behind the name of a flag
+        return made
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         """Import the command and parse its arguments."""

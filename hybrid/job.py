@@ -65,7 +65,7 @@ class DenoiseOptions:
     method : str
         "network" (needs torch), "classical" or "pooled"; default: that of the preset, or "network".
     preset : str
-        One of `PRESETS` of the method, by default the first; "auto" needs `budget`.
+        One of `PRESETS` of the method, by default the first, or "auto" with a `budget`, which "auto" needs.
     budget : str or None
         Time per frame, such as "10s": the most accurate preset that is measured to fit is taken.
     weights : Path or None
@@ -142,7 +142,7 @@ class DenoiseOptions:
         method = self.method or METHOD_OF_PRESET.get(preset, "network")
         if method not in PRESETS:
             raise ValueError(f"method is {method!r}, expected one of {', '.join(PRESETS)}")
-        preset = preset or PRESETS[method][0]
+        preset = preset or ("auto" if self.budget is not None and method == "network" else PRESETS[method][0])
         if preset not in PRESETS[method]:
             expected = ", ".join(PRESETS[method])
             raise ValueError(f"preset is {preset!r}, expected one of {expected} with method {method}")
@@ -175,7 +175,9 @@ class DenoiseOptions:
     def _check_combinations(self) -> None:
         """Refuse options that contradict each other, and stages that do not exist."""
         if (self.preset == "auto") != (self.budget is not None) or (self.weights is not None and self.budget):
-            raise ValueError("--budget chooses the preset, expected it with --preset auto, and without --weights")
+            raise ValueError(
+                "--budget chooses the preset, expected no other --preset than auto with it, and no --weights"
+            )
         if self.breakdown is not None and self.max_memory is not None:
             raise ValueError("--breakdown looks at whole frames, expected no --max-memory with it")
         rules = self.rules
@@ -364,7 +366,9 @@ def check_paths(
     """
     if shot.missing and not options.keep_going:
         missing = format_frames(shot.missing)
-        raise FileNotFoundError(f"frames {missing} were asked for and are not there; --keep-going makes the others")
+        raise FileNotFoundError(
+            f"frames {missing} were asked for and are not there; render them, or add --keep-going to denoise the others"
+        )
     written = [("output", output_path(output, shot, number)) for number in shot.numbers]
     written += [("keep-first-pass", path) for source in first_passes for path in source.kept]
     further = {"breakdown": options.breakdown, **paths.writes}
@@ -425,7 +429,9 @@ def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
             break
     LOG.info(f"preset: {measured.preset} ({', '.join(tried)} a frame; {options.budget} asked for)")
     if not fits:
-        LOG.warning("not even the fastest preset fits")
+        LOG.warning(
+            f"no preset fits --budget {options.budget}: the fastest is used; allow more time, or lower the size"
+        )
     return replace(options, preset=measured.preset, budget=None)
 
 

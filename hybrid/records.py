@@ -73,6 +73,12 @@ class Record:
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "made"]
 
     @property
+    def files(self) -> list[Path]:
+        """The files of the frames that this run made, in the order of their names."""
+        entries = self._document["frames"].values()
+        return sorted(self.path.parent.parent / entry["file"] for entry in entries if entry["state"] == "made")
+
+    @property
     def failed(self) -> list[int]:
         """The frames that failed."""
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "failed"]
@@ -175,7 +181,9 @@ def gather_status(folder: Path, name: str | None = None, frames: Collection[int]
             if entry["state"] == "made":
                 status.seconds.append(entry["seconds"])
     if not status.records:
-        raise FileNotFoundError(f"{folder} has no records of runs, expected some in {folder / FOLDER}")
+        raise FileNotFoundError(
+            f"{folder} has no records of runs in {folder / FOLDER}, expected the output folder of ravg denoise"
+        )
     status.asked |= set(frames or ())
     return status
 

@@ -138,13 +138,13 @@ def validate_layers(shot: Shot) -> ValidationReport:
 
 def find_cut(a: int, b: int) -> Finding:
     """Report that two neighbouring frames are a cut (`hybrid.alignment.measure.PairFacts`)."""
-    message = f"cut between frames {a} and {b}: nothing is averaged across it"
+    message = f"cut between frames {a} and {b}: nothing is averaged across it; where there is no cut, check the vectors"
     return Finding("color", message, left_out=False)
 
 
 def find_repeat(a: int, b: int) -> Finding:
     """Report that frame `b` repeats frame `a` (`PairFacts.repeated`)."""
-    message = f"frame {b} repeats frame {a}: the same noise, whose samples count once"
+    message = f"frame {b} repeats frame {a}: the same noise, whose samples count once; if not intended, render it again"
     return Finding("color", message, left_out=False)
 
 
@@ -336,7 +336,9 @@ class _Checks:
         return grade.factors, [Finding("estimate", words, left_out=False)]
 
     def _leave_out(self, role: str, words: str) -> Finding:
-        return Finding(role, f"{self._name(role)} {words}: left out")
+        return Finding(
+            role, f"{self._name(role)} {words}: left out, {_LOSSES[role]}; check the pass, or --layer {role}=NAME"
+        )
 
     def _name(self, role: str) -> str:
         return f"{role} ({getattr(self.layers, role) or 'of two halves'})"
@@ -349,7 +351,10 @@ def _motion_findings(layers: Layers, choice: Choice) -> Iterator[Finding]:
     if choice.convention is None:
         flow = "" if choice.found is None else f", optical flow {choice.found:.1%}"
         words = f"{name}: no convention explains the pictures (the best leaves {left}, no motion {still}{flow})"
-        yield Finding("motion", f"{words}: left out, replaced by optical flow")
+        yield Finding(
+            "motion",
+            f"{words}: left out, replaced by optical flow, slower and less exact; check the pass, or --motion WORDS",
+        )
     elif choice.contradicted:
         words = f"{name}: {choice.convention}, as stated, does not explain the pictures"
         yield Finding("motion", f"{words} (it leaves {left}, no motion {still}): used as stated", left_out=False)
@@ -471,6 +476,16 @@ def _equal_share(a: Array, b: Array, same: Mask) -> float:
     lit = lit.any(axis=-1) if lit.ndim == 3 else lit
     return float(np.mean(same[lit])) if lit.any() else 0.0
 
+
+# Role → loss where its layer is left out.
+_LOSSES = {
+    "albedo": "textures may blur",
+    "normal": "edges may blur",
+    "depth": "motion is followed less exactly",
+    "variance": "the noise is measured from the frames",
+    "alpha": "alpha is kept as rendered",
+    "estimate": "another first pass is made",
+}
 
 # Role → check of its layer and the color; returns what is wrong, or None.
 _CHECKS: dict[str, Callable[[Array, Array], str | None]] = {

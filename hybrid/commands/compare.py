@@ -23,8 +23,8 @@ from hybrid.commands.options import (
     StrictOption,
     choose,
     input_option,
+    method_option,
     output_option,
-    work_option,
 )
 from hybrid.commands.shots import log_cuts, open_input, validate_renders
 from hybrid.comparison.compare import CompareOptions, compare_shot
@@ -60,13 +60,13 @@ def compare(
         Path | None, output_option("folder for a page with chart and pictures", "-o", "--output", metavar="REPORT")
     ] = None,
     methods: Annotated[
-        str | None, work_option("methods to run, separated by commas; default: all", metavar="NAMES")
+        str | None, method_option("methods to run, with commas between (default: all)", metavar="NAMES")
     ] = None,
     external: Annotated[
         list[str] | None, input_option("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
     ] = None,
-    sweep: Annotated[bool, work_option("also vary stages and settings, one at a time", "--sweep")] = False,
-    rounds: Annotated[int, work_option("runs of each method, in turns; the time is their median", min=1)] = 3,
+    sweep: Annotated[bool, method_option("also vary stages and settings, one at a time", "--sweep")] = False,
+    rounds: Annotated[int, method_option("runs of each method, in turns; the time is their median", min=1)] = 3,
     samples: Annotated[
         float | None,
         input_option(
@@ -79,11 +79,11 @@ def compare(
             "SHOT at other samples per pixel, to measure how the noise falls; may be repeated", metavar="PATTERN=SPP"
         ),
     ] = None,
-    exposure: Annotated[float, work_option("exposure factor of the measures, applied before the tone curve")] = 1.0,
+    exposure: Annotated[float, method_option("factor on radiance before the tone curve of the measures")] = 1.0,
     clock: Annotated[Literal["wall", "cpu"], output_option("time in chart.png and in the Markdown table")] = "wall",
     markdown: Annotated[bool, output_option("print the table as Markdown", "--markdown")] = False,
     name: Annotated[
-        str | None, output_option("name of the shot in tables and on the page; default: its folder")
+        str | None, output_option("name of the shot in tables and on the page (default: its folder's name)")
     ] = None,
     with_report: Annotated[
         list[Path] | None,
@@ -99,7 +99,16 @@ def compare(
     motion: MotionOption = None,
     strict: StrictOption = False,
 ) -> None:
-    """Show accuracy against time: the noisy input, every preset, and other denoisers, against a reference."""
+    """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.
+
+    Examples:
+
+    ravg compare "noisy.####.exr" --reference "clean.####.exr" -o report
+
+    ravg compare "noisy.####.exr" --reference "clean.####.exr" --methods "OIDN high" --external "mine=mine.####.exr"
+
+    ravg compare --with-report one --with-report two -o both   (join finished reports)
+    """
     cost: Cost = "seconds_per_megapixel" if clock == "wall" else "cpu_seconds_per_megapixel"
     report = _Report(output, cost, fps, movies, markdown, with_report or [])
     report.check()

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
-from hybrid.commands.log import LOG, Progress, log_file, one_line, print_table, printable
+from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
 from hybrid.commands.options import (
     AovOption,
     DeviceOption,
@@ -36,10 +41,10 @@ from hybrid.commands.options import (
     SheetOption,
     ShotArgument,
     StrictOption,
+    method_option,
     output_option,
     resource_option,
     usage,
-    work_option,
 )
 from hybrid.commands.shots import (
     ShotInput,
@@ -61,8 +66,25 @@ from hybrid.plan import NEURAL_STAGES, Plan, merge
 from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
 from hybrid.records import Record, sequence_name
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
+from hybrid.runtime.system import peak_memory
 from hybrid.runtime.timing import Timings
 from hybrid.validation import Finding
+
+# Roles of layers as users name them, and the loss where a layer is missing.
+ROLES_IN_WORDS = {
+    "color": "color",
+    "albedo": "albedo",
+    "normal": "normal",
+    "depth": "depth",
+    "motion": "motion vectors",
+    "variance": "variance",
+    "half_a": "half buffers",
+}
+LOSSES = {
+    "albedo": "textures blur",
+    "normal": "edges rely on color",
+    "motion": "motion is estimated: slower and less exact",
+}
 
 
 @dataclass(frozen=True)
@@ -101,33 +123,31 @@ def denoise(
     strict: StrictOption = False,
     method: Annotated[
         Literal["network", "classical", "pooled"] | None,
-        work_option(
-            "network: Robust Average (needs torch); classical: align, average, non-local means, guided filter; pooled: "
-            "OIDN on the samples of all frames of the window (default: that of the preset, or network)"
+        method_option(
+            "network: Robust Average network (needs torch); classical: non-local means and guided filter, or the average "
+            "of first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)"
         ),
     ] = None,
     preset: Annotated[
         Literal["fast", "balanced", "quality", "tkpcn", "auto", "draft", "standard", "final", "pooled", "gathered"]
         | None,
-        work_option(
-            "network: fast (default), balanced, quality, or auto, with --budget; classical: draft, standard (default), "
-            "final; pooled",
+        method_option(
+            "network: fast (default), balanced, quality, or auto (the best that fits --budget); classical: draft, "
+            "standard (default), final; pooled: pooled",
             metavar="NAME",
         ),
     ] = None,
     budget: Annotated[
         str | None,
-        work_option(
-            "time per frame, such as 10s: --preset auto takes the most accurate preset that fits", metavar="TIME"
-        ),
+        method_option("longest time per frame, such as 10s; takes the most accurate preset that fits", metavar="TIME"),
     ] = None,
     weights: Annotated[
-        Path | None, work_option("weights file of ravg train, in place of a preset", metavar="FILE")
+        Path | None, method_option("weights file of ravg train, in place of a preset", metavar="FILE")
     ] = None,
     threshold: Annotated[
         float | None,
-        work_option(
-            "threshold of weights that predict kernels; higher drops more taps (default: as trained)",
+        method_option(
+            "for --weights that predict kernels: drop kernel taps below this share (default: as trained)",
             min=0,
             max=0.99,
             metavar="SHARE",
@@ -137,9 +157,8 @@ def denoise(
     keep_first_pass: KeepOption = None,
     passes: Annotated[
         int,
-        work_option(
-            "denoise the result again: a wider window in time, and a softer image; --resume skips frames of the last "
-            "pass",
+        method_option(
+            "runs over the shot; each denoises the result of the one before: steadier, and softer",
             min=1,
             metavar="N",
         ),
@@ -147,13 +166,14 @@ def denoise(
     breakdown: Annotated[
         Path | None,
         output_option(
-            "image of the share of each frame in the result, with layers and a table of weights", metavar="PNG"
+            "write an image of how much each frame of the window contributes; adds these weights as layers",
+            metavar="PNG",
         ),
     ] = None,
     aov: AovOption = None,
     aov_sum: Annotated[
         Literal["layers", "beauty"],
-        work_option("keep AOVs consistent: scale light passes to the denoised beauty, or make the beauty their sum"),
+        method_option("how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum"),
     ] = "layers",
     preview: PreviewOption = None,
     fps: RateOption = 24,
@@ -163,14 +183,17 @@ def denoise(
     tile: Annotated[
         int | None,
         resource_option(
-            "side in pixels of the tiles of the network (default: 2048, of kernels 640, with --max-memory 384)",
+            "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
             min=16,
             metavar="N",
         ),
     ] = None,
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
-        resource_option("precision of the network; auto: bfloat16 where the processor has it", envvar="RAVG_PRECISION"),
+        resource_option(
+            "number format of the network; auto: bfloat16 on processors that have it, else float32",
+            envvar="RAVG_PRECISION",
+        ),
     ] = "auto",
     device: DeviceOption = "auto",
     resume: ResumeOption = False,
@@ -257,8 +280,10 @@ def _hand_out(context: typer.Context, request: Request, view: str, scheduler: st
 
 def _denoise(request: Request) -> None:
     """Denoise a shot; leave a record beside the frames however it ends; stopped by Ctrl-C, log what is finished."""
+    start = time.monotonic()
     shot = request.shot.open()
     job = Job.open(shot, request.output, request.options, request.paths, _failure_on_record(request, shot))
+    _summarize_input(request, job)
     log_findings(job.report, job.views)
     first = output_path(request.output, shot, shot.numbers[0])
     record = Record(
@@ -292,8 +317,8 @@ def _denoise(request: Request) -> None:
         raise
     record.write(job.timings, "finished")
     if there := len(record.done) - len(record.made):
-        LOG.info(f"{there} of {len(shot)} frames were finished already")
-    LOG.info(f"wrote {len(record.made)} frames to {first.parent} and a record of them to {record.path}")
+        summarize("Note", f"{there} of {len(shot)} frames were finished already")
+    _summarize_result(request, record, time.monotonic() - start)
     if record.failed:
         LOG.error(f"{len(record.failed)} frames could not be made: {format_frames(record.failed)}")
         raise typer.Exit(1)
@@ -315,6 +340,39 @@ def _failure_on_record(request: Request, shot: Shot) -> Iterator[None]:
         raise
 
 
+def _summarize_input(request: Request, job: Job) -> None:
+    """Log what is read, which layers of it are used, and what each frame starts from."""
+    view, source = job.views[0], job.first_passes[0]
+    layers = view.layers(view.numbers[0])
+    method = "" if job.options.method == "network" else f"method {job.options.method}"
+    computed = dict.fromkeys([*job.denoiser.devices.values(), source.device, job.denoiser.settings.get("precision")])
+    how = ", ".join(str(word) for word in computed if word)
+    parts = f"ravg {version('ravg')}", "denoise", method, f"preset {job.preset}", how
+    LOG.info(" · ".join(part for part in parts if part))
+    height, width = view.shape
+    samples = [] if layers.samples is None else [f"{layers.samples:g} samples per pixel"]
+    numbers = f"{format_frames(view.numbers)} ({len(view.numbers)})"
+    facts = [f"frames {numbers}", f"{width}×{height}", layers.profile, *samples]
+    summarize("Input", f"{request.shot.shot}, {', '.join(facts)}")
+    used = [words for role, words in ROLES_IN_WORDS.items() if getattr(layers, role) is not None]
+    missing = [f"{ROLES_IN_WORDS[role]} ({loss})" for role, loss in LOSSES.items() if getattr(layers, role) is None]
+    summarize("Passes", "; without ".join([", ".join(used), *filter(None, [", ".join(missing)])]))
+    later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
+    summarize("First pass", f"{source.name} ({source.reason}){later}")
+
+
+def _summarize_result(request: Request, record: Record, seconds: float) -> None:
+    """Log where the frames are, what they cost, and how to look at them."""
+    if made := record.files:
+        last = f" to {made[-1].name}" if len(made) > 1 else ""
+        summarize("Output", f"{made[0]}{last} ({len(made)} frames)")
+        each = f", {seconds / len(made):.2g} s per frame"
+        summarize("Total", f"{duration(seconds)}{each}, peak memory {peak_memory() / 2**20:.0f} MiB")
+    words = ["ravg", "view", request.output, "--beside", request.shot.shot]
+    summarize("Next", subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words))
+    summarize("Details", f"-v, or {record.path}")
+
+
 class _Report:
     """Logs each finished frame, and writes it to the record."""
 
@@ -324,6 +382,7 @@ class _Report:
         self.pixels = self.outliers = 0
         self.means: list[tuple[float, float]] = []  # radiance of each noisy frame, with and without its fireflies
         self.plans: dict[int, Plan] = {}
+        self.fireflies: dict[int, int] = {}
 
     def add(self, frame: Finished | Failed) -> str:
         """Add a frame; return the message of the progress bar."""
@@ -349,18 +408,19 @@ class _Report:
         self.record.add(frame.number, "there" if frame.resumed else "made", **facts, stages=stages)
         judged = [vars(finding) for finding in self.findings]
         self.record.write(self.job.timings, pixels=self.pixels, outliers=self.outliers, judged=judged)
-        return f"frame {frame.number} {'was there' if frame.resumed else f'{frame.seconds:.1f} s'}"
+        return f"frame {frame.number}{' was there' if frame.resumed else ''}"
 
     def _log(self, frame: Finished, share: float) -> None:
         name = f"frame {frame.number}"
         if frame.again:
             LOG.info(f"{name} is made again: {printable(frame.again)}")
         if frame.fireflies:
-            LOG.info(f"{name}: {frame.fireflies} fireflies taken out, {share:.2%} of its light")
+            self.fireflies[frame.number] = frame.fireflies
+            LOG.debug(f"{name}: {frame.fireflies} fireflies removed, {share:.2%} of its light")
         if frame.repaired:
-            LOG.warning(f"{name}: {frame.repaired} pixels were not finite, filled in")
+            LOG.warning(f"{name}: {frame.repaired} pixels were not finite, filled in from neighbours; check the render")
         if frame.clamped:
-            LOG.warning(f"{name}: {frame.clamped} values too large for half, written as 65504")
+            LOG.warning(f"{name}: {frame.clamped} values too large for half, written as 65504; 32-bit input keeps them")
 
     def finish(self) -> None:
         """Log which stages ran, and a table of seconds and memory."""
@@ -371,7 +431,12 @@ class _Report:
         self.record.write(timings, plan=[vars(decision) for decision in plan], mean=mean)
         for decision in plan:
             if self.job.options.method == "network" or decision.stage not in NEURAL_STAGES:
-                LOG.info(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
+                LOG.debug(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
+            if decision.stage == "fixed-noise" and decision.on and not decision.forced:
+                LOG.warning(f"constant seed: {decision.reason}")
+        if self.fireflies:
+            frames = format_frames(sorted(self.fireflies))
+            summarize("Note", f"{sum(self.fireflies.values())} fireflies removed, in frames {frames}")
         table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
         for row in timings.rows(self.pixels):
             table.add_row(*row)
@@ -380,14 +445,13 @@ class _Report:
 
 def _run(job: Job, record: Record) -> None:
     """Denoise; log progress, and everything that happens to a frame."""
-    view, source = job.views[0], job.first_passes[0]
+    view = job.views[0]
     taken = view.layers(view.numbers[0])
     layers = summarize_layers(taken)
+    LOG.debug(printable(f"layers: {layers}"))
     found = [finding.message for finding in job.report.findings if not finding.warning]
-    for words in (f"layers: {layers}", *taken.notes, *found, *view.recompressed_parts(job.views[1:])):
-        LOG.info(printable(words))
-    later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
-    LOG.info(f"first pass: {source.name} ({source.reason}){later}")
+    for words in (*taken.notes, *found, *view.recompressed_parts(job.views[1:])):
+        summarize("Note", words)
     judged = [vars(finding) for finding in job.report.findings]
     record.write(job.timings, layers=layers, warnings=view.warnings, judged=judged)
     report, bar = _Report(job, record), Progress("denoise", job.total())

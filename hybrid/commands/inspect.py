@@ -45,7 +45,7 @@ def inspect(
     as_json: Annotated[bool, output_option("print one JSON object", "--json")] = False,
     max_pixels: PixelsOption = None,
 ) -> None:
-    """Show which layer has which role, and which stages run, with measurements and reasons.
+    """Check a shot before denoising: its layers, motion vectors, and the stages that it needs.
 
     Examples:
 

@@ -33,7 +33,8 @@ LOG = logging.getLogger("ravg")
 LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
-message_option = panel("Messages")
+message_option = panel("Logging")
+LABEL_WIDTH = 12
 RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
@@ -61,13 +62,20 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
             LOG.warning(line)
         command(**arguments, **({"context": context} if "context" in signature.parameters else {}))
 
-    form = message_option("format of progress and messages", "--log-format", envvar="RAVG_LOG_FORMAT")
-    file = message_option("append messages to a file", "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE")
+    form = message_option(
+        "text; json: an object per line; openjd: text that workers of Open Job Description read",
+        "--log-format",
+        envvar="RAVG_LOG_FORMAT",
+    )
+    file = message_option("also append messages to this file", "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE")
     options = {
         "log_format": (Annotated[LogFormat, form], "text"),
         "log_file": (Annotated[Path | None, file], None),
         "quiet": (Annotated[bool, message_option("only warnings and errors", "-q", "--quiet")], False),
-        "verbose": (Annotated[bool, message_option("also details", "-v", "--verbose")], False),
+        "verbose": (
+            Annotated[bool, message_option("also details: layers, plan, cost of each stage", "-v", "--verbose")],
+            False,
+        ),
     }
     parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
     added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]
@@ -75,6 +83,11 @@ def logged(command: Callable[..., None]) -> Callable[..., None]:
         added.append(parameter("context", keyword, annotation=typer.Context))
     run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     return run
+
+
+def summarize(label: str, text: str) -> None:
+    """Log a line of a command's summary: a label, and what it is about."""
+    LOG.info(printable(text), extra={"label": label, "facts": {"label": label}})
 
 
 class Progress:
@@ -89,9 +102,13 @@ class Progress:
     def advance(self, by: float = 1, message: str = "", **facts: object) -> None:
         """Log that `by` more steps are done, with a message and facts."""
         self.done += by
-        elapsed = time.monotonic() - self._start
-        left = elapsed / self.done * (self.total - self.done) if self.done else None
+        left = self.elapsed / self.done * (self.total - self.done) if self.done else None
         self._record(message or self.task, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self._start
 
     def _record(self, message: str, facts: dict[str, object]) -> None:
         share = self.done / self.total if self.total else 1.0
@@ -127,8 +144,8 @@ def end_log() -> None:
 
 
 def print_table(table: Any, **facts: object) -> None:
-    """Log a rich table: as a table, or as `facts` in JSON."""
-    LOG.info("", extra={"table": table, "facts": facts})
+    """Log a rich table as a detail: as a table, or as `facts` in JSON."""
+    LOG.debug("", extra={"table": table, "facts": facts})
 
 
 # Most characters of a message, which may quote a file.
@@ -155,31 +172,29 @@ def _on_stderr(form: LogFormat) -> logging.Handler:
     console = Console(stderr=True)
     if form == "text" and console.is_terminal and not console.is_dumb_terminal:
         return _Terminal(console)
-    handler = _Lines(sys.stderr)
-    handler.setFormatter(_JsonLine() if form == "json" else _TextLine(openjd=form == "openjd"))
-    return handler
+    return _Lines(sys.stderr, form)
 
 
 def _into(file: Path, form: LogFormat) -> logging.Handler:
     if file.exists() and (not file.is_file() or b"\0" in file.open("rb").read(4096)):
         raise ValueError(f"log-file {str(file)!r} is there and no text, expected a log or a new name")
-    handler = _Lines(file.open("a", encoding="utf-8"), owns_stream=True)
-    handler.setFormatter(_JsonLine() if form == "json" else _TextLine(times=True))
-    return handler
+    return _Lines(file.open("a", encoding="utf-8"), form if form == "json" else "text", owns_stream=True)
 
 
 class _Lines(logging.StreamHandler[Any]):
-    """Records as lines; progress of less than a percent is skipped, except at the end of a frame."""
+    """Records as lines; progress of less than a percent is skipped, except for programs at the end of a frame."""
 
-    def __init__(self, stream: Any, *, owns_stream: bool = False) -> None:
+    def __init__(self, stream: Any, form: LogFormat, *, owns_stream: bool = False) -> None:
         super().__init__(stream)
         self.owns_stream = owns_stream
+        self.setFormatter(_JsonLine() if form == "json" else _TextLine(times=owns_stream, openjd=form == "openjd"))
+        self._each_frame = form != "text"
         self._percent = -1
 
     def emit(self, record: logging.LogRecord) -> None:
         facts = getattr(record, "facts", {})
         if hasattr(record, "progress"):
-            if int(facts["percent"]) == self._percent and "frame" not in facts:
+            if int(facts["percent"]) == self._percent and not (self._each_frame and "frame" in facts):
                 return
             self._percent = int(facts["percent"])
         super().emit(record)
@@ -207,8 +222,8 @@ class _TextLine(logging.Formatter):
         facts = getattr(record, "facts", {})
         if (progress := getattr(record, "progress", None)) is not None:
             left = f", about {duration(facts['seconds_left'])} left" if "seconds_left" in facts else ""
-            count = f"{progress.done:.0f} of {progress.total:.0f} {progress.unit}"
-            text = f"{text}: {count}, {facts['percent']:.0f} %{left}"
+            count = f"{progress.done:.0f} of {progress.total:.0f} {progress.unit}, " if progress.unit != "%" else ""
+            text = f"{text}: {count}{facts['percent']:.0f} %{left}"
         lines = [text]
         if self._openjd and progress is not None:
             lines += [f"openjd_progress: {facts['percent']:.1f}", f"openjd_status: {text}"]
@@ -244,6 +259,8 @@ class _Terminal(logging.Handler):
             self._stop()
             self._console.print(table)
         else:
+            if self._progress is not None and self._progress.done >= self._progress.total:
+                self._stop()  # lines about the result stand below the bar
             self._console.print(_message(record), highlight=False, markup=False, soft_wrap=True)
 
     def close(self) -> None:
@@ -258,12 +275,14 @@ class _Terminal(logging.Handler):
             self._stop()
             words = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
             unit = TextColumn(progress.unit, markup=False)
-            self._bar = Bar(*words, unit, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
-            self._bar.add_task(progress.task, total=progress.total)
+            speed = TextColumn("{task.fields[rate]}", markup=False)
+            self._bar = Bar(*words, unit, speed, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
+            self._bar.add_task(progress.task, total=progress.total, rate="")
             self._bar.start()
             self._progress = progress
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=progress.done, description=text)
+            rate = f"{progress.elapsed / progress.done:.2g} s each" if progress.done else ""
+            self._bar.update(self._bar.task_ids[0], completed=progress.done, description=text, rate=rate)
 
     def _stop(self) -> None:
         if self._bar is not None:
@@ -272,8 +291,10 @@ class _Terminal(logging.Handler):
 
 
 def _message(record: logging.LogRecord) -> str:
-    level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-    return level + record.getMessage()
+    before = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+    if (label := getattr(record, "label", None)) is not None:
+        before = f"{label:<{LABEL_WIDTH}}"
+    return before + record.getMessage()
 
 
 def _plain_table(table: Any) -> str:

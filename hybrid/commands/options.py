@@ -22,8 +22,14 @@ def panel(title: str) -> Callable[..., Any]:
     return option
 
 
-input_option, work_option = panel("Input"), panel("What to run")
+input_option, method_option = panel("Input"), panel("Method")
 output_option, resource_option = panel("Output"), panel("Resources")
+
+# Stages in the order of `hybrid.plan.STAGES`, which this module cannot import: a test compares them.
+STAGE_NAMES = (
+    "fireflies, demodulate, outliers, warp, dense-flow, refine, gate, drift, fixed-noise, prefilter, stabilize, "
+    "restore-mean, blend-samples, alpha, skip"
+)
 
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
 DeviceOption = Annotated[
@@ -62,7 +68,12 @@ OutputOption = Annotated[
     ),
 ]
 FramesOption = Annotated[
-    str | None, input_option("frames, such as 1001-1010x2 (default: all)", "--frames", metavar="RANGE")
+    str | None,
+    input_option(
+        "frames to use, such as 1001-1010, or 1001-1010x2 for every second one (default: all)",
+        "--frames",
+        metavar="RANGE",
+    ),
 ]
 LayerOption = Annotated[
     list[str] | None,
@@ -92,9 +103,7 @@ MotionOption = Annotated[
 ]
 StrictOption = Annotated[
     bool,
-    input_option(
-        "stop at layers that make no sense and at cuts (default: leave such layers out, and warn)", "--strict"
-    ),
+    input_option("stop at implausible layers and at cuts (default: warn, and leave such layers out)", "--strict"),
 ]
 PreviewOption = Annotated[
     Path | None,
@@ -102,17 +111,22 @@ PreviewOption = Annotated[
         "noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames", metavar="FILE"
     ),
 ]
-RateOption = Annotated[float, output_option("frames per second of movies and players", "--fps", min=1, max=240)]
+RateOption = Annotated[
+    float, output_option("frames per second at which movies and pages play", "--fps", min=1, max=240)
+]
 SheetOption = Annotated[
     Path | None, output_option("one image of frames from all over the shot", "--contact-sheet", metavar="PNG")
 ]
 OnOption = Annotated[
-    list[str] | None, work_option("stages to run, whatever was measured; see ravg inspect", "--stages", metavar="NAME")
+    list[str] | None,
+    method_option(f"stages to force on, with commas between: {STAGE_NAMES}", "--stages", metavar="NAMES"),
 ]
-OffOption = Annotated[list[str] | None, work_option("stages not to run", "--no-stages", metavar="NAME")]
+OffOption = Annotated[
+    list[str] | None, method_option("stages to force off, as --stages", "--no-stages", metavar="NAMES")
+]
 FirstPassOption = Annotated[
     str | None,
-    work_option(
+    method_option(
         "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
         "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
         "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
@@ -142,7 +156,7 @@ KeepGoingOption = Annotated[
 MemoryOption = Annotated[
     str | None,
     resource_option(
-        "limit, such as 8G: frames are denoised in bands of rows (default: whole frames)",
+        "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
         metavar="SIZE",
         envvar="RAVG_MAX_MEMORY",
     ),
@@ -150,13 +164,16 @@ MemoryOption = Annotated[
 PixelsOption = Annotated[
     int | None,
     resource_option(
-        "refuse files that claim more pixels (default: 2^28)", metavar="N", min=1, envvar="RAVG_MAX_PIXELS"
+        "refuse images with more pixels (default: 2^28, about 16384x16384)",
+        metavar="N",
+        min=1,
+        envvar="RAVG_MAX_PIXELS",
     ),
 ]
 AovOption = Annotated[
     list[str] | None,
-    work_option(
-        "denoise this layer too; all: every layer whose name is known for a part of the light; repeatable",
+    method_option(
+        "denoise this layer too; all: every light pass and light group; repeatable",
         "--aov",
         metavar="LAYER",
     ),

@@ -10,7 +10,7 @@ import typer
 
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import input_option, output_option, resource_option, usage, work_option
+from hybrid.commands.options import input_option, method_option, output_option, resource_option, usage
 from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
@@ -25,32 +25,32 @@ def simulate(
         Path, output_option("folder for the frames and meta.json", "-o", "--output", "--out", metavar="OUT")
     ],
     frames: Annotated[str, input_option("such as 1001-1010x2", "--frames", metavar="RANGE")] = "1-7",
-    size: Annotated[str, work_option("pixels of the rendered image", metavar="WxH")] = "320x180",
+    size: Annotated[str, method_option("pixels of the rendered image", metavar="WxH")] = "320x180",
     film: Annotated[
-        str | None, work_option("pixels of the whole camera, of which --size is a crop", metavar="WxH")
+        str | None, method_option("pixels of the whole camera, of which --size is a crop", metavar="WxH")
     ] = None,
     center: Annotated[
-        str | None, work_option("center of the crop in the film, as fractions, y down", metavar="X,Y")
+        str | None, method_option("center of the crop in the film, as fractions, y down", metavar="X,Y")
     ] = None,
-    spp: Annotated[str, work_option("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
-    levels: Annotated[str, work_option("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
-    reference: Annotated[int, work_option("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
+    spp: Annotated[str, method_option("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
+    levels: Annotated[str, method_option("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
+    reference: Annotated[int, method_option("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
     reference_frames: Annotated[
-        str | None, work_option("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
+        str | None, method_option("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
     ] = None,
     seed: Annotated[int, input_option("seed of all random numbers")] = 1,
     shots: Annotated[int, input_option("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
     camera: Annotated[str | None, input_option("a camera of the file, or random")] = None,
     motion: Annotated[
-        Literal["auto", "keep", "add"], work_option("auto: add motion to a file that has none", "--animate")
+        Literal["auto", "keep", "add"], method_option("auto: add motion to a file that has none", "--animate")
     ] = "auto",
     moving_objects: Annotated[
-        int | None, work_option("number of moving objects in added motion", min=0, metavar="N")
+        int | None, method_option("number of moving objects in added motion", min=0, metavar="N")
     ] = None,
-    motion_blur: Annotated[bool, work_option("render with motion blur", "--motion-blur")] = False,
-    halves: Annotated[bool, work_option("add half buffers, for the variance", "--halves")] = False,
+    motion_blur: Annotated[bool, method_option("render with motion blur", "--motion-blur")] = False,
+    halves: Annotated[bool, method_option("add half buffers, for the variance", "--halves")] = False,
     effects: Annotated[
-        Literal["auto", "all"], work_option("auto: the effects that the scene needs; all: every effect")
+        Literal["auto", "all"], method_option("auto: the effects that the scene needs; all: every effect")
     ] = "auto",
     jobs: Annotated[int, resource_option("Blender processes at a time", min=1, metavar="N")] = 1,
     threads: Annotated[
@@ -65,7 +65,14 @@ def simulate(
     ] = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Render shots with Cycles: noise levels, guides, motion vectors, references; with the effects a scene needs."""
+    """Render shots with Cycles for training and comparison: several noise levels, and references.
+
+    Examples:
+
+    ravg simulate random -o shots --shots 36 --levels n,n,n/e,4
+
+    ravg simulate scene.blend -o shot --frames 1-7 --spp 32 --reference 512
+    """
     from hybrid.files.sequences import parse_frames
 
     known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]

@@ -35,6 +35,10 @@ def status(
     """
     folder, name = Path(output), None
     if not folder.is_dir():
+        if folder.suffix != ".exr":
+            raise FileNotFoundError(
+                f"{output} is no folder, expected the output folder of ravg denoise, or OUT.####.exr"
+            )
         pattern, _ = parse_pattern(output)
         folder, name = pattern.folder, sequence_name(pattern.path(1))
     with usage():

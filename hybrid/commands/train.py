@@ -24,11 +24,11 @@ from hybrid.commands.options import (
     StrictOption,
     check_first_pass,
     input_option,
+    method_option,
     output_option,
     panel,
     resource_option,
     usage,
-    work_option,
 )
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.comparison.samples import samples_of
@@ -107,11 +107,11 @@ def make_clips(
         str | None,
         input_option("a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers"),
     ] = None,
-    tile: Annotated[int, work_option("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
-    tiles: Annotated[int, work_option("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
-    window: Annotated[int, work_option("frames of a window: 1, 3, 5 or 7")] = 5,
+    tile: Annotated[int, method_option("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
+    tiles: Annotated[int, method_option("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
+    window: Annotated[int, method_option("frames of a window: 1, 3, 5 or 7")] = 5,
     first_pass: Annotated[
-        str, work_option("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=check_first_pass)
+        str, method_option("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=check_first_pass)
     ] = "auto",
     reference: Annotated[
         bool, input_option("target SHOT/reference.####.exr, and only frames that it has", "--reference")
@@ -122,7 +122,7 @@ def make_clips(
             "level whose pseudo-references are the targets of the others; itself it is no input", metavar="LEVEL"
         ),
     ] = None,
-    seed: Annotated[int, work_option("seed of the places")] = 0,
+    seed: Annotated[int, method_option("seed of the random positions of clips")] = 0,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -136,6 +136,12 @@ def make_clips(
 
     Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
     Shots that have clips already are skipped, so that the same command continues an interrupted run.
+
+    Examples:
+
+    ravg make-clips shots/* -o clips
+
+    ravg make-clips "mine.####.exr" -o clips   (your own footage)
     """
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
@@ -232,28 +238,35 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
 def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
     output: Annotated[Path, output_option("weights to write", "-o", "--output", metavar="W.safetensors")],
-    preset: Annotated[str, work_option("fast, balanced, quality, unet, multiscale, paper or tkpcn")] = "fast",
+    preset: Annotated[
+        str, method_option("network to train: fast, balanced, quality, unet, multiscale, paper or tkpcn")
+    ] = "fast",
     init: Annotated[
         str | None,
         input_option("initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone"),
     ] = None,
     window: Annotated[
-        int | None, work_option("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
+        int | None, method_option("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
     ] = None,
     validation: Annotated[
-        list[str] | None, input_option("shots kept out of training; again or with commas for more")
+        list[str] | None,
+        input_option("shots to validate on, which are not trained on; with commas between, or repeated"),
     ] = None,
     device: DeviceOption = "auto",
-    threads: Annotated[int | None, resource_option("of torch and numba", min=1)] = None,
+    threads: Annotated[int | None, resource_option("threads of torch and numba (default: all cores)", min=1)] = None,
     tensorboard: Annotated[Path | None, output_option("write TensorBoard's logs there", metavar="FOLDER")] = None,
     resume: Annotated[bool, output_option("continue from W.safetensors.state, same options", "--resume")] = False,
     **settings: Any,
 ) -> None:
     """Train a network on clips.
 
-    ``torchrun -m hybrid.cli train …`` trains in several processes.
+    Examples:
 
-    Fine-tune on your own footage, without any reference: ravg make-clips of it, then --init fast --rate 1e-4.
+    ravg train clips -o mine.safetensors --init oidn --minutes 60
+
+    ravg train clips -o mine.safetensors --init fast --rate 1e-4   (fine-tune on your own footage)
+
+    torchrun -m hybrid.cli train clips -o mine.safetensors   (in several processes)
     """
     neural = import_neural()
     if init in (None, "oidn") and preset not in neural.TRAINING_PRESETS:

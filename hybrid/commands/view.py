@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid.commands.options import RateOption, input_option, resource_option, work_option
+from hybrid.commands.options import RateOption, input_option, output_option, resource_option
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 
@@ -25,9 +25,9 @@ def view(
     ] = None,
     fps: RateOption = 24,
     port: Annotated[int, resource_option("port of the page; 0: any free port", min=0, max=65535)] = 0,
-    browser: Annotated[bool, work_option("open the page in a browser, if there is a screen")] = True,
+    browser: Annotated[bool, output_option("open the page in a browser, if there is a screen")] = True,
 ) -> None:
-    """Play frames in a browser: wipe, exposure, layers, weights, stages.
+    """Play denoised frames beside noisy ones in a browser, also while they are being made.
 
     OUT may still be empty: frames appear as they are finished. The page is served to this machine alone and loads
     nothing from elsewhere. Ctrl-C ends the server.

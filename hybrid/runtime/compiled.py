@@ -42,7 +42,7 @@ class _FirstRun(event.Listener):
         if self.begun:
             return
         self.begun = True
-        LOG.info("compiling for this processor, once: some ten seconds, and kept for later runs")
+        LOG.info("compiling for this processor: about ten seconds, in the first run only")
         folder = getattr(event.data["dispatcher"]._cache, "cache_path", None)  # None without a cache
         if folder and not folder.startswith(os.devnull):
             options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
@@ -102,7 +102,10 @@ def _temporary_folder() -> str | None:
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
-        LOG.warning("compiled loops cannot be kept anywhere: each run compiles them for some fifteen seconds")
+        LOG.warning(
+            "compiled loops cannot be kept anywhere: each run starts fifteen seconds later; "
+            "set NUMBA_CACHE_DIR to a folder that can be written to"
+        )
         return None
     LOG.info(f"compiled loops are kept in {folder}: neither where ravg is installed nor in ~/.cache can be written to")
     return str(folder)

@@ -319,7 +319,7 @@ def test_the_script_of_the_documentation_renders_denoises_and_loads(blender, ble
     assert Path(path) == made / "Scene_0004.exr"
     assert source == "SEQUENCE"
     assert shown == [4, 3, 3]  # frame 4 of the scene shows file 4 - 4 + 1 + 3
-    assert "wrote 3 frames" in log
+    assert "(3 frames)" in log
     assert sorted(p.name for p in made.glob("*.exr")) == ["Scene_0004.exr", "Scene_0005.exr", "Scene_0006.exr"]
     code = """
     from bl_ext.user_default.ravg import scenes

@@ -139,7 +139,7 @@ def test_the_environment_holds_the_defaults_of_a_site(shot_folder, capsys, monke
 
 def test_the_documentation_names_every_default_of_a_site():
     """And each has the name of its option, but for Blender's interpreter, which is no one else's."""
-    text = (Path(__file__).parents[2] / "docs" / "farm.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
     there = {
         (str(parameter.envvar), option)
         for command in ALL.values()
@@ -197,8 +197,25 @@ def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, caps
 
 
 def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
-    _, _, err = run(capsys, "denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-stages", "warp")
-    assert "not run: warp (forced" in " ".join(err.split())
+    words = ["denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft", "--no-stages", "warp"]
+    assert "not run" not in run(capsys, *words)[2]
+    assert "not run: warp (forced" in " ".join(run(capsys, *words, "-v")[2].split())
+
+
+def test_a_run_is_ten_lines(tmp_path, capsys):
+    shot = Path(__file__).parents[2] / "examples" / "shot" / "noisy.####.exr"
+    _, _, err = run(capsys, "denoise", shot, "-o", tmp_path / "o", "--preset", "draft", "--frames", "8-10")
+    lines = [line for line in err.splitlines() if " of 3 frames, " not in line and "compiling" not in line]
+    labels = ["ravg", "Input", "Passes", "First", "Output", "Total", "Next", "Details"]
+    assert [line.split()[0] for line in lines] == labels
+    assert "3 frames" in next(line for line in lines if line.startswith("Output"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_shows_an_example(capsys, command):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0
+    assert f"ravg {command} " in out.partition("Example")[2]
 
 
 def test_a_hole_is_a_warning_where_nobody_asked_for_it(shot_folder, tmp_path, capsys):

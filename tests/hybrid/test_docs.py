@@ -1,5 +1,6 @@
-"""What a newcomer types, as the documentation has it, and what is said."""
+"""The documentation: commands run, options and messages exist, links lead somewhere."""
 
+import ast
 import os
 import re
 import shlex
@@ -12,9 +13,39 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.cli import main
+from hybrid.cli import COMMANDS, LazyCommand, main
 
 ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+# A marker, which no reader sees, before a block of commands.
+BLOCK = re.compile(r"(?:<!-- (?P<marker>[^>]*) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)\n```", re.DOTALL)
+# Options of other programs.
+FOREIGN = {
+    *(
+        "--break",
+        "--source-dir",
+        "--command",
+        "--background",
+        "--render",
+        "--keep",
+        "--replace",
+        "--addons",
+        "--python",
+    ),
+    *("--python-exit-code", "--chnames", "--chappend", "--no-deps", "--host", "--port", "--nworkers", "--nthreads"),
+    *(
+        "--step",
+        "--nproc-per-node",
+        "--threads",
+        "--system-site-packages",
+        "--upgrade",
+        "--seed",
+        "--compact",
+        "--movers",
+    ),
+    *("--second-reference", "--sweep"),
+}
 
 
 def transcript(document: str, name: str) -> Iterator[tuple[list[str], list[str]]]:
@@ -32,11 +63,18 @@ def said(line: str) -> str:
     return re.sub(r"\d+(\.\d+)? (s|min|h)\b", "TIME", line)
 
 
-@pytest.mark.posix
-def test_in_a_shell(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the examples, as a clone has."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    commands = list(transcript("farm.md", "transcript"))
+    return tmp_path
+
+
+@pytest.mark.posix
+@pytest.mark.usefixtures("folder")
+def test_in_a_shell(capsys):
+    commands = list(transcript("command-line.md", "transcript"))
     assert len(commands) == 5
     for (program, *words), answer in commands:
         assert program == "ravg"
@@ -50,11 +88,9 @@ def test_in_a_shell(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.neural
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
-@pytest.mark.usefixtures("interrupts")
-def test_looking_at_a_shot(tmp_path, monkeypatch, capsys):
+@pytest.mark.usefixtures("interrupts", "folder")
+def test_looking_at_a_shot(capsys):
     pytest.importorskip("torch")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
     ((_, *words), answer), ((_, *look), (url, end)) = transcript("view.md", "transcript")
     assert main(words) == 0
     lines = [said(line) for line in capsys.readouterr().err.splitlines()]
@@ -76,3 +112,127 @@ def test_looking_at_a_shot(tmp_path, monkeypatch, capsys):
         assert process.wait(timeout=30) == 0
     finally:
         process.kill()
+
+
+def commands_of(page: Path) -> list[tuple[str, list[str]]]:
+    """Each block of a page that has commands of ravg, by its marker, with these commands."""
+    blocks = []
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        lines = [line.removeprefix("$ ") for line in block["text"].splitlines()]
+        if found := [line for line in lines if re.match(r"(ravg|torchrun) ", line)]:
+            blocks.append((block["marker"] or "", found))
+    return blocks
+
+
+RUN = [(page, lines) for page in PAGES for marker, lines in commands_of(page) if marker == "run"]
+
+
+@pytest.mark.neural
+@pytest.mark.slow
+@pytest.mark.posix
+@pytest.mark.parametrize(("page", "lines"), RUN, ids=[page.name for page, _ in RUN])
+def test_commands_run(page, lines, folder):
+    pytest.importorskip("torch")
+    for line in lines:
+        _, *words = shlex.split(line)
+        assert main(words) == 0, line
+    assert list(folder.glob("out/*.exr")) or lines[0].startswith("ravg inspect")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_every_command_runs_in_a_test_or_says_why_not(page):
+    """Transcripts are compared by tests of their own."""
+    for marker, lines in commands_of(page):
+        assert marker in ("run", "transcript", "cluster") or marker.startswith("not run: "), lines[0]
+
+
+def test_an_unmarked_block_of_commands_is_noticed(tmp_path):
+    """Or the test above would show nothing."""
+    (tmp_path / "page.md").write_text("```sh\nravg denoise shot -o out\n```\n", encoding="utf-8")
+    assert commands_of(tmp_path / "page.md") == [("", ["ravg denoise shot -o out"])]
+
+
+@pytest.fixture(scope="module")
+def options():
+    """Command → its options."""
+    loaded = {name: LazyCommand(name, entry).load() for name, entry in COMMANDS.items()}
+    return {
+        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        for name, command in loaded.items()
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_options_exist(page, options):
+    text = page.read_text(encoding="utf-8")
+    words = {
+        word
+        for code in re.findall(r"`[^`]+`|```.*?```", text, re.DOTALL)
+        for word in re.findall(r"--[a-z][\w-]*", code)
+    }
+    known = set().union(*options.values(), FOREIGN, {"--help", "--version", "--install-completion"})
+    assert words <= known
+    for name, rest in re.findall(r"ravg (\w[\w-]*) ([^`\n]*)", text):
+        if name in options:
+            rest = rest.partition("&&")[0].partition(" && ")[0]
+            own = set(re.findall(r"(?<!\S)--[a-z][\w-]*", rest))
+            assert own <= options[name] | {"--help"}, f"ravg {name} {rest}"
+
+
+def strings_of_the_code() -> list[str]:
+    """Every string of the code, with … for values within it."""
+    found = []
+    for path in (path for package in ("hybrid", "network", "blender") for path in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [part.value if isinstance(part, ast.Constant) else "…" for part in node.values]
+                found.append("".join(str(part) for part in parts))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def is_made_by(message: str, strings: list[str]) -> bool:
+    """Whether one string of the code has all parts of a message, in their order."""
+    pattern = re.compile(".*".join(re.escape(part) for part in message.split("…")), re.DOTALL)
+    return any(pattern.search(string) for string in strings)
+
+
+def test_messages_of_troubleshooting_exist():
+    text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8").partition("## The result")[0]
+    messages = re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
+    assert len(messages) > 25
+    strings = strings_of_the_code()
+    assert [message for message in messages if not is_made_by(message, strings)] == []
+    assert not is_made_by("frames … are blue", strings)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of the headings of a page, as GitHub makes them."""
+    heads = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if not target.startswith(("http:", "https:")):
+            name, _, anchor = target.partition("#")
+            path = page.parent / name if name else page
+            assert path.exists(), target
+            assert not anchor or anchor in anchors(path), target
+
+
+def test_every_page_is_in_the_index():
+    text = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    linked = {(ROOT / "docs" / name).resolve() for name in re.findall(r"\]\(([^)#\s]+)\)", text)}
+    assert {page for page in PAGES if page not in (ROOT / "README.md", ROOT / "docs" / "README.md")} <= linked
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("index", [0, 1])
+def test_python_of_the_documentation_runs(index, capsys):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 2
+    exec(compile(blocks[index], "python.md", "exec"), {})
+    assert ["10 out/denoised.0010.exr", "2 (180, 320, 3)"][index] in capsys.readouterr().out

@@ -359,7 +359,7 @@ def test_the_command_says_what_was_taken(tmp_path, capfd):
     folder = SCENE.write(tmp_path / "noisy", edit=denoised)
     out = tmp_path / "out"
     assert main(["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "auto"]) == 0
-    assert "first pass: file (the file holds a denoised picture)" in capfd.readouterr().err
+    assert "First pass  file (the file holds a denoised picture)" in capfd.readouterr().err
     assert open_shot(out).numbers == open_shot(folder).numbers
     assert [record["estimate"] for _, record in read_records(out)] == ["file"]
     assert (
@@ -387,7 +387,7 @@ def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
         == 0
     )
     said = capfd.readouterr().err
-    assert "first pass: file" in said
+    assert "First pass  file" in said
     assert "fixed-noise" in said
     before, after = open_shot(folder), open_shot(str(out))
     pictures = [before.read(10).estimate, after.read(10).estimate]  # Combined is replaced, the Noisy Image stays

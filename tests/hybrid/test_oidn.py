@@ -70,7 +70,7 @@ def test_where_its_library_is_missing_auto_does_without_and_says_so(monkeypatch,
     assert main([*words, "auto"]) == 0
     said = capsys.readouterr().err
     expected = {"absent": "pyoidn is not installed", "broken": "libOpenImageDenoise.so.2: no such file"}
-    assert "first pass: nlm (no denoised picture in the file, and " in said
+    assert "First pass  nlm (no denoised picture in the file, and " in said
     assert expected.get(how, "pyoidn does not work here: Device") in said
     assert main([*words, "oidn"]) == 1
     assert "error: first pass oidn: pyoidn" in capsys.readouterr().err

@@ -159,6 +159,6 @@ class TestWithOidn:
         folder = SCENE.write(tmp_path / "noisy")
         out = tmp_path / "out"
         assert main(["denoise", str(folder), "-o", str(out), "--preset", "pooled", "--frames", str(MIDDLE)]) == 0
-        assert "first pass: oidn-fast" in capfd.readouterr().err
+        assert "First pass  oidn-fast" in capfd.readouterr().err
         made, given = open_shot(out).read(MIDDLE), open_shot(folder).read(MIDDLE)
         assert psnr(made.color, truth(given)) > psnr(given.color, truth(given)) + 10

@@ -60,7 +60,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Renderer], np.nd
 
 @pytest.mark.parametrize("renderer", RENDERERS.values(), ids=RENDERERS)
 def test_the_same_command_gives_the_same_picture(renderer: Renderer, told, tmp_path: Path) -> None:
-    found, said = denoised(renderer.write(tmp_path / "theirs", FRAMES), tmp_path / "found", *options(renderer))
+    found, said = denoised(renderer.write(tmp_path / "theirs", FRAMES), tmp_path / "found", *options(renderer), "-v")
     assert "warning" not in said
     assert f"layers: {renderer.profile} (" in said
     # Vectors are rounded otherwise in other units.

@@ -274,7 +274,7 @@ def test_alpha_is_denoised_where_some_frame_has_a_hole(folder):
 
 def test_the_classical_chain_claims_no_stage_of_a_network(folder):
     shot(folder / "in", 3, covered(lambda index: True))
-    said = ravg(*draft(), folder=folder).succeeds().said
+    said = ravg(*draft(), "-v", folder=folder).succeeds().said
     assert not re.search(r"\brun: (alpha|skip)", re.sub(r"not run: \w+", "", said))
 
 

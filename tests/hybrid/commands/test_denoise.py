@@ -103,7 +103,7 @@ def test_the_second_pass_starts_from_the_frames_of_the_first(run, tmp_path, caps
     _, header = run(*ALONE, "--passes", 2)
     assert header["ravg/first-pass"] == "pass 1 of 2"
     assert (header["first-pass"], header["passes"]) == ("nlm", 2)
-    assert "first pass: nlm (asked for); pass 1 of 2 for the last" in capsys.readouterr().err
+    assert "First pass  nlm (asked for); pass 1 of 2 for the last" in capsys.readouterr().err
     assert not list(tmp_path.glob("out*/pass*"))
 
 

@@ -446,6 +446,6 @@ def test_a_network_without_estimates_says_so(tmp_path, capsys):
     )
     assert not (tmp_path / "out").exists()
     assert run(*words, "auto") == 0
-    assert "first pass: none (the denoiser takes none)" in capsys.readouterr().err
+    assert "First pass  none (the denoiser takes none)" in capsys.readouterr().err
     assert run(*words, "none", "--passes", 2) == 0
-    assert "first pass: none (the denoiser takes none)" in capsys.readouterr().err
+    assert "First pass  none (the denoiser takes none)" in capsys.readouterr().err
