@@ -124,7 +124,7 @@ def denoise(
     method: Annotated[
         Literal["network", "classical", "pooled"] | None,
         method_option(
-            "network: Robust Average network (needs torch); classical: non-local means and guided filter, or the average "
+            "network: Robust Average network (needs torch); classical: non-local means, guided filter, or the average "
             "of first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)"
         ),
     ] = None,

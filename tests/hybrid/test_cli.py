@@ -15,10 +15,11 @@ import pytest
 import typer
 
 from hybrid.cli import COMMANDS, LazyCommand, main
-from hybrid.commands.options import check_first_pass
+from hybrid.commands.options import STAGE_NAMES, check_first_pass
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.first_pass import SPECS
+from hybrid.plan import STAGES
 from hybrid.records import read_records
 from tests.exr_files import write_layers
 from tests.scenes import Scene
@@ -67,7 +68,7 @@ def test_completion_can_be_had_and_completes(capsys, monkeypatch):
 def test_options_have_one_name_and_one_group_everywhere(command, capsys):
     code, out, _ = run(capsys, command, "-h")
     assert code == 0
-    assert "Messages" in out
+    assert "Logging" in out
     assert "--output" in out or command == "inspect"
     groups = [line for line in out.splitlines() if line.startswith("╭")]
     assert len(groups) >= 4
@@ -209,6 +210,10 @@ def test_a_run_is_ten_lines(tmp_path, capsys):
     labels = ["ravg", "Input", "Passes", "First", "Output", "Total", "Next", "Details"]
     assert [line.split()[0] for line in lines] == labels
     assert "3 frames" in next(line for line in lines if line.startswith("Output"))
+
+
+def test_the_help_names_all_stages():
+    assert STAGE_NAMES.split(", ") == [*STAGES]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
