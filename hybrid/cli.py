@@ -86,7 +86,7 @@ class Command(TyperCommand):
         except Exception as error:
             if len(files) > 1 and "unexpected extra argument" in str(getattr(error, "message", "")):
                 said = f"{len(files)} files, of which {files[1]}"
-                raise typer.BadParameter(f"expected one pattern in quotes, such as '*.exr', got {said}") from None
+                raise typer.BadParameter(f'expected one pattern in quotes, such as "*.exr", got {said}') from None
             raise
 
 

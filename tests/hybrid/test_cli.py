@@ -118,7 +118,7 @@ def test_a_pattern_that_the_shell_has_replaced_is_to_be_quoted(shot_folder, caps
     code, _, error = run(capsys, *command, *files)
     assert code == 2
     said = " ".join(re.sub("[│╭╮╰╯─]", " ", error).split())
-    assert "expected one pattern in quotes, such as '*.exr', got 3 files" in said
+    assert 'expected one pattern in quotes, such as "*.exr", got 3 files' in said
     assert "in quotes" not in run(capsys, *command, files[0], "more")[2]
 
 
