@@ -33,6 +33,19 @@ def test_a_new_file_is_made_once_and_an_old_one_is_opened_again(tmp_path):
     os.close(open_file(path, new=False))
 
 
+@pytest.mark.skipif(sys.platform != "win32", reason="paths are limited on Windows alone")
+@pytest.mark.parametrize("error", [3, 206])  # path not found, name too long
+def test_a_path_that_is_too_long_for_windows_is_named_as_the_reason(tmp_path, monkeypatch, error):
+    """Wine takes paths of any length, so the answer of Windows is given here."""
+    monkeypatch.setattr(system.ctypes, "get_last_error", lambda: error)
+    long, short = tmp_path / "gone" / ("a" * 250), tmp_path / "gone" / "a"
+    with pytest.raises(OSError, match=f"the path has {len(str(long))} characters, Windows takes 259"):
+        open_file(long, new=True)
+    with pytest.raises(OSError) as raised:
+        open_file(short, new=True)
+    assert "characters" not in str(raised.value)
+
+
 def test_a_locked_file_is_read_written_renamed_and_removed_by_its_name(tmp_path):
     """Locks of Windows are mandatory, and its files are not shared unless that is asked for."""
     path = tmp_path / "a"
