@@ -105,6 +105,7 @@ def distribution_of_others(folder: Path, names: list[str]) -> Path:
 @pytest.mark.slow
 def test_beside_a_distribution_with_packages_of_the_same_names(wheel, tmp_path):
     """As docs/install.md says: pip replaces files without a word, and removes them with the other distribution."""
+    pytest.importorskip("venv", reason="makes an environment, which Python's embeddable package for Windows cannot")
     names = ["flow", "network", "loops"]
     theirs = distribution_of_others(tmp_path, names)
     place = tmp_path / "environment"
