@@ -24,6 +24,11 @@ OURS = tuple(name for name in ("loops", "flow", "nlm", "network", "hybrid", "rav
 EXCEEDED = 98
 
 
+def words_in(printed: str) -> str:
+    """The words of an output in one line, without the lines of tables and boxes (ASCII in pipes on Windows)."""
+    return " ".join("".join(" " if "\u2500" <= sign <= "\u257f" or sign == "|" else sign for sign in printed).split())
+
+
 @dataclass(frozen=True)
 class Done:
     """Exit code of a command, and what it printed."""
@@ -34,7 +39,7 @@ class Done:
     @property
     def words(self) -> str:
         """The output in one line, without the lines of tables and boxes."""
-        return " ".join("".join(" " if "\u2500" <= sign <= "\u257f" else sign for sign in self.said).split())
+        return words_in(self.said)
 
     def succeeds(self) -> Done:
         """Assert exit code 0."""

@@ -14,6 +14,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.files.exr import ExrImage, read_exr
 from hybrid.files.shots import open_shot
+from tests.commands import words_in
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
 FRAMES = truths()
@@ -196,7 +197,7 @@ def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.Capture
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
     spec = str(tmp_path / "%V" / "shot.####.exr")
     assert main(["denoise", "--method=classical", spec, "-o", str(tmp_path / "out")]) == 2
-    assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "expected %V or %v in it" in words_in(capsys.readouterr().err)
     assert (
         main(["denoise", "--method=classical", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
     )
@@ -223,7 +224,7 @@ def test_two_eyes_share_nothing(
     for eye in ("left", "local"):
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
     assert main(["denoise", "%V/shot.####.exr", "--output", "out_%V", "--preset", "draft", option, value]) == 2
-    assert "expected %V or %v in it" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "expected %V or %v in it" in words_in(capsys.readouterr().err)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["left", "local"]
 
 

@@ -12,6 +12,7 @@ from hybrid.cli import main
 from hybrid.files.png import encode_srgb
 from hybrid.files.shots import open_shot
 from hybrid.preview import SHEET_WIDTH, SHORTEST, check_preview, divide, write_contact_sheet, write_preview
+from tests.commands import words_in
 from tests.scenes import Scene
 
 DEFAULTS = Path(__file__).parents[1] / "data" / "defaults"
@@ -133,7 +134,7 @@ def test_what_is_no_preview_is_refused_before_anything_is_made(shot_folder, tmp_
         ["denoise", "--method=classical", str(shot_folder), "-o", str(tmp_path / "out"), option, str(tmp_path / name)]
     )
     assert code == 2
-    assert "expected a name that ends in .png" in " ".join(capsys.readouterr().err.replace("│", "").split())
+    assert "expected a name that ends in .png" in words_in(capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
 

@@ -16,6 +16,7 @@ import typer
 
 from hybrid.cli import main
 from hybrid.commands.cluster import arguments_of
+from tests.commands import words_in
 from tests.hybrid.simulate.test_run import STUB
 from tests.hybrid.test_docs import said, transcript
 from tests.renderers import save
@@ -203,7 +204,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is_handed_out(shot, t
         "tcp://127.0.0.1:9",
     ]
     assert main([*words, "--preview", str(tmp_path / "x.tif")]) == 2
-    assert "expected a name that ends in .png" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "expected a name that ends in .png" in words_in(capsys.readouterr().err)
     assert main([*words, "--contact-sheet", str(tmp_path / "x.png"), "--preview", str(tmp_path / "x.png")]) == 1
     assert "would overwrite preview" in capsys.readouterr().err
     assert main(["denoise", "--method=classical", str(shot), "-o", str(shot), "--scheduler", "tcp://127.0.0.1:9"]) == 1

@@ -21,6 +21,7 @@ from hybrid.simulate.run import (
     simulate,
 )
 from hybrid.simulate.shot import ShotSettings, frame_seed, parse_levels, parse_samples
+from tests.commands import words_in
 
 ROOT = Path(__file__).parents[3]
 SHOT = ShotSettings("random", 3, (1, 2, 3), (64, 36), {"a": 8, "b": 8, "c": 2})
@@ -238,7 +239,7 @@ def test_options_reach_the_settings_of_the_shot(tmp_path, stub, capsys):
 
 def test_half_buffers_need_two_samples_of_each_level(tmp_path, capsys):
     assert main(["simulate", "random", "-o", str(tmp_path), "--spp", "2", "--levels", "n,n/2", "--halves"]) == 2
-    error = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    error = words_in(capsys.readouterr().err)
     assert "level b: got 1 sample per pixel, expected at least 2 for half buffers" in error
 
 
