@@ -22,8 +22,8 @@ class Source:
     """The source that ravg is installed from."""
 
     version: str  # of this extension, such as 0.2.0
-    wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder first
-    online: bool  # whether the package index may be used for requirements
+    wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder
+    online: bool  # whether requirements may come from the package index too
 
     def requirements(self) -> list[str]:
         """Return pip's arguments. FileNotFoundError or ValueError for a wrong wheel or none."""

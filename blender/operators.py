@@ -94,7 +94,7 @@ class Install(_WhenIdle, bpy.types.Operator):
 
     wheel: bpy.props.StringProperty(
         name="Wheel",
-        description="A wheel file of ravg; its requirements come from wheels beside it, else from the package index",
+        description="A wheel file of ravg; its requirements come from wheels beside it or from the package index",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
