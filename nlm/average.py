@@ -72,18 +72,25 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     return cleaned, mask
 
 
+def channel_mean(image: Floats) -> Floats:
+    """Mean (H, W) over the channels of an image (H, W, C)."""
+    mean = np.empty(image.shape[:2], np.float32)
+    run_bands(_channel_mean, len(mean), np.ascontiguousarray(image, np.float32)[None], mean[None])
+    return mean
+
+
 def replace_nonfinite(image: Floats) -> tuple[Floats, Mask]:
     """Fill pixels that hold NaN or infinities in any channel; return a finite copy, and where (H, W) it was filled.
 
-    Values come from the nearest finite pixels, by a normalised box filter whose radius doubles; 0 if no pixel is
-    finite.
+    The image itself comes back where all is finite. Values come from the nearest finite pixels, by a normalised box
+    filter whose radius doubles; 0 if no pixel is finite.
     """
     if image.ndim != 3:
         raise ValueError(f"image: expected (height, width, channels), got shape {image.shape}")
     with np.errstate(invalid="ignore", over="ignore"):  # inf − inf; where it overflows pixels are looked at
         total = image.sum()  # by far the quickest way to see that nothing is missing
     if np.isfinite(total):
-        return image.astype(np.float32), np.zeros(image.shape[:2], np.bool_)
+        return np.asarray(image, np.float32), np.zeros(image.shape[:2], np.bool_)
     mask: Mask = np.any(~np.isfinite(image), axis=-1, keepdims=True)[..., 0]
     filled = np.where(mask[..., None], np.float32(0), image).astype(np.float32, copy=False)
     if mask.all():
