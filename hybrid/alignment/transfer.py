@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from loops.parallel import run_bands
+
 Array = NDArray[np.float32]
+Edges = NDArray[np.intp]
+Sums = NDArray[np.float64]
 
 # Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely specular
 # surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a neighbour's light
@@ -24,18 +31,42 @@ def demodulate(radiance: Array, albedo: Array) -> Array:
     ``radiance / (albedo + ALBEDO_FLOOR)`` (Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1,
     doi:10.1145/3072959.3073708); with the albedo's mean over channels where radiance has other than three.
     """
-    return radiance / _divisor(albedo, radiance.shape[-1])
+    return _with_divisor(_divide, radiance, albedo)
 
 
 def remodulate(irradiance: Array, albedo: Array) -> Array:
     """Invert `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``."""
-    return irradiance * _divisor(albedo, irradiance.shape[-1])
+    return _with_divisor(_multiply, irradiance, albedo)
 
 
-def _divisor(albedo: Array, channels: int) -> Array:
-    if channels != albedo.shape[-1]:
-        albedo = albedo.mean(axis=-1, keepdims=True)
-    return np.maximum(albedo, 0) + np.float32(ALBEDO_FLOOR)
+def _with_divisor(loop: Callable[..., None], layer: Array, albedo: Array) -> Array:
+    """Divide or multiply a layer (..., H, W, C) by the albedo plus the floor."""
+    if layer.shape[-1] != albedo.shape[-1]:
+        albedo = np.broadcast_to(albedo.mean(axis=-1, keepdims=True), (*albedo.shape[:2], layer.shape[-1]))
+    height = len(albedo)
+    result = np.empty(layer.shape, np.float32)
+    given = np.ascontiguousarray(layer, np.float32), np.ascontiguousarray(albedo, np.float32)
+    flat = given[0].reshape(-1, height, albedo[0].size), given[1].reshape(height, -1)
+    run_bands(loop, height, *flat, result.reshape(flat[0].shape))
+    return result
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _divide(first: int, last: int, layer: Array, albedo: Array, result: Array) -> None:
+    floor, zero = np.float32(ALBEDO_FLOOR), np.float32(0)
+    for t in range(len(layer)):
+        for y in range(first, last):
+            for i in range(albedo.shape[1]):
+                result[t, y, i] = layer[t, y, i] / (max(albedo[y, i], zero) + floor)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _multiply(first: int, last: int, layer: Array, albedo: Array, result: Array) -> None:
+    floor, zero = np.float32(ALBEDO_FLOOR), np.float32(0)
+    for t in range(len(layer)):
+        for y in range(first, last):
+            for i in range(albedo.shape[1]):
+                result[t, y, i] = layer[t, y, i] * (max(albedo[y, i], zero) + floor)
 
 
 def compress(radiance: Array, exposure: float) -> Array:
@@ -63,9 +94,12 @@ def measure_exposure(radiance: Array) -> float:
     """
     if radiance.size == 0:
         return 1.0
-    level = np.einsum("...c->...", radiance, dtype=np.float32) / np.float32(radiance.shape[-1])
-    level = np.where(np.isfinite(level), level, np.float32(np.nan))
-    means = _bin_means(level)
+    rows, columns = (_edges(size) for size in radiance.shape[:2])
+    level = np.empty(radiance.shape[:2], np.float32)
+    sums, counts = np.zeros((2, len(rows) - 1, len(columns) - 1))
+    image = np.ascontiguousarray(radiance, np.float32)
+    run_bands(_bin_levels, len(sums), image, rows, columns, level, sums, counts)
+    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
     # Far below any surface next to the brightest lamp that a half float holds, and far above the residue of a denoiser
     # on black: the first guess needs no exposure.
     brightest = float(np.nanmax(means, initial=0.0))
@@ -73,10 +107,11 @@ def measure_exposure(radiance: Array) -> float:
     exposure = 0.0
     while lit.any():
         # Lamps, sky in a window and fireflies are few and bright; they must not decide the exposure.
-        inside = level[_spread(lit, level.shape)]
-        inside = inside[np.isfinite(inside)]
-        bright = np.partition(inside, -1 - inside.size // 100)[-1 - inside.size // 100]
-        exposure = float(np.minimum(inside, bright).mean(dtype=np.float64))
+        size = int(counts[lit].sum())
+        bright = _find_greatest(level.view(np.uint32), rows, columns, lit, size // 100)
+        limited = np.zeros_like(sums)
+        run_bands(_bin_limited, len(sums), level, rows, columns, lit, np.uint32(bright).view(np.float32), limited)
+        exposure = float(limited[lit].sum()) / size
         still_lit = lit & (means > LIT * exposure)
         if (still_lit == lit).all():
             break
@@ -90,39 +125,119 @@ def measure_gain(picture: Array) -> float:
     ``measure_gain(a·x) = measure_gain(x) / a``. Denoisers leave tiny values on black, which are no light.
     """
     exposure = measure_exposure(picture)
-    return autoexposure(picture / np.float32(exposure), dark=LIT) / exposure
+    return autoexposure(picture, dark=LIT, exposure=exposure) / exposure
 
 
-def autoexposure(radiance: Array, *, dark: float = 1e-8) -> float:
+def autoexposure(radiance: Array, *, dark: float = 1e-8, exposure: float = 1.0) -> float:
     """Return OIDN's factor of an image; ``autoexposure(a·x) = autoexposure(x) / a``; 1 without light.
+
+    The radiance is divided by `exposure` first; bins of a luminance of at most `dark` are excluded.
 
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
     ``training/color.py``; `network.unet.autoexposure` is the same in torch.
     """
-    # float64: no sum overflows
-    means = _bin_means(np.maximum(radiance, 0) @ np.array([0.212671, 0.715160, 0.072169]))
+    rows, columns = (_edges(size) for size in radiance.shape[:2])
+    means = np.empty((len(rows) - 1, len(columns) - 1))
+    image = np.ascontiguousarray(radiance, np.float32)
+    run_bands(_bin_luminances, len(means), image, np.float32(exposure), rows, columns, means)
     lit = means[means > dark]
     return float(0.18 / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
 
 
-def _edges(length: int) -> NDArray[np.intp]:
+def _edges(length: int) -> Edges:
     """Limits of bins of at most 16 pixels."""
     bins = max(-(-length // 16), 1)
     return np.asarray(np.arange(bins + 1) * length // bins, np.intp)
 
 
-def _bin_means(level: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Means over bins of at most 16×16 pixels, without NaN; NaN for a bin without other values."""
-    known = np.isfinite(level)
-    sums, counts = np.where(known, level, 0).astype(np.float64), known.astype(np.float64)
-    for axis in (0, 1):
-        first = _edges(level.shape[axis])[:-1]
-        sums, counts = (np.add.reduceat(part, first, axis=axis) for part in (sums, counts))
-    return np.asarray(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0), np.float64)
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bin_levels(
+    first: int, last: int, image: Array, rows: Edges, columns: Edges, level: Array, sums: Sums, counts: Sums
+) -> None:
+    """Write the mean over channels, NaN where it is not finite; in each bin the sum and number of finite means."""
+    for row in range(first, last):
+        for y in range(rows[row], rows[row + 1]):
+            for column in range(sums.shape[1]):
+                total, count = np.float64(0), 0
+                for x in range(columns[column], columns[column + 1]):
+                    value = np.float32(0)
+                    for c in range(image.shape[2]):
+                        value += image[y, x, c]
+                    value /= np.float32(image.shape[2])
+                    finite = np.isfinite(value)
+                    level[y, x] = value if finite else np.float32(np.nan)
+                    total += value if finite else np.float32(0)
+                    count += finite
+                sums[row, column] += total
+                counts[row, column] += count
 
 
-def _spread(bins: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Repeat the value of each bin over its pixels."""
-    for axis in (0, 1):
-        bins = np.repeat(bins, np.diff(_edges(shape[axis])), axis=axis)
-    return bins
+@njit(nogil=True, cache=True)
+def _find_greatest(bits: NDArray[np.uint32], rows: Edges, columns: Edges, lit: NDArray[np.bool_], rank: int) -> int:
+    """Bits of the level of this rank, the greatest first, in the lit bins; NaN is left out."""
+    # Two digits of 16 bits each, in an order of integers that is that of floats.
+    prefix, left = np.uint32(0), rank
+    for digit in range(2):
+        counts = np.zeros(1 << 16, np.int64)
+        for row in range(lit.shape[0]):
+            for column in range(lit.shape[1]):
+                if not lit[row, column]:
+                    continue
+                for y in range(rows[row], rows[row + 1]):
+                    for x in range(columns[column], columns[column + 1]):
+                        value = bits[y, x]
+                        if value & np.uint32(0x7FFFFFFF) > np.uint32(0x7F800000):
+                            continue
+                        negative = value >> np.uint32(31)
+                        key = value ^ (np.uint32(0xFFFFFFFF) if negative else np.uint32(0x80000000))
+                        if digit == 0:
+                            counts[key >> np.uint32(16)] += 1
+                        elif key >> np.uint32(16) == prefix:
+                            counts[key & np.uint32(0xFFFF)] += 1
+        place = len(counts) - 1
+        while place > 0 and left >= counts[place]:
+            left -= counts[place]
+            place -= 1
+        prefix = np.uint32(prefix << np.uint32(16)) | np.uint32(place)
+    return int(prefix ^ (np.uint32(0x80000000) if prefix >> np.uint32(31) else np.uint32(0xFFFFFFFF)))
+
+
+@njit(nogil=True, cache=True)
+def _bin_limited(
+    first: int, last: int, level: Array, rows: Edges, columns: Edges, lit: NDArray[np.bool_], limit: np.float32,
+    sums: Sums,
+) -> None:  # fmt: skip
+    """Sum in each lit bin the levels, each up to the limit."""
+    for row in range(first, last):
+        for y in range(rows[row], rows[row + 1]):
+            for column in range(lit.shape[1]):
+                if lit[row, column]:
+                    total = np.float64(0)
+                    for x in range(columns[column], columns[column + 1]):
+                        value = level[y, x]
+                        total += min(value, limit) if value == value else np.float32(0)
+                    sums[row, column] += total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bin_luminances(
+    first: int, last: int, image: Array, exposure: np.float32, rows: Edges, columns: Edges, means: Sums
+) -> None:
+    """Mean luminance of each bin, without values that are not finite; NaN for a bin without others."""
+    zero = np.float32(0)
+    for row in range(first, last):
+        for column in range(means.shape[1]):
+            total, count = np.float64(0), 0
+            for y in range(rows[row], rows[row + 1]):
+                for x in range(columns[column], columns[column + 1]):
+                    # float64: no sum overflows
+                    red, green, blue = image[y, x, 0] / exposure, image[y, x, 1] / exposure, image[y, x, 2] / exposure
+                    # Written so that NaN remains.
+                    red, green, blue = (
+                        zero if red < zero else red, zero if green < zero else green, zero if blue < zero else blue
+                    )  # fmt: skip
+                    value = 0.212671 * red + 0.715160 * green + 0.072169 * blue
+                    if np.isfinite(value):
+                        total += value
+                        count += 1
+            means[row, column] = total / count if count else np.nan

@@ -103,3 +103,18 @@ def test_autoexposure_is_that_of_bins():
     assert autoexposure(64 * radiance) == pytest.approx(autoexposure(radiance) / 64, rel=1e-6)
     assert autoexposure(np.full((3, 3, 3), 3e38, np.float32)) > 0
     assert autoexposure(np.zeros((20, 20, 3), np.float32)) == 1
+
+
+def test_exposure_is_the_mean_of_the_lit_bins_up_to_their_brightest_hundredth():
+    rng = np.random.default_rng(3)
+    image = rng.gamma(0.5, 1, (40, 70, 3)).astype(np.float32)
+    image[:16] = 0  # whole bins without light
+    image[20, 20], image[30, 60] = np.nan, -1
+    level = (image[..., 0] + image[..., 1] + image[..., 2]) / np.float32(3)
+    # Bins of 40 rows in three are 13, 13 and 14 high: those of the first are black, those of the second partly.
+    lit = level[13:]
+    lit = np.sort(lit[np.isfinite(lit)])
+    bright = lit[-1 - lit.size // 100]
+    expected = float(np.minimum(lit, bright).mean(dtype=np.float64))
+    assert measure_exposure(image) == pytest.approx(expected, rel=1e-12)
+    assert measure_exposure(-np.abs(image)) == 1
