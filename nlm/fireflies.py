@@ -14,6 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from loops.parallel import run_bands
+from nlm.average import channel_mean
+
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Places = NDArray[np.intp]
@@ -74,7 +77,9 @@ def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
     """
     if color.ndim != 3:
         raise ValueError(f"color: expected (height, width, channels), got {color.shape}")
-    found = _find(_level(color), OVER_BRIGHTEST, OVER_MEAN)
+    level = channel_mean(color)
+    found = np.zeros(level.shape, np.uint8)
+    run_bands(_find, len(level), level, OVER_BRIGHTEST, OVER_MEAN, found)
     places = np.argwhere(found)
     return places, found[places[:, 0], places[:, 1]] == _ISOLATED
 
@@ -130,13 +135,9 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
     At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
     frame has no pixel above an eighth within a pixel's distance.
     """
-    first, second = cv2.dilate(_level(color), np.ones((3, 3), np.uint8)), _level(other)
-    peak = first[lights.pixels[:, 0], lights.pixels[:, 1], None, None]
-    (rows, columns, inside), (y, x, seen) = (
-        _blocks(middle, color.shape, STRANGER_WINDOW) for middle in (lights.pixels, pixels)
-    )
-    strange = (second[y, x] > peak / 4) & (first[rows, columns] < peak / 8) & inside & seen
-    return np.asarray(strange.sum(axis=(1, 2)) <= STRANGERS)
+    count = np.zeros(len(pixels), np.intp)
+    run_bands(_count_strangers, len(count), lights.pixels, color, pixels, other, STRANGER_WINDOW // 2, count)
+    return np.asarray(count <= STRANGERS)
 
 
 def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
@@ -144,9 +145,9 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
     pixels.
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
-    brightest = cv2.dilate(_level(other), np.ones((SPREAD, SPREAD), np.uint8))
-    near = brightest[rows, columns]
-    return np.asarray(inside & (near >= RECURS * _level(color)[places[:, 0], places[:, 1]]))
+    near = np.empty(len(places), np.float32)
+    run_bands(_brightest_around, len(near), other, rows, columns, SPREAD // 2, near)
+    return np.asarray(inside & (near >= RECURS * channel_mean(color[places[:, 0], places[:, 1]][None])[0]))
 
 
 def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Points, Mask]]) -> Highlights:
@@ -215,12 +216,11 @@ def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, floa
     brightest of the ring.
     """
     cleaned, replaced = color.copy(), np.zeros(color.shape[:2], bool)
-    level = _level(color)
     for place in places:
         block, distance = _neighbourhood(place, 2, color.shape)
-        core = distance <= 1
+        core, level = distance <= 1, channel_mean(color[block])
         ring = ~core
-        bright = core & (level[block] > 4 * level[block][ring].max())
+        bright = core & (level > 4 * level[ring].max())
         cleaned[block][bright] = color[block][ring].mean(axis=0)
         replaced[block] |= bright
     before = float(color.sum(dtype=np.float64))
@@ -257,11 +257,6 @@ def _around(block: NDArray[np.float64], inside: Mask) -> NDArray[np.float64]:
     return np.asarray(np.einsum("kyxc,kyx->kc", block, ring) / np.maximum(ring.sum(axis=(1, 2)), 1)[:, None])
 
 
-def _level(color: Floats) -> Floats:
-    """Mean over channels."""
-    return np.ascontiguousarray(np.einsum("hwc->hw", color, dtype=np.float32) / np.float32(color.shape[-1]))
-
-
 def _significant(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zero the part of patterns (K, 3, 3) that is noise of the surroundings."""
     return np.where(pattern > DIM * pattern.max(axis=(1, 2), keepdims=True), pattern, 0)
@@ -272,12 +267,62 @@ def _same_phase(moved: Points) -> Mask:
     return np.asarray(np.abs(moved - nearest_pixel(moved)).max(axis=1) <= SAME_PHASE)
 
 
-@njit(cache=True)
-def _find(level, over_brightest, over_mean):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _level(color: Floats, y: int, x: int) -> np.float32:
+    """Mean over channels of a pixel, as `nlm.average.channel_mean`."""
+    total = np.float32(0)
+    for c in range(color.shape[2]):
+        total += color[y, x, c]
+    return np.float32(total / color.shape[2])
+
+
+@njit(cache=True, nogil=True)
+def _brightest_around(
+    first: int, last: int, color: Floats, rows: Places, columns: Places, reach: int, brightest: Floats
+) -> None:
+    """Write the brightest of the pixels within `reach` of each place."""
+    height, width = color.shape[:2]
+    for k in range(first, last):
+        most = np.float32(-np.inf)
+        for y in range(max(rows[k] - reach, 0), min(rows[k] + reach + 1, height)):
+            for x in range(max(columns[k] - reach, 0), min(columns[k] + reach + 1, width)):
+                most = max(most, _level(color, y, x))
+        brightest[k] = most
+
+
+@njit(cache=True, nogil=True)
+def _count_strangers(
+    first: int, last: int, middles: Places, color: Floats, pixels: Places, other: Floats, reach: int, count: Places
+) -> None:
+    """Count the bright pixels around each place of another frame that the frame lacks within a pixel's distance."""
+    height, width = color.shape[:2]
+    for k in range(first, last):
+        peak = np.float32(-np.inf)
+        for y in range(max(middles[k, 0] - 1, 0), min(middles[k, 0] + 2, height)):
+            for x in range(max(middles[k, 1] - 1, 0), min(middles[k, 1] + 2, width)):
+                peak = max(peak, _level(color, y, x))
+        for j in range(-reach, reach + 1):
+            for i in range(-reach, reach + 1):
+                here_y, here_x, y, x = middles[k, 0] + j, middles[k, 1] + i, pixels[k, 0] + j, pixels[k, 1] + i
+                inside = 0 <= here_y < height and 0 <= here_x < width
+                if not (inside and 0 <= y < height and 0 <= x < width):
+                    continue
+                if not _level(other, y, x) > peak / np.float32(4):
+                    continue
+                most = np.float32(-np.inf)
+                for near_y in range(max(here_y - 1, 0), min(here_y + 2, height)):
+                    for near_x in range(max(here_x - 1, 0), min(here_x + 2, width)):
+                        most = max(most, _level(color, near_y, near_x))
+                count[k] += most < peak / np.float32(8)
+
+
+@njit(cache=True, nogil=True)
+def _find(
+    first: int, last: int, level: Floats, over_brightest: float, over_mean: float, found: NDArray[np.uint8]
+) -> None:
     """Mark pixels as 0, `_PAIRED` or `_ISOLATED`."""
     height, width = level.shape
-    found = np.zeros((height, width), np.uint8)
-    for y in range(height):
+    for y in range(first, last):
         for x in range(width):
             value = level[y, x]
             # Skips nearly all pixels: a firefly exceeds the pixels two to its left and right, or one of these.
@@ -305,4 +350,3 @@ def _find(level, over_brightest, over_mean):  # type: ignore[no-untyped-def]
             rest = total - brightest
             if second > 0 and value > over_brightest * second and value * (count - 1) > over_mean * rest:
                 found[y, x] = _PAIRED
-    return found

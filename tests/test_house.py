@@ -101,7 +101,6 @@ def test_the_extension_for_blender_imports_blender_and_nothing_else():
 # Modules that are tested by others' files so far. None may join them.
 WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/alignment/fireflies.py",
-    "hybrid/alignment/measure.py",
     "hybrid/alignment/prepare.py",
     "hybrid/breakdown.py",
     "hybrid/commands/inspect.py",

@@ -93,10 +93,11 @@ def _find_highlights(
             lights = measure_highlights(there.irradiance, pixels, there.divisor)
             fresh = np.isfinite(lights.light).all(axis=1)
             for other, before in compared:
-                noise = equal_noise(other.irradiance, there.irradiance)
+                fresh &= not repeats(other.irradiance, there.irradiance)
                 unmoved = np.abs(moved[side] - before).max(axis=1) < MOVED_NOISE
-                fresh &= not repeats(*noise)
-                fresh &= ~(unmoved & same_noise_at(*noise, pixels))
+                if unmoved.any():
+                    noise = equal_noise(other.irradiance, there.irradiance)
+                    fresh = fresh & ~(unmoved & same_noise_at(*noise, pixels))
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))
             same = fresh & undecided & same_highlight(centre, moved[side], lights)

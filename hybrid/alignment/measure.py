@@ -16,7 +16,7 @@ from flow.tvl1 import rough_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import compress, measure_exposure, remodulate
-from nlm.average import reject_outliers
+from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
 
 Array = NDArray[np.float32]
@@ -43,6 +43,8 @@ FIXED_NOISE_ABOVE = 0.25
 REPEATED = 0.99
 # Side of the area in which noise is compared around a pixel; the whole frame if fewer than `FEW` pixels hold noise.
 NOISE_AROUND, FEW = 33, 32
+# Rows that are compared at a time, until it is certain that a frame does not repeat another.
+NOISE_ROWS = 64
 # A tile that differs from its smoothed version by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32
@@ -155,7 +157,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         fixed_noise=fixed_noise(here, there, moves=changed > 0),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=changed > CUT and _is_cut(here, there, smalls, vectors),
-        repeated=repeats(*equal_noise(here.irradiance, there.irradiance)),
+        repeated=repeats(here.irradiance, there.irradiance),
     )
 
 
@@ -201,7 +203,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
     block = _middle(here.irradiance.shape[:2])
-    a, b = (_level(frame.irradiance[block]) for frame in (here, there))
+    a, b = (channel_mean(frame.irradiance[block]) for frame in (here, there))
     level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
@@ -224,8 +226,8 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
         shares.append(int(compared.sum()))
         figures.append(float(np.mean(equal[compared])))
     if moved.sum() > CROP and forth is not None and back is not None:
-        d_a = a - _level(_warp_block(there.irradiance, forth[0], block))
-        d_b = b - _level(_warp_block(here.irradiance, back[0], block))
+        d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
+        d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
         figures.append(2 * _correlation(*d))
@@ -238,17 +240,25 @@ def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
     The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than the rounding of half floats, else
     0; the second is 1 where their values also agree to that rounding.
     """
-    a, b = _level(here), _level(there)
+    a, b = channel_mean(here), channel_mean(there)
     most = np.maximum(np.abs(a), np.abs(b))
     grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
     grainy = grain > 4 * SAME * most
     return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= SAME * most)).astype(np.float32)
 
 
-def repeats(grainy: Array, equal: Array) -> bool:
-    """Return whether a frame repeats another, by `equal_noise`; False if hardly any pixel has noise or detail."""
-    count = np.count_nonzero(grainy)
-    return bool(count >= FEW and np.count_nonzero(equal) >= REPEATED * count)
+def repeats(here: Array, there: Array) -> bool:
+    """Return whether a frame (H, W, 3) repeats another, by `equal_noise`; False if hardly any pixel has detail."""
+    height, size, grainy, equal = len(here), here.shape[0] * here.shape[1], 0, 0
+    for top in range(0, height, NOISE_ROWS):
+        # With the two rows on each side that a median of 5×5 pixels reads.
+        first, last = max(top - 2, 0), min(top + NOISE_ROWS, height)
+        found, same = equal_noise(here[first : last + 2], there[first : last + 2])
+        grainy += int(np.count_nonzero(found[top - first : last - first]))
+        equal += int(np.count_nonzero(same[top - first : last - first]))
+        if grainy - equal > (1 - REPEATED) * size:  # too many already, whatever follows
+            return False
+    return bool(grainy >= FEW and equal >= REPEATED * grainy)
 
 
 def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
@@ -289,8 +299,8 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
         inside &= vectors[1]
     inside &= _coverage(here, there)
     floor = np.float32(0.05 * measure_exposure(here.light))
-    level = 0.5 * (_level(here.light) + _level(light)) + floor
-    difference = np.where(inside, (_level(both[1]) - _level(both[0])) / level, np.float32(0))
+    level = 0.5 * (channel_mean(here.light) + channel_mean(light)) + floor
+    difference = np.where(inside, (channel_mean(both[1]) - channel_mean(both[0])) / level, np.float32(0))
     sums = np.stack([difference, np.square(difference), inside.astype(np.float32)], axis=-1)
     shares = [0.0]
     for side in {min(AREA, *shape), min(shape)} - {*range(8)}:  # fewer pixels give no estimate of the noise
@@ -310,7 +320,7 @@ def _coverage(here: SmallFrame, there: SmallFrame) -> Mask:
     change of light.
     """
     # Closed: noise leaves single pixels of lit surfaces black.
-    lit = ((frame.valid & (_level(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
+    lit = ((frame.valid & (channel_mean(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
     shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]
     if 2 * np.count_nonzero(shown[0]) > np.count_nonzero(shown[1]):
         return np.asarray(shown[0])
@@ -370,12 +380,6 @@ def _needed(places: Array, size: int) -> tuple[int, int]:
         return 0, 1
     first, last = np.clip([np.floor(finite.min()), np.ceil(finite.max()) + 1], 0, size - 1)
     return int(first), int(last) + 1
-
-
-def _level(image: Array) -> Array:
-    """The mean over channels."""
-    # einsum: several times faster than a mean over so short an axis
-    return np.asarray(np.einsum("hwc->hw", image) / np.float32(image.shape[-1]), np.float32)
 
 
 def _noise_free_share(small: SmallFrame) -> float:
