@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,10 @@ from hybrid.alignment.window import AlignedWindow, Trust, Window
 from hybrid.plan import Context, Plan
 from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
-from nlm.average import average
+from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
 from nlm.moving_lights import confirmed_by_neighbour, find_bright
+from nlm.parts import limit_change
 from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
@@ -50,6 +52,21 @@ class Denoised:
 DenoiseWindow = Callable[[AlignedWindow], Denoised]
 
 
+class Excess(NamedTuple):
+    """By how much a frame as rendered exceeds its picture.
+
+    Attributes
+    ----------
+    relative : (H, W) array
+        Relative to the picture plus the exposure.
+    bright : (H, W) bool array
+        The bright pixels of that (`nlm.moving_lights.find_bright`).
+    """
+
+    relative: Array
+    bright: NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class WindowResult:
     """A window denoised, with what the averaging of neighbouring results reads."""
@@ -63,8 +80,7 @@ class WindowResult:
     drift_weight: Array | None  # (H, W): as `AlignedWindow.drift_weight`
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
-    # (H, W): by how much the centre as rendered exceeds the denoised one, relative to the light; with "blend-samples"
-    excess: Array | None
+    excess: Excess | None  # of the centre; with "blend-samples"
     # as `AlignedWindow` has them, over all bands
     repaired: int
     fireflies: int
@@ -245,20 +261,17 @@ class FrameDenoiser:
         with self.stream.timings.stage("blend-samples"):
             excess = self._results[frame.number].excess
             assert excess is not None
-            bright = find_bright(excess)
-            if not (others and bright.any()):
+            if not (others and excess.bright.any()):
                 return denoised
-            seen = np.zeros_like(bright)
+            seen = np.zeros_like(excess.bright)
             for n in others:
                 other = self._results[n].excess
                 if other is None:
                     continue
                 flow = self.stream.flow(frame.number, n)
-                seen |= confirmed_by_neighbour(
-                    excess, bright, other, find_bright(other), None if flow is None else flow.vectors
-                )
-            if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(bright):
-                seen = bright
+                seen |= confirmed_by_neighbour(*excess, *other, None if flow is None else flow.vectors)
+            if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(excess.bright):
+                seen = excess.bright
             color = np.where(seen[..., None], frame.rendered, denoised.color)
         return _changed(denoised, color, CORRECTED)
 
@@ -291,10 +304,11 @@ class _Layers:
         return {name: layer for (other, name), layer in self._layers.items() if other == kind}
 
 
-def _excess(frame: PreparedFrame, picture: Array) -> Array:
-    """By how much a frame as rendered exceeds its picture, relative to the picture plus the exposure (H, W)."""
-    light = picture.mean(axis=-1) + np.float32(measure_exposure(picture))
-    return np.asarray((frame.rendered - picture).mean(axis=-1) / light * frame.valid, np.float32)
+def _excess(frame: PreparedFrame, picture: Array) -> Excess:
+    """By how much a frame as rendered exceeds its picture."""
+    light = channel_mean(picture) + np.float32(measure_exposure(picture))
+    relative = np.asarray(channel_mean(frame.rendered - picture) / light * frame.valid, np.float32)
+    return Excess(relative, find_bright(relative))
 
 
 def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array:
@@ -304,17 +318,15 @@ def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array
 
 def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
     """The picture with another color, and its parts, if any, changed alike: by a factor of `most` at most."""
-    own, factor = denoised.color, np.float32(most)
+    own = denoised.color
     if most > MOST and not denoised.parts:
         return replace(denoised, color=color)
-    bounded = np.clip(color, own / factor, own * factor)  # before the division, which may exceed float32
-    change = np.divide(bounded, own, out=np.ones_like(own), where=own > 0)
-    within = (own <= 0) | (bounded == color)
+    color, change = limit_change(own, color, most, with_factor=bool(denoised.parts))
     aovs, extra = (
         {name: layer * change if name in denoised.parts else layer for name, layer in layers.items()}
         for layers in (denoised.aovs, denoised.extra)
     )
-    return replace(denoised, color=np.where(within, color, own * change), aovs=aovs, extra=extra)
+    return replace(denoised, color=color, aovs=aovs, extra=extra)
 
 
 def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from loops.parallel import run_bands
 from nlm.guided import guided_filter
 from nlm.variance import second_differences
 
@@ -248,3 +250,41 @@ def _second_differences(layer: Floats) -> Floats:
     """[1 −2 1]ᵀ [1 −2 1] / 6, which has the variance of white noise (Immerkær 1996), without the outermost pixels."""
     found = np.asarray(second_differences(layer) / 6, np.float32)
     return found[1:-1, 1:-1] if min(layer.shape[:2]) > 2 else found
+
+
+def limit_change(own: Floats, color: Floats, most: float, *, with_factor: bool) -> tuple[Floats, Floats]:
+    """Change a picture to another color by a factor of `most` at most, and return the factor.
+
+    Parameters
+    ----------
+    own, color : (H, W, C) float32
+        The picture; where it is 0 or less the color is taken as it is.
+    most : float
+    with_factor : bool
+        Whether the factor is needed, by which the parts of the picture change; else it is empty.
+
+    Returns
+    -------
+    changed, factor : (H, W, C) float32
+    """
+    changed, factor = np.empty_like(own), np.empty(own.shape if with_factor else (0, 0, 0), np.float32)
+    run_bands(_limit_change, len(own), own, np.ascontiguousarray(color), np.float32(most), changed, factor)
+    return changed, factor
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _limit_change(
+    first: int, last: int, own: Floats, color: Floats, most: np.float32, changed: Floats, factor: Floats
+) -> None:
+    for y in range(first, last):
+        for x in range(own.shape[1]):
+            for c in range(own.shape[2]):
+                before, after, change = own[y, x, c], color[y, x, c], np.float32(1)
+                if before > 0:
+                    # Before the division, which may exceed float32.
+                    bounded = min(max(after, before / most), before * most)
+                    change = bounded / before
+                    after = after if bounded == after else before * change
+                changed[y, x, c] = after
+                if factor.size:
+                    factor[y, x, c] = change

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_window
-from nlm.variance import gaussian_mean, ratio, second_differences
+from nlm.average import channel_mean, check_window
+from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
+from nlm.variance import gaussian_mean, second_differences
 
 Floats = NDArray[np.float32]
 
@@ -76,16 +76,14 @@ def average_neighbours(
         Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
     modulation : (H, W, 3) float32, factor from the unit of the window to radiance
     """
-    weight = np.maximum(confidence, np.float32(_OTHER_LIGHT) * geometry)
-    estimates, weight = check_window(estimates, weight, "confidence")
+    estimates, confidence = check_window(estimates, confidence, "confidence")
     if residuals is not None and residuals.shape != estimates.shape:
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
-    mean, frames = np.zeros(estimates.shape[1:], np.float32), np.zeros(weight.shape[1:], np.float32)
+    shape = estimates.shape[1:]
+    mean = SampleMean(*(np.zeros(size, np.float32) for size in (shape, shape[:2], shape[:2])))
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
-    run_bands(_average, len(mean), *given, residuals is not None, weight, modulation, (mean, frames))
-    middle = len(weight) // 2
-    trust = np.minimum(np.maximum(confidence, geometry).sum(axis=0) - np.maximum(confidence, geometry)[middle], 1)
-    return SampleMean(mean, frames, np.where(frames > 0, trust, 0))
+    run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, mean)
+    return mean
 
 
 def blend_samples(
@@ -121,36 +119,34 @@ def blend_samples(
     """
     if not picture.shape == noisy.shape == neighbours.mean.shape:
         raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
+    picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     # Radiance per unit of relative error.
-    light = gaussian_mean(_gray(picture), 2.0) + np.float32(_DARK * exposure)
+    light = gaussian_mean(channel_mean(picture), 2.0) + np.float32(_DARK * exposure)
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
-    mean = neighbours.mean * _relative_light(noisy, neighbours, rate)[..., None]
-    sums = np.zeros((4, *light.shape), np.float32)
-    run_bands(_compare, len(light), picture, noisy, neighbours._replace(mean=mean), rate, sums)
+    factor, sums = _relative_light(noisy, neighbours, rate), np.zeros((4, *light.shape), np.float32)
+    run_bands(_compare, len(light), picture, noisy, neighbours, factor, rate, sums)
     together, squares, products, temporal = sums
     # Over as many pixels as a Gaussian averages, 1 / Σ weight².
     noise = gaussian_mean(products, _SIGMA_SHARED) / np.float32(4 * np.pi * _SIGMA_SHARED**2)
-    found = gaussian_mean(together, _SIGMA_SHARED) - np.float32(_DEVIATIONS) * np.sqrt(noise)
-    shared = np.clip(ratio(found, gaussian_mean(squares, _SIGMA_SHARED)), 0, 1) * neighbours.trust
-    blended = picture + shared[..., None] * (mean - picture)
+    means = gaussian_mean(together, _SIGMA_SHARED), gaussian_mean(squares, _SIGMA_SHARED), noise
+    blended = np.empty_like(picture)
+    run_bands(_blend_shared, len(light), picture, neighbours, factor, means, blended)
     if variance is None:
         alone = np.float32(_SPREAD) * spatial_variance(noisy, blended, rate)
     else:
         alone = np.asarray(variance.sum(axis=-1) * np.square(rate), np.float32)
-    alone = np.where(neighbours.trust >= 1, temporal, alone + neighbours.trust * (temporal - alone))
-    error = np.square(np.clip((noisy - blended) * rate[..., None], -_LIMIT, _LIMIT)).sum(axis=-1)
-    error, noise = (gaussian_mean(x, _SIGMA_CENTRE) for x in (error, np.minimum(alone, 3 * _LIMIT**2)))
-    share = np.clip(ratio(error - np.float32(_VARIANCES) * noise, error), 0, 1)
-    return np.asarray(blended + share[..., None] * (noisy - blended), np.float32)
+    error = np.empty_like(light)
+    run_bands(_compare_blended, len(light), blended, noisy, neighbours.trust, rate, temporal, error, alone)
+    error, alone = gaussian_mean(error, _SIGMA_CENTRE), gaussian_mean(alone, _SIGMA_CENTRE)
+    run_bands(_blend_centre, len(light), noisy, error, alone, blended)
+    return blended
 
 
 def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> Floats:
     """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel."""
-    weight = np.square(rate) * neighbours.trust
-    together, alone = (
-        gaussian_mean(np.einsum("yxc,yxc->yx", image, neighbours.mean) * weight, _SIGMA_SHARED)
-        for image in (noisy, neighbours.mean)
-    )
+    products = np.empty((2, *rate.shape), np.float32)
+    run_bands(_multiply, len(rate), noisy, neighbours, rate, products)
+    together, alone = (gaussian_mean(product, _SIGMA_SHARED) for product in products)
     return np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2)
 
 
@@ -160,8 +156,9 @@ def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
     The lesser of the high-pass energies of ``noisy`` and ``noisy − picture``: detail of the frame adds to the first,
     detail that the picture has lost or invented to the second (Immerkær, as `nlm.variance.variance_from_residual`).
     """
-    residuals = (second_differences(image) * rate[..., None] for image in (noisy, noisy - picture))
-    energies = (np.square(residual).sum(axis=-1) / np.float32(36) for residual in residuals)
+    energies = np.empty((2, *rate.shape), np.float32)
+    for image, energy in zip((noisy, noisy - picture), energies, strict=True):
+        run_bands(_energy, len(rate), second_differences(image), rate, energy)
     return np.minimum(*(gaussian_mean(energy, _SIGMA_SHARED) for energy in energies))
 
 
@@ -189,53 +186,126 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     those much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
     nothing around it. The means over σ = 48 pixels come first (k = 1, f = 3000), then those over 12 (8, 300).
     """
+    picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few in _MEANS:
-        level = np.maximum(_gray(picture), 0)
-        around = _mean(np.minimum(level, np.float32(_LAMP * exposure)), sigma)
-        light = level + np.float32(_SOFT) * around + np.float32(1e-3 * exposure)
-        weight = 1 / np.maximum(light, around)
-        lit = _mean(weight * light, sigma)
-        reach = _FAR * light[..., None]
-        difference = weight[..., None] * np.clip(noisy - picture, -reach, reach)
-        mean = np.dstack([_mean(difference[..., c], sigma) for c in range(3)])
-        square = np.square(difference).mean(axis=-1)
+        # Cells of σ / 6 pixels blur nothing that a Gaussian mean keeps.
+        side = max(int(sigma / _CELLS), 1)
+        rows, columns = (cell_axis(length, side) for length in picture.shape[:2])
+        sums = np.zeros((7, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
+        run_bands(_sum_levels, sums.shape[1], picture, np.float32(_LAMP * exposure), rows, columns, side, sums)
+        around = gaussian_mean(sums[0] / np.float32(side**2), sigma / side)[None]
+        dark = np.float32(1e-3 * exposure)
+        run_bands(_sum_differences, sums.shape[1], picture, noisy, around, dark, rows, columns, side, sums)
+        means = np.stack([around[0], *(gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:])])
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
-        pixels = np.float32(min(4 * np.pi * sigma**2, square.size))
-        noise, fourth = (_mean(power, sigma) for power in (square, np.square(square)))
-        unsure = np.float32(certain) * (1 + ratio(np.float32(few) * fourth, pixels * np.square(noise)))
-        known = np.square(mean).mean(axis=-1)
-        share = np.clip(ratio(known - unsure * noise / pixels, known), 0, 1)
-        picture = np.maximum(picture + mean * (share * light / lit)[..., None], np.minimum(picture, 0))
-    return np.asarray(picture, np.float32)
+        pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
+        restored = np.empty_like(picture)
+        limits = dark, pixels, np.float32(certain), np.float32(few)
+        run_bands(_restore, len(picture), picture, means, limits, rows, columns, restored)
+        picture = restored
+    return picture
 
 
-def _mean(image: Floats, sigma: float) -> Floats:
-    """Gaussian mean around each pixel, on cells of σ / 6 pixels, which blur nothing that the mean keeps."""
-    side, (height, width) = max(int(sigma / _CELLS), 1), image.shape
-    whole = cv2.copyMakeBorder(image, 0, -height % side, 0, -width % side, cv2.BORDER_REFLECT)
-    rows, columns = whole.shape[0] // side, whole.shape[1] // side
-    cells = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
-    mean = gaussian_mean(cells, sigma / side)
-    spread = cv2.resize(mean, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(spread[:height, :width], np.float32)
+@njit(cache=True, nogil=True, inline="always")
+def _level(image: Floats, y: int, x: int) -> np.float32:
+    """Mean over channels of a pixel, at least 0."""
+    total = np.float32(0)
+    for c in range(image.shape[2]):
+        total += image[y, x, c]
+    return max(total / np.float32(image.shape[2]), np.float32(0))
 
 
-def _gray(image: Floats) -> Floats:
-    return np.asarray(np.einsum("yxc->yx", image) / np.float32(image.shape[-1]), np.float32)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_levels(
+    first: int, last: int, picture: Floats, lamp: np.float32, rows: Axis, columns: Axis, side: int, sums: Floats
+) -> None:
+    """Sum over cells the level of a picture, up to `lamp`, into the first plane."""
+    for row in range(first, last):
+        for y in rows.pixels[row * side : (row + 1) * side]:
+            for column in range(sums.shape[2]):
+                total = np.float32(0)
+                for x in columns.pixels[column * side : (column + 1) * side]:
+                    total += min(_level(picture, y, x), lamp)
+                sums[0, row, column] += total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_differences(
+    first: int, last: int, picture: Floats, noisy: Floats, around: Floats, dark: np.float32, rows: Axis, columns: Axis,
+    side: int, sums: Floats,
+) -> None:  # fmt: skip
+    """Sum over cells: weight × light, differences of three channels, square, and square²; from the second plane on."""
+    blended = np.empty((1, around.shape[2]), np.float32)
+    for row in range(first, last):
+        for y in rows.pixels[row * side : (row + 1) * side]:
+            blend_rows(around, rows, y, blended)
+            for column in range(sums.shape[2]):
+                lit, square, fourth = np.float32(0), np.float32(0), np.float32(0)
+                red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+                for x in columns.pixels[column * side : (column + 1) * side]:
+                    level = blend_columns(blended, 0, columns, x)
+                    light = _level(picture, y, x) + np.float32(_SOFT) * level + dark
+                    weight = np.float32(1) / max(light, level)
+                    reach = _FAR * light
+                    r = weight * min(max(noisy[y, x, 0] - picture[y, x, 0], -reach), reach)
+                    g = weight * min(max(noisy[y, x, 1] - picture[y, x, 1], -reach), reach)
+                    b = weight * min(max(noisy[y, x, 2] - picture[y, x, 2], -reach), reach)
+                    power = (r * r + g * g + b * b) / np.float32(3)
+                    lit += weight * light
+                    red += r
+                    green += g
+                    blue += b
+                    square += power
+                    fourth += power * power
+                sums[1, row, column] += lit
+                sums[2, row, column] += red
+                sums[3, row, column] += green
+                sums[4, row, column] += blue
+                sums[5, row, column] += square
+                sums[6, row, column] += fourth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _restore(
+    first: int, last: int, picture: Floats, means: Floats, limits: tuple[np.float32, ...], rows: Axis, columns: Axis,
+    restored: Floats,
+) -> None:  # fmt: skip
+    """Add the known part of the mean differences to a picture."""
+    dark, pixels, certain, few = limits
+    zero, one = np.float32(0), np.float32(1)
+    blended = np.empty((means.shape[0], means.shape[2]), np.float32)
+    for y in range(first, last):
+        blend_rows(means, rows, y, blended)
+        for x in range(picture.shape[1]):
+            around, lit = blend_columns(blended, 0, columns, x), blend_columns(blended, 1, columns, x)
+            red, green = blend_columns(blended, 2, columns, x), blend_columns(blended, 3, columns, x)
+            blue, noise = blend_columns(blended, 4, columns, x), blend_columns(blended, 5, columns, x)
+            fourth = blend_columns(blended, 6, columns, x)
+            power = pixels * (noise * noise)
+            unsure = certain * (one + (few * fourth / power if power > zero else zero))
+            known = (red * red + green * green + blue * blue) / np.float32(3)
+            share = (known - unsure * noise / pixels) / known if known > zero else zero
+            light = _level(picture, y, x) + np.float32(_SOFT) * around + dark
+            factor = min(max(share, zero), one) * light / lit
+            restored[y, x, 0] = max(picture[y, x, 0] + red * factor, min(picture[y, x, 0], zero))
+            restored[y, x, 1] = max(picture[y, x, 1] + green * factor, min(picture[y, x, 1], zero))
+            restored[y, x, 2] = max(picture[y, x, 2] + blue * factor, min(picture[y, x, 2], zero))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(
-    first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, modulation: Floats,
-    out: tuple[Floats, Floats],
+    first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, geometry: Floats,
+    modulation: Floats, out: SampleMean,
 ) -> None:  # fmt: skip
-    mean, frames = out
+    mean, frames, trust = out
     T, _, W, C = estimates.shape
     for y in range(first, last):
         for x in range(W):
             total, squares = np.float64(0), np.float64(0)  # the square of a small confidence must not vanish
+            greatest = np.float32(0)
             for t in range(T):
-                weight = confidence[t, y, x]
+                weight = max(confidence[t, y, x], np.float32(_OTHER_LIGHT) * geometry[t, y, x])
+                greatest += max(confidence[t, y, x], geometry[t, y, x])
                 if t == T // 2 or not weight > 0:
                     continue
                 level = np.float32(0)
@@ -250,14 +320,42 @@ def _average(
                     mean[y, x, c] += weight * value * modulation[y, x, c]
             if total > 0:
                 frames[y, x] = total * total / squares
+                centre = max(confidence[T // 2, y, x], geometry[T // 2, y, x])
+                trust[y, x] = min(greatest - centre, np.float32(1))
                 for c in range(C):
                     mean[y, x, c] /= np.float32(total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _multiply(first: int, last: int, noisy: Floats, neighbours: SampleMean, rate: Floats, products: Floats) -> None:
+    """Write the products of a frame with its neighbours' mean, and of the mean with itself, relative to the light."""
+    for y in range(first, last):
+        for x in range(rate.shape[1]):
+            together, alone = np.float32(0), np.float32(0)
+            for c in range(noisy.shape[2]):
+                together += noisy[y, x, c] * neighbours.mean[y, x, c]
+                alone += neighbours.mean[y, x, c] * neighbours.mean[y, x, c]
+            weight = rate[y, x] * rate[y, x] * neighbours.trust[y, x]
+            products[0, y, x] = together * weight
+            products[1, y, x] = alone * weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _energy(first: int, last: int, residual: Floats, rate: Floats, energy: Floats) -> None:
+    """Write the squares of second differences, relative to the light, over the sum of their squared coefficients."""
+    for y in range(first, last):
+        for x in range(rate.shape[1]):
+            total = np.float32(0)
+            for c in range(residual.shape[2]):
+                total += (residual[y, x, c] * rate[y, x]) ** 2
+            energy[y, x] = total / np.float32(36)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
-    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, rate: Floats, sums: Floats
-) -> None:
+    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, rate: Floats,
+    sums: Floats,
+) -> None:  # fmt: skip
     """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
     _, W, C = picture.shape
     for y in range(first, last):
@@ -266,11 +364,60 @@ def _compare(
                 continue
             scale, product = rate[y, x], np.float32(0)
             for c in range(C):
-                n_p = min(max(scale * (noisy[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                m_p = min(max(scale * (neighbours.mean[y, x, c] - picture[y, x, c]), -_LIMIT), _LIMIT)
-                n_m = min(max(scale * (noisy[y, x, c] - neighbours.mean[y, x, c]), -_LIMIT), _LIMIT)
+                n, m, p = noisy[y, x, c], neighbours.mean[y, x, c] * factor[y, x], picture[y, x, c]
+                n_p = min(max(scale * (n - p), -_LIMIT), _LIMIT)
+                m_p = min(max(scale * (m - p), -_LIMIT), _LIMIT)
+                n_m = min(max(scale * (n - m), -_LIMIT), _LIMIT)
                 sums[0, y, x] += n_p * m_p
                 sums[1, y, x] += m_p * m_p
                 product += n_m * m_p
                 sums[3, y, x] += n_m * n_m / (1 + _WARPED / neighbours.frames[y, x])
             sums[2, y, x] = product * product
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend_shared(
+    first: int, last: int, picture: Floats, neighbours: SampleMean, factor: Floats,
+    means: tuple[Floats, Floats, Floats], blended: Floats,
+) -> None:  # fmt: skip
+    """Blend the neighbours' mean into a picture where both frames show the same difference."""
+    together, squares, noise = means
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(first, last):
+        for x in range(picture.shape[1]):
+            found = together[y, x] - np.float32(_DEVIATIONS) * np.sqrt(noise[y, x])
+            share = found / squares[y, x] if squares[y, x] > zero else zero
+            share = min(max(share, zero), one) * neighbours.trust[y, x]
+            for c in range(picture.shape[2]):
+                own = picture[y, x, c]
+                blended[y, x, c] = own + share * (neighbours.mean[y, x, c] * factor[y, x] - own)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compare_blended(
+    first: int, last: int, blended: Floats, noisy: Floats, trust: Floats, rate: Floats, temporal: Floats,
+    error: Floats, variance: Floats,
+) -> None:  # fmt: skip
+    """Write the squared difference from the samples, and their variance, which is spatial as far as none is trusted."""
+    for y in range(first, last):
+        for x in range(rate.shape[1]):
+            total = np.float32(0)
+            for c in range(blended.shape[2]):
+                difference = (noisy[y, x, c] - blended[y, x, c]) * rate[y, x]
+                total += min(max(difference, -_LIMIT), _LIMIT) ** 2
+            error[y, x] = total
+            mixed = variance[y, x] + trust[y, x] * (temporal[y, x] - variance[y, x])
+            mixed = temporal[y, x] if trust[y, x] >= np.float32(1) else mixed
+            variance[y, x] = min(mixed, np.float32(3) * _LIMIT * _LIMIT)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend_centre(first: int, last: int, noisy: Floats, error: Floats, noise: Floats, blended: Floats) -> None:
+    """Blend the samples into a picture, in place, where it differs from them by more than their noise."""
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(first, last):
+        for x in range(blended.shape[1]):
+            found = error[y, x] - np.float32(_VARIANCES) * noise[y, x]
+            share = min(max(found / error[y, x], zero), one) if error[y, x] > zero else zero
+            for c in range(blended.shape[2]):
+                blended[y, x, c] += share * (noisy[y, x, c] - blended[y, x, c])
