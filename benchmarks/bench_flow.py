@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
         "select_flow": lambda: select_flow([flow, start], guides),
         "dense_flow": lambda: dense_flow(guides),
         "estimate_confidence": lambda: estimate_confidence(
-            flow, inside=inside, reverse=-flow, albedo=albedo, warped_albedo=warped, normal=normal, warped_normal=normal
+            flow, inside=inside, reverse=-flow, albedo=albedo, other_albedo=albedo, normal=normal, other_normal=normal
         ),
         "mix_centre": lambda: mix_centre(warped, albedo, inside.astype(np.float32)),
     }

@@ -21,25 +21,27 @@ def estimate_confidence(
     inside: np.ndarray,
     reverse: np.ndarray | None = None,
     albedo: np.ndarray | None = None,
-    warped_albedo: np.ndarray | None = None,
+    other_albedo: np.ndarray | None = None,
     normal: np.ndarray | None = None,
-    warped_normal: np.ndarray | None = None,
+    other_normal: np.ndarray | None = None,
     first_row: int = 0,
 ) -> np.ndarray:
-    """Estimate how far each pixel of a warped neighbour shows the same as the centre.
+    """Estimate how far a neighbour shows the same as the centre at the end of each vector.
 
     Parameters
     ----------
     flow : (H, W, 2) float array, pixels, finite, centre to neighbour
     inside : (H, W) bool array
-        From `flow.warp.warp`; False also where the vector, or a pixel it leads to, is invalid.
+        From `find_coverage`.
     reverse : (H, W, 2) float array, optional
-        Pixels, neighbour to centre; always of the whole frame, also where the other arrays are a part of its rows.
-    albedo, warped_albedo : (H, W) or (H, W, C) float array, optional
-        Of the centre and the warped neighbour, both or none; likewise the normals.
-    normal, warped_normal : (H, W, 3) float array, optional
+        Pixels, neighbour to centre.
+    albedo, other_albedo : (H, W, C) float array, optional
+        Of the centre and the neighbour, both or none; likewise the normals.
+    normal, other_normal : (H, W, 3) float array, optional
         In any one space, of any length, 0 where there is no surface.
-    first_row : int, the frame's row that the first row of `flow` belongs to
+    first_row : int
+        The frame's row that the first row of `flow` belongs to, where the arrays of the centre are some of its rows;
+        those of the neighbour are always of the whole frame.
 
     Returns
     -------
@@ -60,12 +62,17 @@ def estimate_confidence(
     shape = flow.shape[:2]
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")
-    pairs = {"albedo": (albedo, warped_albedo), "normal": (normal, warped_normal)}
-    for name, (centre, warped) in pairs.items():
-        if (centre is None) != (warped is None):
-            raise ValueError(f"{name} and warped_{name} come together, got only one of them")
-        if centre is not None and warped is not None and (centre.shape != warped.shape or centre.shape[:2] != shape):
-            raise ValueError(f"{name} has shape {centre.shape}, warped_{name} {warped.shape}, expected both {shape}")
+    pairs = {"albedo": (albedo, other_albedo), "normal": (normal, other_normal)}
+    for name, (centre, other) in pairs.items():
+        if (centre is None) != (other is None):
+            raise ValueError(f"{name} and other_{name} come together, got only one of them")
+        if centre is not None and other is not None:
+            if centre.shape[:2] != shape or centre.shape[1:] != other.shape[1:]:
+                raise ValueError(
+                    f"{name} has shape {centre.shape}, other_{name} {other.shape}, expected that of {shape}"
+                )
+            if not first_row + shape[0] <= len(other):
+                raise ValueError(f"other_{name} has {len(other)} rows, expected at least {first_row + shape[0]}")
     if inside.shape != shape:
         raise ValueError(f"inside has shape {inside.shape}, expected {shape}")
 
@@ -73,10 +80,66 @@ def estimate_confidence(
     absent = np.empty((0, 0, 0), np.float32)
     layers = [
         tuple(absent if x is None else np.ascontiguousarray(x, np.float32).reshape(*x.shape[:2], -1) for x in pair)
-        for pair in ((flow, reverse), (albedo, warped_albedo), (normal, warped_normal))
+        for pair in ((flow, reverse), (albedo, other_albedo), (normal, other_normal))
     ]
     run_bands(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
     return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
+
+
+def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, first_row: int = 0) -> np.ndarray:
+    """Find where valid vectors end in the frame, at pixels that have all been measured: (H, W) bool.
+
+    Parameters
+    ----------
+    flow, valid : (h, W, 2) float32 and (h, W) bool array
+        From some rows of the centre to a neighbour, pixels.
+    measured : (H, W) bool array
+        Of the whole neighbour.
+    first_row : int
+        The first of these rows.
+    """
+    covered = np.empty(valid.shape, np.bool_)
+    given = (np.ascontiguousarray(layer) for layer in (flow, valid, measured))
+    run_bands(_cover, len(covered), *given, first_row, covered)
+    return covered
+
+
+def fill_uncovered(warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray) -> None:
+    """Write the centre's pixels, in place, into a warped picture where its coverage is 0.
+
+    Parameters
+    ----------
+    warped, centre : (H, W, C) float32 array
+    coverage : (H, W) float32 array
+    """
+    run_bands(_fill, len(warped), warped, np.ascontiguousarray(centre), coverage)
+
+
+@njit(nogil=True, cache=True)
+def _cover(
+    first: int, last: int, flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, first_row: int, out: np.ndarray
+) -> None:
+    height, width = measured.shape
+    for y in range(first, last):
+        for x in range(width):
+            place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
+            x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
+            weights, share = weigh(place), np.float32(0)
+            share += weights[0] if measured[y0, x0] else np.float32(0)
+            share += weights[1] if measured[y0, x1] else np.float32(0)
+            share += weights[2] if measured[y1, x0] else np.float32(0)
+            share += weights[3] if measured[y1, x1] else np.float32(0)
+            # A pixel of which less than all is finite color is not measured.
+            out[y, x] = valid[y, x] and place.inside and share > np.float32(0.999)
+
+
+@njit(nogil=True, cache=True)
+def _fill(first: int, last: int, warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray) -> None:
+    for y in range(first, last):
+        for x in range(coverage.shape[1]):
+            if coverage[y, x] == 0:
+                for c in range(warped.shape[2]):
+                    warped[y, x, c] = centre[y, x, c]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -86,19 +149,20 @@ def _agree(
 ) -> None:  # fmt: skip
     """Multiply the agreement of motion, albedo and normal; layers of size 0 are left out."""
     flow, reverse = flows
-    albedo, warped_albedo = albedos
-    normal, warped_normal = normals
+    albedo, other_albedo = albedos
+    normal, other_normal = normals
     one = np.float32(1)
+    # All layers of the neighbour have its size, or none.
+    height = max(len(reverse), len(other_albedo), len(other_normal), 1)
     for y in range(first, last):
         for x in range(out.shape[1]):
             out[y, x] = 0
             if not inside[y, x]:
                 continue
             u, v = flow[y, x, 0], flow[y, x, 1]
+            place = locate(np.float32(x) + u, np.float32(first_row + y) + v, out.shape[1], height)
+            weights = weigh(place)
             if reverse.size:
-                height, width = reverse.shape[:2]
-                place = locate(np.float32(x) + u, np.float32(first_row + y) + v, width, height)
-                weights = weigh(place)
                 # Sundaram's test: there and back ends near the start.
                 du, dv = interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
                 error = np.sqrt(du * du + dv * dv)
@@ -111,24 +175,24 @@ def _agree(
             if albedo.size:
                 difference, greatest = np.float32(0), one
                 for c in range(albedo.shape[2]):
-                    a, b = albedo[y, x, c], warped_albedo[y, x, c]
+                    a, b = albedo[y, x, c], interpolate(other_albedo, c, place, weights)
                     difference += (a - b) ** 2
                     greatest = max(greatest, max(a, b))
                 # Relative where the albedo is above 1 (emitters, sky).
                 weight *= np.exp(-difference / (greatest * greatest * np.float32(_ALBEDO_SIGMA**2)))
             if normal.size:
-                square, warped_square, product = np.float32(0), np.float32(0), np.float32(0)
+                square, other_square, product = np.float32(0), np.float32(0), np.float32(0)
                 for c in range(normal.shape[2]):
-                    a, b = normal[y, x, c], warped_normal[y, x, c]
+                    a, b = normal[y, x, c], interpolate(other_normal, c, place, weights)
                     square += a * a
-                    warped_square += b * b
+                    other_square += b * b
                     product += a * b
                 # Below a tenth of the samples on a surface, the direction is that of a stray sample.
-                surface, warped_surface = square > np.float32(0.01), warped_square > np.float32(0.01)
-                if surface and warped_surface:
-                    cosine = product / np.sqrt(max(square * warped_square, np.float32(1e-4)))
+                surface, other_surface = square > np.float32(0.01), other_square > np.float32(0.01)
+                if surface and other_surface:
+                    cosine = product / np.sqrt(max(square * other_square, np.float32(1e-4)))
                     weight *= min(max((cosine - np.float32(0.8)) / np.float32(0.2), np.float32(0)), one)
-                elif surface != warped_surface:
+                elif surface != other_surface:
                     continue
             if weight > 0:  # not where a guide is not finite
                 out[y, x] = weight

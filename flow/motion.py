@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import warp
+from flow.warp import interpolate, locate, warp, weigh
+from loops.parallel import run_bands
 
 # Longer than any frame is wide: renderers write 1e9, 1e10 or similar where they know no motion.
 ABSURD_LENGTH = 1e4
@@ -201,13 +202,31 @@ def compose_flow(
     """
     if first.shape != second.shape:
         raise ValueError(f"first has shape {first.shape}, expected that of second, {second.shape}")
-    known = np.ones(first.shape[:2], bool) if second_valid is None else second_valid
-    sampled, inside = warp(np.dstack([second, ~known]), first)
-    # The last channel is the share of invalid vectors in the bilinear mix: any at all is too much.
-    valid = inside & (sampled[..., 2] == 0)
-    if first_valid is not None:
-        valid &= first_valid
-    return np.asarray(first, np.float32) + sampled[..., :2], valid
+    shape = first.shape[:2]
+    masks = [np.ones(shape, np.bool_) if mask is None else mask for mask in (first_valid, second_valid)]
+    flow, valid = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
+    vectors = [np.ascontiguousarray(part, np.float32) for part in (first, second)]
+    run_bands(_compose, shape[0], *vectors, *(np.ascontiguousarray(mask) for mask in masks), flow, valid)
+    return flow, valid
+
+
+@njit(nogil=True, cache=True)
+def _compose(
+    begin: int, end: int, first: np.ndarray, second: np.ndarray, first_valid: np.ndarray, second_valid: np.ndarray,
+    flow: np.ndarray, valid: np.ndarray,
+) -> None:  # fmt: skip
+    height, width = valid.shape
+    for y in range(begin, end):
+        for x in range(width):
+            u, v = first[y, x, 0], first[y, x, 1]
+            place = locate(np.float32(x) + u, np.float32(y) + v, width, height)
+            weights = weigh(place)
+            flow[y, x, 0] = u + interpolate(second, 0, place, weights)
+            flow[y, x, 1] = v + interpolate(second, 1, place, weights)
+            x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
+            # Any invalid vector in the bilinear mix is too much.
+            known = second_valid[y0, x0] and second_valid[y0, x1] and second_valid[y1, x0] and second_valid[y1, x1]
+            valid[y, x] = place.inside and known and first_valid[y, x]
 
 
 @njit(nogil=True, cache=True)

@@ -88,19 +88,21 @@ def _compare(
     first: int, last: int, image: Floats, centre: Floats, exposure: np.float32, difference: Floats, both: Mask
 ) -> None:
     """Write image − centre, each as x / (x + exposure), and where both are finite; elsewhere the difference is 0."""
+    zero, one = np.float32(0), np.float32(1)
     for y in range(first, last):
+        values, others, flat = image[y].reshape(-1), centre[y].reshape(-1), difference[y].reshape(-1)
+        for i in range(len(flat)):
+            # exposure / (x + exposure) and not x / …: it cannot overflow
+            here = one - exposure / (max(values[i], zero) + exposure)
+            there = one - exposure / (max(others[i], zero) + exposure)
+            flat[i] = here - there
         for x in range(image.shape[1]):
             finite = True
             for c in range(image.shape[2]):
                 finite = finite and np.isfinite(image[y, x, c]) and np.isfinite(centre[y, x, c])
             both[y, x] = finite
-            for c in range(image.shape[2]):
-                difference[y, x, c] = 0
-                if finite:
-                    # exposure / (x + exposure) and not x / …: it cannot overflow
-                    here = np.float32(1) - exposure / (max(image[y, x, c], np.float32(0)) + exposure)
-                    there = np.float32(1) - exposure / (max(centre[y, x, c], np.float32(0)) + exposure)
-                    difference[y, x, c] = here - there
+            if not finite:
+                difference[y, x] = 0
 
 
 def _mean_square(x: Floats) -> Floats:

@@ -117,16 +117,18 @@ def _pool(
 @njit(cache=True, nogil=True)
 def _range(first: int, last: int, estimates: Floats, residuals: Floats, low: Floats, high: Floats) -> None:
     """Write the least and the greatest finite value of the estimates and the samples of all frames."""
-    T, _, W, C = estimates.shape
+    infinite = np.float32(np.inf)
     for y in range(first, last):
-        for x in range(W):
-            for c in range(C):
-                least, most = np.float32(np.inf), np.float32(-np.inf)
-                for t in range(T):
-                    estimate = estimates[t, y, x, c]
-                    sample = estimate + residuals[t, y, x, c]
-                    if np.isfinite(estimate):
-                        least, most = min(least, estimate), max(most, estimate)
-                    if np.isfinite(sample):
-                        least, most = min(least, sample), max(most, sample)
-                low[y, x, c], high[y, x, c] = least, most
+        least, most = low[y].reshape(-1), high[y].reshape(-1)
+        least[:], most[:] = infinite, -infinite
+        for t in range(len(estimates)):
+            estimate, residual = estimates[t, y].reshape(-1), residuals[t, y].reshape(-1)
+            # Choices and no branches, so that several values are computed at once.
+            for i in range(len(least)):
+                value = estimate[i]
+                sample = value + residual[i]
+                finite, whole = abs(value) < infinite, abs(sample) < infinite
+                least[i] = value if finite and value < least[i] else least[i]
+                most[i] = value if finite and value > most[i] else most[i]
+                least[i] = sample if whole and sample < least[i] else least[i]
+                most[i] = sample if whole and sample > most[i] else most[i]

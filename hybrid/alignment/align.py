@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.confidence import fill_uncovered
 from flow.warp import warp
 from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
-from hybrid.alignment.transfer import remodulate
+from hybrid.alignment.transfer import demodulate, remodulate
 from hybrid.alignment.window import AlignedWindow, Trust, WarpSources, Window, clean_guide
 from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
@@ -197,7 +198,7 @@ def align_results(
     results = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("stabilize"):
         divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
-        light = results if divisor is None else results / remodulate(np.ones_like(noisy), divisor)
+        light = results if divisor is None else demodulate(results, divisor)
         # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
         # bundled shot with its chrome that is worth 0.4 dB.
         gates = color_gates(light, noisy, exposure, FINISHED)
@@ -256,7 +257,6 @@ def _warp_neighbours(
     centre, count = window.centre, len(window.frames)
     shape = count, rows.stop - rows.start, centre.irradiance.shape[1]
     kept = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n not in guides}
-    passing = {name: np.empty(layers[name].shape, np.float32) for name in guides}
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     trusts: list[Trust | None] = [None] * count
     for index, (there, link) in enumerate(zip(window.frames, window.links, strict=True)):
@@ -268,12 +268,9 @@ def _warp_neighbours(
                 confidence[index] = coverage[index] = centre.valid[rows]
             continue
         with timings.stage("warp"):
-            flow = link.forward.vectors[rows]
-            warped = {name: layer[index] for name, layer in kept.items()} | passing
-            covered = link.forward.valid[rows] & warp_layers(there, flow, rows, warped)
-            geometry = trust_geometry(layers, warped, flow, covered, link.backward.vectors, rows.start)
-            trusts[index] = Trust(covered, geometry)
-            _set_trust(confidence, coverage, window, index, Trust(covered, geometry), rows)
+            warp_layers(there, link.forward.vectors[rows], rows, {name: layer[index] for name, layer in kept.items()})
+            trust = trusts[index] = trust_geometry(layers, there, link, rows)
+            _set_trust(confidence, coverage, window, index, trust, rows)
     return _Warped(kept, confidence, coverage, tuple(trusts))
 
 
@@ -312,7 +309,7 @@ def _warp_first_pass(
                 warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
             else:
                 warped[index] = there[rows]
-            np.copyto(warped[index], middle[rows], where=coverage[index, ..., None] == 0)
+            fill_uncovered(warped[index], middle[rows], coverage[index])
     return warped
 
 

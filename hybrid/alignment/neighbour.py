@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from flow.confidence import estimate_confidence
+from flow.confidence import estimate_confidence, find_coverage
 from flow.warp import warp
+from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
+from hybrid.alignment.window import Trust
+from loops.parallel import run_bands
 
 Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # The confidence that geometry leaves at least to denoised frames of one color: outlines, whose albedo and normals
 # are mixed anew in each frame, flicker most. Worth 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB
@@ -39,49 +42,35 @@ def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False)
     return {name: layer for name, layer in named.items() if layer is not None}
 
 
-def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> Mask:
-    """Warp a neighbour's layers to some rows of the centre, into `warped`; return where (h, W) the color was measured.
+def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> None:
+    """Warp a neighbour's layers to some rows of the centre, into `warped`.
 
     The flow (h, W, 2) leads from these rows to the neighbour; names are those of `layers_of`.
     """
     layers = layers_of(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
-    if not flow.any():
-        for name, out in warped.items():
-            out[...] = layers[name][rows]
-        return there.valid[rows]
-    inside = None
+    moves = bool(warped) and flow.any()
     for name, out in warped.items():
-        _, inside = warp(layers[name], flow, first_row=rows.start, out=out)
-    if inside is not None and there.valid.all():
-        return inside
-    # The share of finite color in each warped pixel: a pixel with less than all of it is not measured.
-    share, inside = warp(there.valid.astype(np.float32), flow, first_row=rows.start)
-    return np.asarray(inside & (share > 0.999))
+        if moves:
+            warp(layers[name], flow, first_row=rows.start, out=out)
+        else:
+            out[...] = layers[name][rows]
 
 
-def trust_geometry(
-    centre: dict[str, Array],
-    warped: dict[str, Array],
-    flow: Array,
-    measured: Mask,
-    back: Array,
-    first_row: int,
-) -> Array:
-    """Measure the confidence (h, W), in [0, 1], of geometry in a warped neighbour.
-
-    The flow (h, W, 2) leads from rows of the centre, of which `first_row` is the first, to the neighbour; `back` (H, W,
-    2) from the neighbour to the centre. `measured` is the result of `warp_layers`.
-    """
-    return estimate_confidence(
+def trust_geometry(centre: dict[str, Array], there: PreparedFrame, link: Link, rows: slice) -> Trust:
+    """Measure how far geometry trusts a neighbour at some rows of the centre, whose layers are `centre`."""
+    flow = link.forward.vectors[rows]
+    covered = find_coverage(flow, link.forward.valid[rows], there.valid, rows.start)
+    confidence = estimate_confidence(
         flow,
-        inside=measured,
-        reverse=back if flow.any() or back.any() else None,
+        inside=covered,
+        reverse=link.backward.vectors,
         albedo=centre.get("albedo"),
-        warped_albedo=warped.get("albedo"),
+        other_albedo=there.albedo,
         normal=centre.get("normal"),
-        warped_normal=warped.get("normal"),
-        first_row=first_row,
+        other_normal=there.normal,
+        first_row=rows.start,
     )
+    return Trust(covered, confidence)
 
 
 def novelty_of(flow: Array) -> Array:
@@ -103,5 +92,23 @@ def trust_light(
     Coverage is an upper bound of the confidence; `agreeing` is the confidence that geometry leaves at least where the
     light agrees. Without the stage "gate" the confidence of geometry stands.
     """
-    floor = np.minimum(coverage, agreeing) * gate
-    return np.maximum(confidence * gate if "gate" in stages else confidence, floor) * (coverage > 0)
+    trust = np.empty_like(confidence)
+    given = confidence, coverage, np.ascontiguousarray(gate), np.float32(agreeing), "gate" in stages
+    run_bands(_combine, trust.shape[1], *given, trust)
+    return trust
+
+
+@njit(cache=True, nogil=True)
+def _combine(
+    first: int, last: int, confidence: Array, coverage: Array, gate: Array, agreeing: np.float32, gated: bool,
+    trust: Array,
+) -> None:  # fmt: skip
+    zero, one = np.float32(0), np.float32(1)
+    for t in range(len(trust)):
+        for y in range(first, last):
+            for x in range(trust.shape[2]):
+                weight = gate[t, y, x]
+                floor = min(coverage[t, y, x], agreeing) * weight
+                # A factor and no condition, so that several pixels are computed at once.
+                shown = one if coverage[t, y, x] > zero else zero
+                trust[t, y, x] = max(confidence[t, y, x] * (weight if gated else one), floor) * shown

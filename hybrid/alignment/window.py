@@ -14,7 +14,7 @@ from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import PreparedFrame
-from hybrid.alignment.transfer import demodulate
+from hybrid.alignment.residual import warp_residual
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
@@ -92,11 +92,7 @@ class WarpSources:
                 out[:] = 0
                 continue
             divisor = frame.albedo if frame.demodulated else None
-            left = frame.irradiance - (denoised if divisor is None else demodulate(denoised, divisor))
-            if flow is None or not flow.any():
-                out[:] = left[self.rows]
-            else:
-                warp(left, flow, interpolation="nearest", first_row=self.rows.start, out=out)
+            warp_residual(frame.irradiance, denoised, divisor, flow, self.rows.start, out)
         return residuals
 
 

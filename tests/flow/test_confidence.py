@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flow.confidence import estimate_confidence, mix_centre
+from flow.confidence import estimate_confidence, find_coverage, mix_centre
 from flow.warp import warp
 
 SHAPE = (16, 20)
@@ -22,7 +22,7 @@ def test_a_still_frame_is_trusted_everywhere() -> None:
     albedo = rng.random((*SHAPE, 3), np.float32)
     normal = rng.normal(size=(*SHAPE, 3)).astype(np.float32)
     confidence = estimate_confidence(
-        STILL, inside=INSIDE, reverse=STILL, albedo=albedo, warped_albedo=albedo, normal=normal, warped_normal=normal
+        STILL, inside=INSIDE, reverse=STILL, albedo=albedo, other_albedo=albedo, normal=normal, other_normal=normal
     )  # fmt: skip
     # The cosine of a vector with itself, in float32.
     np.testing.assert_allclose(confidence, 1, atol=1e-5)
@@ -61,7 +61,7 @@ def test_an_occlusion_fails_forward_and_backward() -> None:
 
 def test_albedo_falls_off_as_a_gaussian_relative_above_one() -> None:
     def agreement(a: float, b: float) -> float:
-        result = estimate_confidence(STILL, inside=INSIDE, albedo=constant(a, a, a), warped_albedo=constant(b, b, b))
+        result = estimate_confidence(STILL, inside=INSIDE, albedo=constant(a, a, a), other_albedo=constant(b, b, b))
         return float(result[3, 3])
 
     # exp(-3 · 0.05² / 0.1²); float32.
@@ -74,7 +74,7 @@ def test_albedo_falls_off_as_a_gaussian_relative_above_one() -> None:
 
 def test_normals_of_any_length_and_of_no_surface() -> None:
     def agreement(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
-        result = estimate_confidence(STILL, inside=INSIDE, normal=constant(*a), warped_normal=constant(*b))
+        result = estimate_confidence(STILL, inside=INSIDE, normal=constant(*a), other_normal=constant(*b))
         return float(result[3, 3])
 
     tilt = float(np.arccos(0.9))
@@ -90,7 +90,7 @@ def test_guides_that_are_not_finite_give_zero() -> None:
     albedo = constant(0.5, 0.5, 0.5)
     bad = albedo.copy()
     bad[3, 3], bad[10, 10] = np.nan, np.inf
-    confidence = estimate_confidence(STILL, inside=INSIDE, albedo=albedo, warped_albedo=bad)
+    confidence = estimate_confidence(STILL, inside=INSIDE, albedo=albedo, other_albedo=bad)
     assert np.isfinite(confidence).all()
     assert not confidence[2:5, 2:5].any()
     assert not confidence[9:12, 9:12].any()
@@ -98,7 +98,7 @@ def test_guides_that_are_not_finite_give_zero() -> None:
 
 
 def test_errors_name_the_argument() -> None:
-    with pytest.raises(ValueError, match="albedo and warped_albedo come together"):
+    with pytest.raises(ValueError, match="albedo and other_albedo come together"):
         estimate_confidence(STILL, inside=INSIDE, albedo=constant(1, 1, 1))
     with pytest.raises(ValueError, match="inside has shape"):
         estimate_confidence(STILL, inside=INSIDE[:3])
@@ -115,3 +115,28 @@ def test_mixing_is_linear_and_untrusted_pixels_cannot_spoil_it() -> None:
     mixed = mix_centre(warped, constant(2)[..., 0], confidence)
     assert mixed[0, 0] == 2
     assert np.isfinite(mixed).all()
+
+
+def test_guides_of_the_neighbour_are_sampled_along_the_flow() -> None:
+    rng = np.random.default_rng(1)
+    albedo, normal = rng.random((2, *SHAPE, 3), np.float32)
+    flow = np.broadcast_to(np.float32([2.25, -1.5]), (*SHAPE, 2)).copy()
+    rows = slice(4, 12)
+    moved = {name: warp(layer, flow)[0] for name, layer in (("albedo", albedo), ("normal", normal))}
+    given = {"inside": INSIDE[rows], "first_row": rows.start, "other_albedo": albedo, "other_normal": normal}
+    own = {name: layer[rows] for name, layer in moved.items()}
+    np.testing.assert_allclose(estimate_confidence(flow[rows], **given, **own), 1, atol=1e-5)
+    assert estimate_confidence(STILL[rows], **given, **own).mean() < 0.1
+    with pytest.raises(ValueError, match="other_albedo has 16 rows"):
+        estimate_confidence(flow[rows], inside=INSIDE[rows], albedo=albedo[rows], other_albedo=albedo, first_row=9)
+
+
+def test_coverage_needs_a_valid_vector_into_the_frame_and_four_measured_pixels() -> None:
+    flow = np.broadcast_to(np.float32([0.5, 0]), (*SHAPE, 2)).copy()
+    valid, measured = INSIDE.copy(), INSIDE.copy()
+    valid[2, 3], measured[9, 9] = False, False
+    flow[14, 5] = 100, 0
+    rows = slice(1, 16)
+    expected = INSIDE.copy()
+    expected[2, 3] = expected[9, 8] = expected[9, 9] = expected[14, 5] = False
+    np.testing.assert_array_equal(find_coverage(flow[rows], valid[rows], measured, rows.start), expected[rows])

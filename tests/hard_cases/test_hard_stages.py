@@ -143,8 +143,8 @@ def test_confidence_is_between_nought_and_one(drawn):
     shape = guide.shape[:2]
     other = np.roll(guide, 1, axis=1)
     confidence = estimate_confidence(
-        flows(rng, shape), inside=rng.random(shape) < 0.9, reverse=flows(rng, shape), albedo=guide, warped_albedo=other,
-        normal=other, warped_normal=guide,
+        flows(rng, shape), inside=rng.random(shape) < 0.9, reverse=flows(rng, shape), albedo=guide, other_albedo=other,
+        normal=other, other_normal=guide,
     )  # fmt: skip
     assert ((confidence >= 0) & (confidence <= 1)).all()
     # Whatever is not finite is not trusted, nor are its neighbours; nor does it spread further.

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
+from flow.confidence import find_coverage
 from hybrid.alignment.neighbour import AGREEING, layers_of, novelty_of, trust_light, warp_layers
 from hybrid.alignment.prepare import prepare
 from hybrid.files.shots import open_shot
@@ -28,7 +27,8 @@ def test_layers_are_moved_and_what_was_not_measured_is_not_shown(frame, step):
     valid[20, 30] = False
     flow = np.full((25, frame.valid.shape[1], 2), (step, 0), np.float32)
     warped = {name: np.empty((25, *layer.shape[1:]), np.float32) for name, layer in layers_of(frame).items()}
-    shown = warp_layers(replace(frame, valid=valid), flow, ROWS, warped)
+    warp_layers(frame, flow, ROWS, warped)
+    shown = find_coverage(flow, np.ones(flow.shape[:2], bool), valid, ROWS.start)
     assert {"color", "albedo", "normal"} <= {*warped}
     inside = slice(None, -step or None)
     for name, layer in warped.items():
