@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
@@ -27,6 +28,7 @@ from hybrid.commands.options import (
     output_option,
 )
 from hybrid.commands.shots import log_cuts, open_input, validate_renders
+from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
@@ -43,6 +45,8 @@ from hybrid.stream import plan_shot
 
 if TYPE_CHECKING:
     from hybrid.comparison.embedding import ShotImages
+
+FRAMES = "frames"  # folder next to the page
 
 
 def compare(
@@ -64,6 +68,10 @@ def compare(
     ] = None,
     external: Annotated[
         list[str] | None, input_option("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
+    ] = None,
+    external_seconds: Annotated[
+        list[str] | None,
+        input_option("seconds per frame of an --external denoiser; may be repeated", metavar="NAME=SECONDS"),
     ] = None,
     sweep: Annotated[bool, method_option("also vary stages and settings, one at a time", "--sweep")] = False,
     rounds: Annotated[int, method_option("runs of each method, in turns; the time is their median", min=1)] = 3,
@@ -93,6 +101,9 @@ def compare(
     movies: Annotated[
         bool, output_option("also write a movie of each method in full size, next to the page", "--movies")
     ] = False,
+    keep_frames: Annotated[
+        bool, output_option("also write the frames of each method as EXR, next to the page", "--keep-frames")
+    ] = False,
     frames: FramesOption = None,
     layer: LayerOption = None,
     profile: ProfileOption = None,
@@ -110,7 +121,7 @@ def compare(
     ravg compare --with-report one --with-report two -o both   (join finished reports)
     """
     cost: Cost = "seconds_per_megapixel" if clock == "wall" else "cpu_seconds_per_megapixel"
-    report = _Report(output, cost, fps, movies, markdown, with_report or [])
+    report = _Report(output, cost, fps, movies, keep_frames, markdown, with_report or [])
     report.check()
     if shot is None or not reference:
         if shot is not None or reference or not with_report:
@@ -123,7 +134,7 @@ def compare(
     alike, findings = validate_renders({"shot": opened}, strict=strict)
     noisy = alike["shot"]
     clean = [_open_matching(spec, noisy, frames) for spec in reference]
-    chosen = _methods(methods, external, noisy, frames)
+    chosen = _methods(methods, external, _seconds(external_seconds), noisy, frames)
     plan = cache(partial(run_in_process, plan_shot, noisy))
     if sweep:
         LOG.info("plan the shot")
@@ -148,7 +159,10 @@ def compare(
 
             LOG.info("page: encode the pictures")
             numbers = [n for n in noisy.numbers if all(n in half.numbers for half in clean)]
-            report.write(comparison, report_images(FrameStore(Path(folder)), comparison, numbers, exposure))
+            images = report_images(FrameStore(Path(folder)), comparison, numbers, exposure)
+            report.write(comparison, images)
+            if keep_frames:
+                _write_frames(output / FRAMES, noisy, images)
     report.show([comparison, *report.read_others()], comparison.results)
 
 
@@ -174,6 +188,7 @@ class _Report:
     cost: Cost
     rate: float
     movies: bool
+    keep_frames: bool
     markdown: bool
     folders: Sequence[Path]
 
@@ -187,9 +202,10 @@ class _Report:
             from hybrid.comparison.report import check_report
 
             check_report(self.output, [folder / "results.json" for folder in self.folders])
-        if self.movies:
-            if self.output is None:
-                raise typer.BadParameter("--movies writes next to a page, expected --output with it")
+        if self.output is None and (self.movies or self.keep_frames):
+            option = "--movies" if self.movies else "--keep-frames"
+            raise typer.BadParameter(f"{option} writes next to a page, expected --output with it")
+        if self.output is not None and self.movies:
             check_movie(self.output / "movie.mp4")
         self.read_others()
 
@@ -229,8 +245,38 @@ def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
     return opened
 
 
-def _methods(names: str | None, external: Sequence[str] | None, shot: Shot, frames: str | None) -> dict[str, Method]:
-    """The requested methods, and sequences of other denoisers."""
+def _write_frames(folder: Path, shot: Shot, images: ShotImages) -> None:
+    """Write the reference and each method's frames as files of the shot with another color."""
+    for index, source in enumerate(images.sources):
+        name = file_name(index, source.name)
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for number in images.frames:
+            shot.write(folder / name / f"{name}.{number:04d}.exr", number, {"color": source.frame(number)})
+    LOG.info(f"wrote frames to {folder}")
+
+
+def _seconds(stated: Sequence[str] | None) -> dict[str, float]:
+    """Seconds per frame, by the names of --external."""
+    seconds = {}
+    for item in stated or ():
+        name, separator, count = item.rpartition("=")
+        try:
+            seconds[name] = float(count)
+        except ValueError:
+            separator = ""
+        if not separator or not name or not 0 < seconds[name] < math.inf:
+            raise typer.BadParameter(f"--external-seconds is {item!r}, expected NAME=SECONDS, more than 0")
+    return seconds
+
+
+def _methods(
+    names: str | None,
+    external: Sequence[str] | None,
+    seconds: Mapping[str, float],
+    shot: Shot,
+    frames: str | None,
+) -> dict[str, Method]:
+    """The requested methods, and sequences of other denoisers with their seconds per frame."""
     wanted = METHODS if names is None else {n.strip(): choose(METHODS, n.strip(), "methods") for n in names.split(",")}
     chosen = dict(wanted)
     for item in external or ():
@@ -239,7 +285,9 @@ def _methods(names: str | None, external: Sequence[str] | None, shot: Shot, fram
             raise typer.BadParameter(f"--external is {item!r}, expected NAME=PATTERN")
         if name in METHODS or name == "reference":
             raise typer.BadParameter(f"--external is {item!r}, expected a name that no other method has")
-        chosen[name] = finished(_open_matching(pattern, shot, frames))
+        chosen[name] = finished(_open_matching(pattern, shot, frames), seconds.get(name))
+    if unknown := sorted(seconds.keys() - chosen.keys()):
+        raise typer.BadParameter(f"--external-seconds names {unknown[0]!r}, expected a name of --external")
     return chosen
 
 

@@ -58,13 +58,17 @@ def embed_animations(images: ShotImages) -> Embedded:
     return Embedded(info, [(f"a{i}", text) for i, text in enumerate(sheets)])
 
 
+def file_name(index: int, name: str) -> str:
+    """Return a name for files of a source of the viewer: names of methods may hold any character."""
+    return f"{index:02d}_{re.sub(r'[^A-Za-z0-9-]+', '_', name)[:60]}"
+
+
 def write_movies(folder: Path, images: ShotImages, rate: float) -> dict[str, str]:
     """Write an MP4 of the reference and of every method in their own size; return the file names by method."""
     encode = _encoder(images)
 
     def write(index: int, source: MethodImages) -> str:
-        # Names of methods may hold any character.
-        name = f"{index:02d}_{re.sub(r'[^A-Za-z0-9-]+', '_', source.name)[:60]}.mp4"
+        name = f"{file_name(index, source.name)}.mp4"
         write_movie(folder / name, (encode(source.frame(number)) for number in images.frames), rate)
         return name
 

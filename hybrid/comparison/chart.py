@@ -6,7 +6,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
-from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from matplotlib.transforms import Affine2D, Bbox
 
-from hybrid.comparison.results import COSTS, Cost, MethodResult, Metric, pareto_front
-from hybrid.comparison.tables import column_title, format_bytes, format_seconds
+from hybrid.comparison.results import COSTS, INPUT_FAMILY, Cost, MethodResult, Metric, pareto_front
+from hybrid.comparison.tables import column_title, format_bytes, format_seconds, format_value
 
 # Okabe and Ito's palette, which people with any common color blindness can distinguish, without its yellow, which is
 # invisible on white. Seven colors and nine markers: families repeat neither until the 64th.
@@ -76,16 +76,15 @@ def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, l
     axes = figure.add_axes((0.075, (0.6 + legend_height) / height, 0.91, (HEIGHT - 0.95) / height), facecolor="none")
     places = _set_cost_axis(axes, {i: getattr(r, cost) for i, r in shown.items()}, cost)
     _set_measure_axis(axes, metric)
-    points = [
-        _Point(i, r, places[i], r.metrics[metric.key].mean, names.index(r.family), r.name in front)
-        for i, r in shown.items()
-    ]
+    low, high = _leave_out_input(axes, shown.values(), metric)
+    heights = {i: float(np.clip(r.metrics[metric.key].mean, low, high)) for i, r in shown.items()}
+    points = [_Point(i, r, places[i], heights[i], names.index(r.family), r.name in front) for i, r in shown.items()]
     for point in points:
         _draw_point(axes, point, metric, cost)
     _draw_lines(axes, points)
     if legend:
         _draw_legend(figure, names)
-    _draw_labels(figure, axes, points)
+    _draw_labels(figure, axes, points, metric)
     return figure
 
 
@@ -137,6 +136,19 @@ def _set_measure_axis(axes: Axes, metric: Metric) -> None:
     axes.spines[["top", "left", "right"]].set_visible(False)
 
 
+def _leave_out_input(axes: Axes, shown: Collection[MethodResult], metric: Metric) -> tuple[float, float]:
+    """Set the range of the measure to that of the denoisers, which the noisy input would press together; return it."""
+    statistics = [r.metrics[metric.key] for r in shown if r.family != INPUT_FAMILY]
+    values = [v for s in statistics for v in (s.mean, s.low, s.high) if math.isfinite(v)]
+    if metric.logarithmic or len(statistics) == len(shown) or len({s.mean for s in statistics}) < 2:
+        return -math.inf, math.inf
+    margin = 0.1 * (max(values) - min(values))
+    bottom, top = min(values) - 2 * margin, max(values) + margin
+    axes.set_ylim((bottom, top) if metric.better == "higher" else (top + margin, bottom + margin))
+    low, high = sorted(axes.get_ylim())
+    return low, high
+
+
 def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
     """Marker and error bars of a method: filled on the front, smaller for a point of a sweep."""
     result, statistic = point.result, point.result.metrics[metric.key]
@@ -178,7 +190,7 @@ def _draw_lines(axes: Axes, points: Sequence[_Point]) -> None:
         axes.plot([p.x for p in line], [p.y for p in line], color=color, linewidth=0.8, alpha=0.6, gid=gid)
 
 
-def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point]) -> None:
+def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: Metric) -> None:
     """Names of as many points as have space, the front's first; points of a sweep are named on the front only."""
     figure.draw_without_rendering()
     pixels = [axes.transData.transform((p.x, p.y)) for p in points]
@@ -188,6 +200,8 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point]) -> None:
         if p.result.sweep and not p.on_front:
             continue
         name = " ".join(p.result.name.split())
+        if p.y != (mean := p.result.metrics[metric.key].mean):
+            name += f" {format_value(mean, metric)}, off the scale"
         words = name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
         weight, color = ("bold", "#222") if p.on_front else ("normal", "#555")
         text = axes.annotate(words, (p.x, p.y), (0, 0), textcoords="offset points", annotation_clip=False, fontsize=9)
@@ -200,6 +214,28 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point]) -> None:
                 break
         else:
             text.remove()
+
+
+def draw_curves(results: Sequence[MethodResult], metric: Metric, pair: tuple[str, str] | None) -> Markup | None:
+    """Draw a measure over the frames, of all methods in gray and of a pair in color; None below three frames."""
+    drawn = [r for r in results if metric.key in r.metrics and not r.sweep and r.family != INPUT_FAMILY]
+    series = {r.name: r.metrics[metric.key].values for r in drawn}
+    length = max(map(len, series.values()), default=0)
+    if length < 3:
+        return None
+    figure = Figure(figsize=(WIDTH, 2.6), facecolor="none")
+    axes = figure.add_axes((0.075, 0.16, 0.745, 0.72), facecolor="none")
+    _set_measure_axis(axes, metric)
+    lines = sorted((name for name in series if len(series[name]) == length), key=lambda name: name in (pair or ()))
+    for name in lines:
+        color = COLORS[(pair or ()).index(name)] if name in (pair or ()) else "#88888866"
+        axes.plot(range(length), series[name], color=color, linewidth=1.6 if name in (pair or ()) else 0.8)
+        if name in (pair or ()):
+            place = 1.01, 0.9 - 0.12 * (pair or ()).index(name)
+            axes.text(*place, name, transform=axes.transAxes, color=color, fontsize=9, parse_math=False)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("frame of the shot, from 0 →", loc="right")
+    return to_svg(figure, f"curve-{metric.key}")
 
 
 def _draw_legend(figure: Figure, names: Sequence[str]) -> None:

@@ -90,7 +90,7 @@ def compare_shot(
         results = [
             _absent_result(name, method, timed.absent[name])
             if name in timed.absent
-            else _result(name, method, timed.runs[name], statistics[name], law)
+            else _result(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             for name, method in methods.items()
         ]
         map_facts = _store_all_maps(store, shot, {n: methods[n] for n in timed.runs}, evaluator, steps)
@@ -187,6 +187,7 @@ def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], steps: _Steps
     """Measures of each method; without FLIP for points of a sweep."""
     steps.start("FLIP of all methods", steps.first_measure)
     evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
+    evaluator.map_reference_changes()
     statistics = {}
     for done, (name, method) in enumerate(methods.items(), start=1):
         steps.start(f"measure {name}", done, first=steps.first_measure)
@@ -207,18 +208,24 @@ def _noise_law(
 
 
 def _result(
-    name: str, method: Method, runs: Sequence[RunCost], metrics: Mapping[str, Statistic], law: NoiseLaw | None
+    name: str,
+    method: Method,
+    runs: Sequence[RunCost],
+    metrics: Mapping[str, Statistic],
+    law: NoiseLaw | None,
+    megapixels: float,
 ) -> MethodResult:
-    """The result of a method that has run."""
+    """The result of a method that has run on frames of so many megapixels."""
     seconds = summarize_runs(runs) if method.cost == "measured" else None
     unmeasured = 0.0 if method.cost == "free" else None
+    stated = unmeasured if method.seconds is None else method.seconds / megapixels
     return MethodResult(
         name,
         method.settings,
         method.family,
         method.sweep,
         method.base,
-        seconds_per_megapixel=seconds.median if seconds else unmeasured,
+        seconds_per_megapixel=seconds.median if seconds else stated,
         spread=(seconds.least, seconds.most) if seconds and len(runs) > 1 else None,
         cpu_seconds_per_megapixel=seconds.cpu if seconds else unmeasured,
         peak_bytes=None if method.cost == "unknown" else max(run.peak_bytes for run in runs),

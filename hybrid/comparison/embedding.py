@@ -49,11 +49,12 @@ class ShotImages:
     reference: Callable[[int], Array]
     frames: Sequence[int]
     exposure: float = 1.0
+    reference_maps: Mapping[str, Callable[[int], Array | None]] = field(default_factory=dict)  # as of a method
 
     @property
     def sources(self) -> list[MethodImages]:
         """The reference, then the methods."""
-        return [MethodImages("reference", self.reference), *self.methods]
+        return [MethodImages("reference", self.reference, self.reference_maps), *self.methods]
 
     @property
     def middle(self) -> int:

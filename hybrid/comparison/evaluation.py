@@ -78,6 +78,12 @@ class Evaluator:
         with ThreadPoolExecutor(AT_ONCE) as threads:
             list(threads.map(partial(self._map_flip, names), self.numbers))
 
+    def map_reference_changes(self) -> None:
+        """Store the maps of changes of the reference: true changes, beside which flicker can be told."""
+        if self.pairs:
+            with ThreadPoolExecutor(AT_ONCE) as threads:
+                list(threads.map(partial(self._map_change, REFERENCE), self.numbers))
+
     def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
         """Measure the frames of a method, and pairs of frames; measures over time only with pairs or static pixels.
 

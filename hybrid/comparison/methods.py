@@ -48,6 +48,7 @@ class Method:
     # "measured"; "free": the frames exist before any method runs; "unknown": another program made the frames
     cost: Literal["measured", "free", "unknown"] = "measured"
     threads: int = 0  # limit on the number of threads; 0: no limit
+    seconds: float | None = None  # per frame, of "unknown" cost, as its user states them
     given: Shot | None = None  # frames that another denoiser has written: they are checked before any method runs
     # shown in the report; in a sweep, the settings that differ from those of `base`
     settings: Mapping[str, object] = field(default_factory=dict)
@@ -72,9 +73,9 @@ def finished(shot: Frames, *, other: Shot) -> Iterator[tuple[int, Array]]:
             yield number, read_denoised(other, number)
 
 
-def external(other: Shot) -> Method:
-    """Return a finished sequence as a method."""
-    return Method(partial(finished, other=other), "External", cost="unknown", given=other)
+def external(other: Shot, seconds: float | None = None) -> Method:
+    """Return a finished sequence as a method, with its seconds per frame if these are known."""
+    return Method(partial(finished, other=other), "External", cost="unknown", seconds=seconds, given=other)
 
 
 # Methods on aligned windows

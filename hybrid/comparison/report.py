@@ -30,6 +30,7 @@ from hybrid.comparison.results import (
     best_and_ties,
     is_comparison,
     join,
+    leading_pair,
     pareto_front,
     present_metrics,
     stage_values,
@@ -37,7 +38,7 @@ from hybrid.comparison.results import (
     to_json,
     to_plain_numbers,
 )
-from hybrid.comparison.store import MAP_TITLES, REFERENCE, FrameStore
+from hybrid.comparison.store import CHANGE_MAP, MAP_TITLES, REFERENCE, FrameStore
 from hybrid.comparison.tables import format_bytes, format_change, format_seconds, format_value, format_worth
 from hybrid.files.replace import check_outputs, write_file
 
@@ -99,7 +100,9 @@ def report_images(
             titles = [t for t in MAP_TITLES if any(store.has(result.name, number, t) for number in frames)]
             maps = {title: partial(_load_map, store, result.name, title) for title in titles}
             methods.append(MethodImages(result.name, partial(store.load, result.name), maps))
-    return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure)
+    changes = {CHANGE_MAP: partial(_load_map, store, REFERENCE, CHANGE_MAP)}
+    there = any(store.has(REFERENCE, number, CHANGE_MAP) for number in frames)
+    return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure, changes if there else {})
 
 
 def _load_map(store: FrameStore, name: str, title: str, number: int) -> Array | None:
@@ -149,12 +152,14 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
     """The page as HTML."""
     comparison, results = report.comparison, report.comparison.results
     metrics = present_metrics(results, METRICS)
+    pair = leading_pair(results, metrics[0]) if metrics else None
     present = [r for r in results if r.absent_reason is None]
     costs = {key: COSTS[key] for key in (report.cost, *(c for c in COSTS if c != report.cost))}
     data = {
         **document,
         "chart": [m.key for m in charted],
         "cost": report.cost,
+        "pair": pair,
         "exposure": report.images.exposure if report.images is not None else 1.0,
         "pictures": embedded.pictures and embedded.pictures.info,
         "animations": embedded.animations and embedded.animations.info,
@@ -164,7 +169,8 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
         comparison=comparison,
         style=page.style(),
         script=page.script(),
-        verdict=_verdict(results, metrics),
+        verdict=_verdict(results, metrics, pair),
+        curves=[(m, curve) for m in charted if (curve := chart.draw_curves(present, m, pair))],
         metrics=metrics,
         charted=charted,
         costs=costs,
@@ -188,29 +194,33 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
 
 @dataclass(frozen=True)
 class Verdict:
-    """Head of the page: the best method by the first measure, its ties, and (figure, unit, label) of its gains."""
+    """Head of the page: the best method by the first measure, its rival, its ties, and (figure, unit, label)."""
 
     leader: str
+    rival: str | None
     ties: list[str]
     figures: list[tuple[str, str, str]]
 
 
-def _verdict(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> Verdict | None:
+def _verdict(
+    results: Sequence[MethodResult], metrics: Sequence[Metric], pair: tuple[str, str] | None
+) -> Verdict | None:
     best, ties = best_and_ties(results, metrics[0]) if metrics else (None, set())
     if best is None:
         return None
     metric, by_name = metrics[0], {r.name: r for r in results}
-    leader, noisy = by_name[best], by_name.get("noisy")
-    value = leader.metrics[metric.key].mean
-    figures = [(format_value(value, metric), metric.unit, metric.label)]
-    if noisy is not None and noisy is not leader and metric.key in noisy.metrics and not metric.logarithmic:
-        gain = value - noisy.metrics[metric.key].mean
-        figures.append((format_change(gain, metric), metric.unit, "over the noisy input"))
+    leader = by_name[best]
+    figures = [(format_value(leader.metrics[metric.key].mean, metric), metric.unit, metric.label)]
+    for gained in (m for m in metrics[:2] if pair and not m.logarithmic):
+        means = [by_name[name].metrics[gained.key].mean for name in pair or () if gained.key in by_name[name].metrics]
+        if len(means) == 2:
+            label = f"{gained.label} over {pair[1] if pair else ''}"
+            figures.append((format_change(means[0] - means[1], gained), gained.unit, label))
     if leader.worth is not None and math.isfinite(leader.worth):
         figures.append((format_worth(leader.worth), "", "worth in samples"))
     if leader.seconds_per_megapixel is not None:
         figures.append((format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
-    return Verdict(best, [r.name for r in results if r.name in ties], figures)
+    return Verdict(best, pair and pair[1], [r.name for r in results if r.name in ties], figures)
 
 
 @dataclass(frozen=True)

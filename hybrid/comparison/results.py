@@ -86,6 +86,8 @@ METRICS: tuple[Metric, ...] = (
     Metric("mean_bias", "Bias", digits=4, better="zero"),
     Metric("static_std", "Static deviation", better="lower", logarithmic=True),
 )
+INPUT_FAMILY = "Input"
+OTHER_FAMILIES = ("OIDN", "External")  # denoisers of others
 MARKDOWN_METRICS = ("psnr", "temporal_psnr")  # the columns of the README's table
 CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # in the order of the chart's menu
 
@@ -149,6 +151,26 @@ def best_and_ties(results: Sequence[MethodResult], metric: Metric) -> tuple[str 
         return None, set()
     best = max(rated, key=lambda name: _goodness(rated[name].mean, metric))
     return best, {name for name in rated if name != best and _tied(rated[name], rated[best])}
+
+
+def leading_pair(results: Sequence[MethodResult], metric: Metric) -> tuple[str, str] | None:
+    """Name the best method and its strongest rival; None where fewer than two methods have a mean.
+
+    For a method of ours the rival is the best of `OTHER_FAMILIES`, for one of those the best of ours, and of any family
+    where the other side has none. Points of sweeps and the noisy input are rivals only where nothing else is.
+    """
+    rated = [r for r in results if metric.key in r.metrics and not math.isnan(r.metrics[metric.key].mean)]
+    best, _ = best_and_ties(rated, metric)
+    leader = next((r for r in rated if r.name == best), None)
+    if leader is None:
+        return None
+    denoisers = [r for r in rated if r.family != INPUT_FAMILY and not r.sweep]
+    is_other = leader.family in OTHER_FAMILIES
+    for rivals in ([r for r in denoisers if (r.family in OTHER_FAMILIES) != is_other], denoisers, rated):
+        rival, _ = best_and_ties([r for r in rivals if r.name != leader.name], metric)
+        if rival is not None:
+            return leader.name, rival
+    return None
 
 
 def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:

@@ -29,11 +29,10 @@ class Sheets {
 
 function startAnimations(info) {
   const sheets = new Sheets(info), names = sheets.sources.map(({ name }) => name);
-  const left = Math.max(names.indexOf("noisy"), 0), right = names.length - 1;
-  const player = new Player(sheets, { prefix: "animation-", state: { left, right: right === left ? 0 : right } });
+  const player = new Player(sheets, { prefix: "animation-", state: firstPair(names) });
   fillChoices(player, names);
   player.listen({ wheelNeedsFocus: true });
   player.listenToKeys(find("animations"));
   find("animations").hidden = false;
-  return player.draw();
+  return matchMedia("(prefers-reduced-motion: reduce)").matches ? player.draw() : player.play(true);
 }

@@ -4,7 +4,7 @@ const LENS = 120, MAGNIFIED = 4; // the side of a lens in CSS pixels, and its ma
 
 // All methods in a grid, in the report only.
 LAYOUTS.all = ({ pictures: { sources, width, height } }, wide) => {
-  const columns = clamp(Math.min(sources.length, Math.floor(wide / 250)), 1, 4), w = wide / columns, h = w * height / width;
+  const columns = clamp(Math.min(Math.ceil(Math.sqrt(sources.length)), Math.floor(wide / 250)), 1, 4), w = wide / columns, h = w * height / width;
   return sources.map((_, i) => ({ source: i, ...cell((i % columns) * w, Math.floor(i / columns) * h, w, h) }));
 };
 
@@ -105,14 +105,17 @@ class Viewer extends Player {
   }
 }
 
-// The noisy frames on the left, the last of the front on the right.
+// The best method on the right, its strongest rival on the left; without their pictures the last, and the noisy frames.
+function firstPair(names) {
+  const [leader, rival] = report.pair ?? [], place = (name) => names.indexOf(name);
+  const right = place(leader) >= 0 ? place(leader) : names.length - 1;
+  return { left: [rival, "noisy"].map(place).find((i) => i >= 0 && i !== right) ?? 0, right };
+}
+
 function firstState({ sources, frames, black, row }) {
-  const names = sources.map(({ name }) => name), front = report.fronts[`${report.chart[0]} ${report.cost}`] ?? [];
-  const last = front.findLast((name) => names.includes(name)), right = last ? names.indexOf(last) : names.length - 1;
-  const left = names.includes("noisy") ? names.indexOf("noisy") : Math.min(1, names.length - 1);
   // 0 EV is the exposure of the metrics; start where the shot's mean level is a comfortable middle gray.
   const ev = Math.round(2 * Math.log2(0.35 / (report.exposure * black * 64))) / 2;
-  return { left, right: right === left ? 0 : right, view: "picture", frame: Math.floor(frames.length / 2), ev, row,
+  return { ...firstPair(sources.map(({ name }) => name)), view: "picture", frame: Math.floor(frames.length / 2), ev, row,
     magnify: false, at: null };
 }
 

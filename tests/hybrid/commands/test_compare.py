@@ -159,3 +159,22 @@ def test_levels_are_measured(shots: tuple[Path, Path], tmp_path: Path) -> None:
         image, reference = (open_shot(folder).read(number).color for folder in (level, clean))
         scores.append(10 ** (-psnr(image, reference) / 10))
     assert f"32: {-10 * np.log10(np.mean(scores)):.2f} dB" in said
+
+
+def test_frames_are_kept_and_the_time_of_others_is_theirs_to_state(tmp_path: Path) -> None:
+    pytest.importorskip("jinja2")
+    noisy, clean = SMALL.write(tmp_path / "noisy"), SMALL.write(tmp_path / "clean", clean=True)
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--external", f"mine={clean}"]
+    words += ["--rounds", "1", "-o", str(tmp_path / "report")]
+    assert main([*words, "--external-seconds", "mine=1.0", "--keep-frames"]) == 0
+    results = {result.name: result for result in results_of(tmp_path / "report").results}
+    pixels = SMALL.height * SMALL.width
+    assert results["mine"].seconds_per_megapixel == pytest.approx(1e6 / pixels)
+    kept = {folder.name: sorted(folder.iterdir()) for folder in (tmp_path / "report" / "frames").iterdir()}
+    assert kept.keys() == {"00_reference", "01_noisy", "02_mine"}
+    shot, made = open_shot(clean), open_shot(tmp_path / "report" / "frames" / "02_mine")
+    assert made.numbers == shot.numbers
+    np.testing.assert_array_equal(made.read(shot.numbers[0]).color, shot.read(shot.numbers[0]).color)
+    for wrong in ("mine", "mine=0", "mine=-1", "other=2", "=3"):
+        assert main([*words, "--external-seconds", wrong]) == 2
+    assert main([*words[:-2], "--keep-frames"]) == 2

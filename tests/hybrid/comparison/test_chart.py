@@ -80,8 +80,25 @@ def test_the_front_leads_up_to_its_end() -> None:
     figure = draw(RESULTS)
     (front,) = [line for line in figure.axes[0].lines if line.get_gid() is None]
     heights = [float(y) for y in np.asarray(front.get_ydata())]
-    assert heights == pytest.approx([22, 28, 34, 34])
+    assert heights[1:] == pytest.approx([28, 34, 34])
+    # The noisy input, at 22 dB, would press the denoisers together: it is at the edge, and says its value.
+    assert heights[0] == pytest.approx(figure.axes[0].get_ylim()[0])
+    assert 22 < heights[0] < 28
+    (said,) = [text.get_text() for text in figure.axes[0].findobj(Text) if text.get_gid() == "name-0"]
+    assert said == "noisy 22.00, off the scale"
     assert front.get_drawstyle() == "steps-post"
+
+
+def test_curves_over_frames_show_the_pair_in_color() -> None:
+    series = [
+        result("a", [30.0, 31.0, 29.0], 1),
+        result("b", [28.0, 28.5, 28.0], 1),
+        result("c", [20.0, 21.0, 22.0], 1),
+    ]
+    drawing = chart.draw_curves(series, PSNR, ("a", "b"))
+    assert drawing is not None
+    assert [drawing.count(color) > 0 for color in chart.COLORS[:3]] == [True, True, False]
+    assert chart.draw_curves([result("a", [30.0, 31.0], 1)], PSNR, None) is None  # too few frames for a curve
 
 
 def test_the_legend_has_every_family_and_as_many_rows_as_it_takes() -> None:

@@ -143,7 +143,7 @@ def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def page(browser: Any, report_file: Path) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1200, "height": 900}, offline=True)
+    context = browser.new_context(viewport={"width": 1200, "height": 900}, offline=True, reduced_motion="reduce")
     tab = context.new_page()
     faults: list[str] = []
     asked: list[str] = []
@@ -203,7 +203,7 @@ def close(a: list[int], b: list[int]) -> bool:
 
 
 def test_the_slider_divides_two_pictures_and_follows_mouse_and_keys(page: Any) -> None:
-    # It opens on the noisy input and the last of the front.
+    # It opens on the best method, and on the noisy input where the strongest rival has no pictures.
     see(page, shown(page, "noisy"), 0.25)
     see(page, shown(page, "final"), 0.75)
     assert not close(shown(page, "noisy"), shown(page, "final"))
@@ -458,3 +458,20 @@ def test_text_is_readable_on_light_and_dark(page: Any, scheme: str) -> None:
         low, high = sorted((luminance(ink), luminance(paper)))
         assert (high + 0.05) / (low + 0.05) >= 4.5, selector  # WCAG 2 AA
     assert (luminance(pairs[0][2]) < 0.1) == (scheme == "dark")
+
+
+def test_it_plays_the_best_method_against_its_strongest_rival(browser: Any, tmp_path: Path) -> None:
+    results = [replace(r, name="rival") if r.name == "other" else r for r in RESULTS]
+    images = [MethodImages(name, scene(0.5)) for name in ("noisy", "final", "rival")]
+    report = Report(Comparison("Hall", tuple(results)), ShotImages(images, scene(0.5), [8, 9, 10]))
+    with browser.new_context(viewport={"width": 1440, "height": 900}) as context:
+        tab = context.new_page()
+        tab.goto(write_report(tmp_path, report).as_uri())
+        until(tab, "document.getElementById('animation-play').getAttribute('aria-pressed') === 'true'")
+        chosen = [tab.locator(f"#{name}").evaluate("e => e.selectedOptions[0].text") for name in PLAYED]
+        assert chosen == ["rival", "final"] * 2
+        assert "over rival" in tab.inner_text(".figures")
+        assert tab.evaluate("document.querySelector('#results .scroll').scrollWidth <= innerWidth")
+
+
+PLAYED = ("animation-left", "animation-right", "left", "right")

@@ -17,6 +17,7 @@ from hybrid.comparison.results import (
     Statistic,
     best_and_ties,
     join,
+    leading_pair,
     pareto_front,
     read_comparison,
     stage_values,
@@ -146,3 +147,15 @@ def test_numbers_that_are_not_finite_survive_json() -> None:
     document = to_document(Comparison("x", (result("a", [math.inf, math.nan], 1.0),)))
     statistic = json.loads(to_json(document))["results"][0]["metrics"]["psnr"]
     assert [float(v) for v in statistic["values"]] == pytest.approx([math.inf, math.nan], nan_ok=True)
+
+
+def test_the_strongest_rival_is_of_the_other_side() -> None:
+    ours = [result("fast", 30, 1), result("quality", 33, 4), result("quality 3", 34, 4, sweep="Window")]
+    theirs = [result("OIDN", 31, 1, family="OIDN"), result("mine", 29, None, family="External")]
+    noisy = result("noisy", 20, 0, family="Input")
+    assert leading_pair([noisy, *ours[:2], *theirs], PSNR) == ("quality", "OIDN")
+    assert leading_pair([noisy, ours[0], *theirs], PSNR) == ("OIDN", "fast")
+    assert leading_pair([noisy, *ours[:2]], PSNR) == ("quality", "fast")
+    assert leading_pair([noisy, ours[1]], PSNR) == ("quality", "noisy")
+    assert leading_pair([ours[1]], PSNR) is None
+    assert leading_pair([], PSNR) is None
