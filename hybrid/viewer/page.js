@@ -214,7 +214,7 @@ async function showFacts() {
 function showRecord() {
   const { stages = {}, plan = [], command, preset, estimate, asked = [], peak_bytes: peak } = source.sequences[0].record;
   $("#record").hidden = !command;
-  showPairs($("#record dl"), { command, preset, estimate, frames: asked.length, ...(peak && { memory: mebibytes(peak) }) });
+  showPairs($("#record dl"), { command, preset, "first pass": estimate, frames: asked.length, ...(peak && { memory: mebibytes(peak) }) });
   $("#record tbody").replaceChildren(...Object.entries(stages).map(([name, cost]) => {
     const row = make("tr");
     row.append(make("td", name), make("td", cost.seconds.toFixed(2)), make("td", mebibytes(cost.peak_bytes)));
@@ -236,6 +236,23 @@ function mebibytes(bytes) {
   return `${Math.round(bytes / 2 ** 20)} MiB`;
 }
 
+// The values of the pixel under the pointer, of both sides; the answer to the latest place counts.
+let pointed = 0;
+
+async function readOut(event) {
+  const { x, y } = player.under(event), { width, height } = source.size(), mine = ++pointed;
+  const at = [Math.floor(x * width), Math.floor(y * height)], number = source.frames[player.state.frame];
+  if (x < 0 || y < 0 || x >= 1 || y >= 1 || number === undefined || player.state.playing) return;
+  const lines = await Promise.all([player.state.left, player.state.right].map(async ({ sequence, layer }) => {
+    const query = `layer=${encodeURIComponent(layer)}&x=${at[0]}&y=${at[1]}`;
+    const answer = await fetch(`values/${sequence}/${number}.json?${query}`);
+    const values = answer.ok ? Object.entries(await answer.json()) : [];
+    const texts = values.map(([name, value]) => `${name} ${value === null ? "not finite" : rounded(value, 4)}`);
+    return `${source.sequences[sequence].name}: ${texts.join("  ") || "–"}`;
+  }));
+  if (mine === pointed) $("#readout").textContent = [`(${at.join(", ")})`, ...new Set(lines)].join("\n");
+}
+
 // --- controls ---------------------------------------------------------------------------------------------
 
 for (const name of ["left", "right"]) {
@@ -255,6 +272,7 @@ Object.assign(player.keys, {
 });
 player.listen();
 player.listenToKeys(document);
+player.canvas.addEventListener("pointermove", readOut);
 new ResizeObserver(drawFinished).observe($("#time"));
 
 poll();

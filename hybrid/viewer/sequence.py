@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,24 @@ class Sequence:
         Raises KeyError if there is no such frame or layer; OSError or ExrError if the file cannot be read, for instance
         because it is incomplete so far.
         """
+        image, layer, pixels = self._read_layer(number, name)
+        return _on_display_window(self._encode(pixels, layer, _layers(image), gain, ev), image.parts[layer.part])
+
+    def values(self, number: int, name: str, x: int, y: int) -> dict[str, float | None]:
+        """Return the values of a layer's pixel by component, None if not finite; {} outside of the data window.
+
+        `x` and `y` count from the top left of the display window. Errors are those of `picture`.
+        """
+        image, layer, pixels = self._read_layer(number, name)
+        part = image.parts[layer.part]
+        column, row = x + part.display_window[0] - part.data_window[0], y + part.display_window[1] - part.data_window[1]
+        if not (0 <= row < pixels.shape[0] and 0 <= column < pixels.shape[1]):
+            return {}
+        found = (float(value) for value in pixels[row, column])
+        return {component_of(c): v if math.isfinite(v) else None for c, v in zip(layer.channels, found, strict=True)}
+
+    def _read_layer(self, number: int, name: str) -> tuple[ExrImage, Layer, NDArray[Any]]:
+        """A frame's file, a layer of it, and its pixels (H, W, C), from the cache if they are there."""
         path = self._path(number)
         key = path, _version(path.stat()), name
         with self._lock:
@@ -109,7 +128,7 @@ class Sequence:
         if pixels is None:
             pixels = image.pixels(layer.channels)
             self._cache_pixels(key, pixels)
-        return _on_display_window(self._encode(pixels, layer, _layers(image), gain, ev), image.parts[layer.part])
+        return image, layer, pixels
 
     def facts(self, number: int) -> dict[str, Any]:
         """Return the header's facts on the denoising, and the mean weight of each frame of the window, if present."""
@@ -118,11 +137,6 @@ class Sequence:
         header = image.parts[0].header
         ours = [key for key in header if key.startswith("ravg/") and key != MADE_FROM]
         made = {key.removeprefix("ravg/"): str(header[key]) for key in ours}
-        # The given options are one attribute, as JSON.
-        with suppress(ValueError, AttributeError, RecursionError):
-            settings = json.loads(made.get("settings", "{}")).items()
-            made = {name: value for name, value in made.items() if name != "settings"}
-            made |= {name: str(value) for name, value in settings if value not in (None, False)}
         # A view's layers have its name: Back.Combined.weight.before1.
         weights = {
             layer.name.replace("weight.", ""): layer
@@ -133,7 +147,7 @@ class Sequence:
             image = read_exr(path)
         ordered = sorted(weights, key=_time_of)
         means = {name: float(image.pixels(weights[name].channels).mean()) for name in ordered}
-        return {"file": path.name, "made": made, "weights": means}
+        return {"file": path.name, "made": _in_words(made), "weights": means}
 
     def record(self) -> dict[str, Any]:
         """Return the record of the latest run: stages with their cost, and the plan; {} if there is none."""
@@ -176,6 +190,30 @@ class Sequence:
                 inside = finite.size and finite.min() >= 0 and finite.max() <= 1
                 self._ranges[name] = (0.0, 1.0) if inside else (float(low), float(high))
             return self._ranges[name]
+
+
+def _in_words(made: Mapping[str, str]) -> dict[str, str]:
+    """The facts of a header that say how a frame was made, by names that are read."""
+    found: dict[str, Any] = dict(made)
+    for key in ("settings", "versions"):  # attributes that hold JSON; others wrote what is none
+        with suppress(ValueError, AttributeError, RecursionError):
+            found[key] = dict(json.loads(made.get(key, "{}")).items())
+    settings = found["settings"] if isinstance(found.get("settings"), dict) else {}
+    versions = found["versions"] if isinstance(found.get("versions"), dict) else {}
+    device, aovs = settings.get("device"), settings.get("aovs")
+    facts = {
+        "method": settings.get("method"),
+        "preset": found.get("preset"),
+        "first pass": found.get("first-pass"),
+        "passes": None if settings.get("passes") == 1 else settings.get("passes"),
+        "light passes": ", ".join(map(str, aovs)) if isinstance(aovs, list) else None,
+        "forced stages": found.get("forced"),
+        "made without": found.get("beside"),
+        "computed on": ", ".join(dict.fromkeys(map(str, device.values()))) if isinstance(device, dict) else None,
+        "precision": settings.get("precision"),
+        "ravg": versions.get("ravg"),
+    }
+    return {name: str(fact) for name, fact in facts.items() if fact not in (None, "", False)}
 
 
 def _version(status: os.stat_result) -> str:

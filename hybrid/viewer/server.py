@@ -156,6 +156,14 @@ class _Handler(BaseHTTPRequestHandler):
         number, _, suffix = name.rpartition(".")
         if what == "facts" and suffix == "json":
             return 200, "application/json", json.dumps(sequence.facts(int(number))).encode(), False
+        if what == "values" and suffix == "json":
+            x, y = (int(query[axis][0]) for axis in "xy")
+            return (
+                200,
+                "application/json",
+                json.dumps(sequence.values(int(number), query["layer"][0], x, y)).encode(),
+                False,
+            )
         if what != "frame" or suffix not in KINDS:
             raise KeyError(rest)
         ev = float(query["ev"][0])

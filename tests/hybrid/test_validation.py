@@ -207,7 +207,7 @@ def test_an_alpha_that_is_the_color_is_not_filtered(tmp_path) -> None:
         channels[f"{LIGHT}.A"] = channels[f"{LIGHT}.R"]
 
     spec = write(tmp_path, edit)
-    _, said = quality(spec, tmp_path / "out")
+    _, said = quality(spec, tmp_path / "out", "--preset", "draft", "-v")
     assert [line for line in warnings(said) if "alpha (ViewLayer.Combined.A) is the color: left out" in line]
     assert "alpha" not in next(line for line in said.splitlines() if line.startswith("layers:"))
     before, after = (

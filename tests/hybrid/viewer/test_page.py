@@ -129,6 +129,17 @@ def test_every_arrangement_shows_what_it_says(page, served):
     assert pixel(page, 0.25) == level(served, GRAY / 2), "left and right are swapped"
 
 
+def test_the_values_under_the_pointer_are_shown(page):
+    assert page.text_content("#readout") == "drag to pan, wheel to zoom"
+    box = page.locator("#canvas").bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.25, box["y"] + box["height"] / 2)
+    page.wait_for_selector("#readout:has-text('noisy: R')")
+    said = page.inner_text("#readout").splitlines()
+    assert len(said) == 3
+    values = {line.split(":")[0]: float(line.split("R ")[1].split()[0]) for line in said[1:]}
+    assert values == {"noisy": pytest.approx(GRAY, rel=1e-3), "out": pytest.approx(GRAY / 2, rel=1e-3)}
+
+
 def test_exposure_is_in_stops(page, served):
     for _ in range(4):
         page.keyboard.press("]")

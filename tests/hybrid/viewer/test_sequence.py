@@ -191,13 +191,37 @@ def test_a_result_begins_with_the_denoised_picture_and_an_input_with_the_noisy_o
 def test_facts_tell_how_a_frame_was_made_and_what_its_neighbours_weigh(tmp_path):
     weights = {"before1": 0.25, "centre": 0.5, "after1": 0.125}
     layers = {f"weight.{name}": np.full((4, 4), value, np.float32) for name, value in weights.items()}
-    settings = json.dumps({"tile": 640, "aov": None, "breakdown": False})
-    attributes = {"ravg/preset": "fast", "ravg/settings": settings, "owner": "somebody"}
+    devices = {"network": "cpu", "oidn": "cpu"}
+    settings = json.dumps(
+        {"tile": 640, "method": "network", "aovs": [], "passes": 1, "device": devices, "precision": "x"}
+    )
+    attributes = {"ravg/preset": "fast", "ravg/first-pass": "file", "ravg/forced": "", "owner": "somebody"}
+    attributes |= {"ravg/settings": settings, "ravg/versions": '{"ravg": "0.2.0", "numpy": "2"}'}
     write_layers(tmp_path / "a.1.exr", {"color": np.ones((4, 4, 3)), **layers}, attributes=attributes)
     facts = Sequence(str(tmp_path), finished=True).facts(1)
     assert facts["file"] == "a.1.exr"
-    assert facts["made"] == {"preset": "fast", "tile": "640"}
+    words = {"method": "network", "preset": "fast", "first pass": "file", "computed on": "cpu", "precision": "x"}
+    assert facts["made"] == {**words, "ravg": "0.2.0"}
     assert list(facts["weights"].items()) == list(weights.items()), "in the order of time"
+
+
+@pytest.mark.parametrize("hostile", ["", "[", "[]", '"x"', '{"device": 3, "aovs": "x"}', "[" * 99999])
+def test_headers_that_hold_no_facts_make_none(tmp_path, hostile):
+    attributes = {"ravg/preset": "fast", "ravg/settings": hostile, "ravg/versions": hostile}
+    write_layers(tmp_path / "a.1.exr", {"color": np.ones((4, 4, 3))}, attributes=attributes)
+    assert Sequence(str(tmp_path), finished=True).facts(1)["made"] == {"preset": "fast"}
+
+
+def test_values_are_those_of_the_pixel_on_the_display_window(tmp_path):
+    color = np.zeros((4, 6, 3), np.float32)
+    color[1, 2] = 0.5, 2, np.nan
+    write_layers(tmp_path / "a.1.exr", {"color": color})
+    watched = Sequence(str(tmp_path), finished=True)
+    (name, *_), _ = watched.layers(1)
+    assert watched.values(1, name, 2, 1) == {"R": 0.5, "G": 2, "B": None}
+    assert watched.values(1, name, 6, 1) == watched.values(1, name, -1, 1) == {}
+    with pytest.raises(KeyError):
+        watched.values(1, "nothing", 0, 0)
 
 
 def test_of_several_pictures_the_first_is_shown_and_the_weights_of_all_are_told(tmp_path):
