@@ -208,7 +208,7 @@ def _in_words(made: Mapping[str, str]) -> dict[str, str]:
         "passes": None if settings.get("passes") == 1 else settings.get("passes"),
         "light passes": ", ".join(map(str, aovs)) if isinstance(aovs, list) else None,
         "forced stages": found.get("forced"),
-        "made without": found.get("beside"),
+        "averaged with": found.get("beside"),
         "computed on": ", ".join(dict.fromkeys(map(str, device.values()))) if isinstance(device, dict) else None,
         "precision": settings.get("precision"),
         "ravg": versions.get("ravg"),
