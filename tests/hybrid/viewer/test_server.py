@@ -153,7 +153,11 @@ def test_nothing_can_be_sent(served, method):
 
 def test_it_listens_on_this_machine_alone(served):
     assert served.server_address[0] == "127.0.0.1"
-    addresses = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    try:
+        found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+    except socket.gaierror:
+        pytest.skip("the machine's own name has no address here, as under Wine")
+    addresses = {info[4][0] for info in found}
     for address in addresses - {"127.0.0.1", "127.0.1.1"}:
         with pytest.raises(ConnectionRefusedError), socket.create_connection((address, served.port), timeout=2):
             pass
@@ -180,5 +184,5 @@ def test_many_are_answered_at_once(served):
 
 
 def test_a_port_that_is_taken_is_an_error(served):
-    with pytest.raises(OSError, match=r"[Aa]ddress"):
+    with pytest.raises(OSError, match=r"[Aa]ddress|WinError 100(48|13)"):  # in use; another's alone
         ViewServer(served.sequences, port=served.port)
