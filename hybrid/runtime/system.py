@@ -9,8 +9,9 @@ import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.context import BaseContext
 from pathlib import Path, PureWindowsPath
 
@@ -210,6 +211,15 @@ def peak_memory() -> int:
         except (OSError, StopIteration):
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             return peak if sys.platform == "darwin" else peak * 1024  # macOS counts bytes, others KiB
+
+
+def thread_clock() -> Callable[[], float]:
+    """Return a function that other threads call for the CPU seconds of this one, while it runs."""
+    if sys.platform != "win32" and sys.platform != "darwin":
+        clock = time.pthread_getcpuclockid(threading.get_ident())
+        return lambda: time.clock_gettime(clock)
+    number, process = threading.get_native_id(), psutil.Process()
+    return lambda: next((float(t.user_time + t.system_time) for t in process.threads() if t.id == number), 0.0)
 
 
 def start_context(preloaded: str) -> BaseContext:

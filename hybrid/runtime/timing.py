@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from hybrid.runtime.system import peak_memory
+from hybrid.runtime.system import peak_memory, thread_clock
 
 
 @dataclass
@@ -25,10 +24,6 @@ class Stage:
     peak_bytes: int = 0
 
 
-# CPU clock of another thread. Without it (macOS, Windows) background work is counted when it has ended.
-_CLOCK_OF: Callable[[int], int] | None = getattr(time, "pthread_getcpuclockid", None)
-
-
 class Timings:
     """Adds up the cost of named stages, which may not nest."""
 
@@ -37,7 +32,7 @@ class Timings:
         self._lock = threading.Lock()
         # CPU seconds of background work that has ended, and the clocks of work that has not.
         self._ended = 0.0
-        self._running: dict[int, tuple[int, float]] = {}
+        self._running: dict[int, tuple[Callable[[], float], float]] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -54,10 +49,9 @@ class Timings:
 
         Threads that libraries start in the block are counted with the stage of the main thread.
         """
-        thread, start = threading.get_ident(), time.thread_time()
-        if _CLOCK_OF is not None:
-            with self._lock:
-                self._running[thread] = _CLOCK_OF(thread), start
+        thread, start, clock = threading.get_ident(), time.thread_time(), thread_clock()
+        with self._lock:
+            self._running[thread] = clock, start
         try:
             yield
         finally:
@@ -70,9 +64,7 @@ class Timings:
     def _cpu_time(self) -> float:
         """CPU seconds of the process without background work."""
         with self._lock:
-            running = 0.0
-            if sys.platform != "win32":  # which has no such clocks
-                running = sum(time.clock_gettime(clock) - start for clock, start in self._running.values())
+            running = sum(clock() - start for clock, start in self._running.values())
             return time.process_time() - self._ended - running
 
     def _add(self, name: str, wall: float, cpu: float, *, calls: int) -> None:

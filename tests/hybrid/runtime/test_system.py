@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,7 @@ from hybrid.runtime.system import (
     replace_path,
     same_file,
     start_context,
+    thread_clock,
 )
 
 
@@ -152,6 +155,29 @@ def test_peak_memory_holds_what_the_process_takes():
     assert peak_memory() > 2**22  # bytes, and not KiB or pages: an interpreter alone takes more
     assert peak_memory() >= before
     assert len(held) == 2**26
+
+
+@pytest.mark.parametrize("platform", [sys.platform, "win32"])
+def test_the_time_of_a_thread_is_seen_from_another(monkeypatch, platform):
+    """By the clock of Linux, and by what psutil lists elsewhere."""
+    monkeypatch.setattr(system.sys, "platform", platform)
+    clocks, ended = [], threading.Event()
+
+    def burn():
+        clocks.append(thread_clock())
+        while time.thread_time() < 0.3:
+            pass
+        clocks.append(None)
+        ended.wait(60)
+
+    thread = threading.Thread(target=burn)
+    thread.start()
+    while len(clocks) < 2:
+        time.sleep(0.01)
+    seen = clocks[0]()
+    ended.set()
+    thread.join()
+    assert seen == pytest.approx(0.3, abs=0.05)  # counted in hundredths elsewhere
 
 
 def test_processes_are_forked_from_a_server_on_linux_alone(monkeypatch):

@@ -36,7 +36,6 @@ def burn(seconds):
         pass
 
 
-@pytest.mark.skipif(not hasattr(time, "pthread_getcpuclockid"), reason="the system has no clock of another thread")
 def test_what_goes_on_beside_the_work_is_counted_there_and_not_with_the_work():
     """CPU time, not the clock: half a second of it in a thread, over two stages of the work."""
     timings, half = Timings(), threading.Event()
