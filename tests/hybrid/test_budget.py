@@ -102,6 +102,15 @@ def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, caplog, ask
 def test_a_budget_and_a_preset_are_not_both_chosen(tmp_path):
     pytest.importorskip("torch")
     shot = str(SCENE.write(tmp_path / "in"))
-    for options in (["--budget", "9s"], ["--preset", "auto"], ["--preset", "auto", "--budget", "9s", "--weights", "w"]):
+    for options in (
+        ["--budget", "9s", "--preset", "fast"],
+        ["--preset", "auto"],
+        ["--preset", "auto", "--budget", "9s", "--weights", "w"],
+    ):
         assert cli.main(["denoise", shot, "-o", str(tmp_path / "out"), *options]) == 2
     assert cli.main(["denoise", shot, "-o", str(tmp_path / "out"), "--preset", "auto", "--budget", "soon"]) == 2
+
+
+def test_a_budget_alone_chooses_the_preset():
+    assert DenoiseOptions(budget="9s").preset == "auto"
+    assert DenoiseOptions().preset == "fast"

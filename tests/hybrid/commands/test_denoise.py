@@ -133,7 +133,8 @@ def test_old_names_are_those_of_commands_and_options_that_are_there():
     "options",
     [
         ["--preset", "auto"],
-        ["--budget", "5s"],
+        ["--budget", "5s", "--preset", "fast"],
+        ["--budget", "5s", "--method", "classical"],
         ["--method", "classical", "--preset", "fast"],
         ["--method", "classical", "--passes", "2"],
         ["--method", "classical", "--tile", "64"],
