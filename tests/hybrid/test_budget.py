@@ -96,7 +96,7 @@ def test_the_most_accurate_that_fits_is_taken(tmp_path, monkeypatch, caplog, ask
     assert len(measured) == tried  # nothing is measured that is not needed
     said = caplog.text
     assert f"preset: {chosen}" in said
-    assert ("not even the fastest" in said) == (asked == "1s")
+    assert ("no preset fits --budget 1s: the fastest is used" in said) == (asked == "1s")
 
 
 def test_a_budget_and_a_preset_are_not_both_chosen(tmp_path):
