@@ -229,6 +229,7 @@ def test_every_page_is_in_the_index():
     assert {page for page in PAGES if page not in (ROOT / "README.md", ROOT / "docs" / "README.md")} <= linked
 
 
+@pytest.mark.posix
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("index", [0, 1])
 def test_python_of_the_documentation_runs(index, capsys):
