@@ -1,0 +1,73 @@
+"""How many times each stage runs while ten frames are denoised: once for a frame, a pair or a window."""
+
+from __future__ import annotations
+
+import collections
+
+import pytest
+
+from hybrid import stabilize, stream
+from hybrid.alignment import align, flows
+from hybrid.files.shots import Shot, open_shot
+from hybrid.first_pass import PerFrame
+from hybrid.plan import Rules
+from hybrid.stabilize import Denoised
+from tests.scenes import Scene, denoise_view
+
+FRAMES, RADIUS = 10, 2
+# Neighbours one and two frames away that all windows have together; the flow to one two frames away, and its flow back,
+# are composed.
+NEXT, SECOND = 2 * (FRAMES - 1), 2 * (FRAMES - 2)
+EXPECTED = {
+    "read": FRAMES,
+    "prepare": FRAMES,
+    "remove_fireflies": FRAMES,
+    "shrink": FRAMES,
+    "measure_frame": FRAMES,
+    "measure_pair": FRAMES - 1,
+    "measure_flows": FRAMES - 1,
+    "first pass": FRAMES,
+    "compose_flow": 2 * SECOND,
+    "align": FRAMES,
+    "trust_geometry": NEXT + SECOND,
+    "denoise": FRAMES,
+    "align_results": FRAMES,
+    "find_bright": FRAMES,
+    "restore_mean": FRAMES,
+    "blend_samples": FRAMES,
+}
+
+
+@pytest.fixture
+def count(monkeypatch):
+    """Count the calls of functions by their names."""
+    counts: collections.Counter[str] = collections.Counter()
+
+    def counted(name, function):
+        def call(*arguments, **named):
+            counts[name] += 1
+            return function(*arguments, **named)
+
+        return call
+
+    def watch(owner, name):
+        monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
+
+    for name in ("prepare", "remove_fireflies", "shrink", "measure_frame", "measure_pair", "measure_flows"):
+        watch(stream, name)
+    for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):
+        watch(stabilize, name)
+    watch(align, "trust_geometry")
+    watch(flows, "compose_flow")
+    watch(Shot, "read")
+    return counts, counted
+
+
+def test_each_stage_runs_once(tmp_path, count):
+    counts, counted = count
+    shot = open_shot(Scene(frames=FRAMES, noise=0.1).write(tmp_path / "in"))
+    first_pass = PerFrame(counted("first pass", lambda frame: frame.color.copy()))
+    denoise = counted("denoise", lambda aligned: Denoised(aligned.first_pass[RADIUS] * aligned.modulation))
+    for _ in denoise_view(shot, tmp_path / "out", denoise, Rules(), first_pass, radius=RADIUS):
+        pass
+    assert dict(counts) == EXPECTED
