@@ -159,24 +159,34 @@ def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np
 
 def _decode(vectors: np.ndarray, convention: MotionConvention) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        flow = np.array(vectors[..., :2], np.float32)
+        flow = np.asarray(vectors[..., :2], np.float32)
         if convention.encoding != "plain":
             flow = 2 * flow - 1
         if convention.encoding == "magnitude":
-            flow *= vectors[..., 2:3]
+            flow = np.asarray(flow * vectors[..., 2:3], np.float32)
         if convention.offset:
-            flow += np.float32(convention.offset)
+            flow = flow + np.float32(convention.offset)
     return flow
 
 
-def _to_pixels(flow: np.ndarray, unit: np.ndarray) -> Vectors:
-    """Convert to pixels, in place; 0 and False where a vector is not finite or absurdly long."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        flow *= unit
-    # Written so that NaN compares false; by planes, which is faster than over so short an axis.
-    valid = (np.abs(flow[..., 0]) <= ABSURD_LENGTH) & (np.abs(flow[..., 1]) <= ABSURD_LENGTH)
-    flow[~valid] = 0
-    return Vectors(flow, valid)
+def _to_pixels(decoded: np.ndarray, unit: np.ndarray) -> Vectors:
+    """Convert to pixels; 0 and False where a vector is not finite or absurdly long."""
+    vectors = Vectors(np.empty(decoded.shape, np.float32), np.empty(decoded.shape[:2], np.bool_))
+    run_bands(_scale, len(decoded), decoded[..., 0], decoded[..., 1], unit, *vectors)
+    return vectors
+
+
+@njit(nogil=True, cache=True)
+def _scale(
+    first: int, last: int, x_of: np.ndarray, y_of: np.ndarray, unit: np.ndarray, flow: np.ndarray, valid: np.ndarray
+) -> None:
+    longest, zero = np.float32(ABSURD_LENGTH), np.float32(0)
+    for y in range(first, last):
+        for x in range(valid.shape[1]):
+            u, v = x_of[y, x] * unit[0], y_of[y, x] * unit[1]
+            known = abs(u) <= longest and abs(v) <= longest  # NaN compares false
+            valid[y, x] = known
+            flow[y, x, 0], flow[y, x, 1] = u if known else zero, v if known else zero
 
 
 def compose_flow(

@@ -6,7 +6,7 @@ A persistent highlight is a light of one or two pixels that neighbouring frames 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -84,14 +84,17 @@ def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
     return places, found[places[:, 0], places[:, 1]] == _ISOLATED
 
 
-def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = None) -> Highlights:
+def measure_highlights(
+    color: Floats, pixels: Places, factor: Callable[[Places, Places], Floats | None] = lambda *_: None
+) -> Highlights:
     """Measure position, light and pattern of bright pixels above their surroundings.
 
     Parameters
     ----------
     color : (H, W, C) float32, radiance or irradiance, finite
     pixels : (K, 2) intp, anywhere, also outside the frame
-    factor : (H, W, C) float32, optional, factor from `color` to radiance
+    factor : callable
+        From rows and columns (K, y, x) to the factor (K, y, x, C) from `color` to radiance there, or None.
 
     Notes
     -----
@@ -101,8 +104,8 @@ def measure_highlights(color: Floats, pixels: Places, factor: Floats | None = No
     rows, columns, inside = _blocks(pixels, color.shape)
     block = color[rows, columns].astype(np.float64)
     core = (block - _around(block, inside)[:, None, None])[:, 1:4, 1:4] * inside[:, 1:4, 1:4, None]
-    if factor is not None:
-        core *= factor[rows, columns][:, 1:4, 1:4]
+    if (scale := factor(rows[:, 1:4, 1:4], columns[:, 1:4, 1:4])) is not None:
+        core *= scale
     light = core.sum(axis=(1, 2))
     light[~inside[:, 2, 2]] = np.nan
     pattern = core.mean(axis=-1)

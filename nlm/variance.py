@@ -92,12 +92,16 @@ def smooth_variance(variance: Floats) -> Floats:
     # Squares of more than 1e18 overflow, and an infinity would spoil the filters' running sums.
     variance = np.minimum(variance, np.float32(1e36))
     means = np.asarray(cv2.blur(variance, (3, 3)), np.float32).reshape(variance.shape)
-    # plane by plane: medianBlur takes at most four channels
-    median = np.stack([cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])], -1)
-    cut = np.minimum(variance, np.float32(_CAP) * median)
+    if variance.shape[-1] == 3:
+        median = np.asarray(cv2.medianBlur(means, 5), np.float32)
+    else:  # plane by plane: medianBlur takes at most four channels
+        planes = [cv2.medianBlur(np.ascontiguousarray(means[..., c]), 5) for c in range(variance.shape[-1])]
+        median = np.stack(planes, -1)
+    median *= np.float32(_CAP)
+    cut = np.minimum(variance, median, out=median)
     # Running sums beside values of 1e24 round to below 0.
     smooth = np.asarray(cv2.blur(cut, (2 * _RADIUS + 1, 2 * _RADIUS + 1)), np.float32)
-    return np.maximum(smooth, 0).reshape(variance.shape)
+    return np.maximum(smooth, 0, out=smooth).reshape(variance.shape)
 
 
 def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
@@ -113,9 +117,8 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     guides, confidence = check_window(guides, confidence, "confidence")
     temporal, trust = _temporal_variance(guides, confidence)
     spatial = variance_from_residual(guides[guides.shape[0] // 2])
-    # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
-    variance = np.maximum(np.minimum(_fade(temporal, spatial, trust), spatial), np.float32(1e-8))
-    noisy = np.logical_or.reduce([variance[..., c] > _NOISELESS for c in range(variance.shape[-1])])
+    variance, noisy = np.empty_like(spatial), np.empty(trust.shape, np.bool_)
+    run_bands(_lesser_variance, len(trust), temporal, spatial, trust, variance, noisy)
     return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0, where=noisy)
 
 
@@ -152,3 +155,21 @@ def _centre_deviation(
                         mean += confidence[t, y, x] * window[t, y, x, c]
                 difference = window[centre, y, x, c] - mean / total
                 deviation[y, x, c] = difference**2 / (1 + np.float32(_WARPED) * squares / (total * total))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lesser_variance(
+    first: int, last: int, temporal: Floats, spatial: Floats, trust: Floats, variance: Floats, noisy: NDArray[np.bool_]
+) -> None:
+    """Write the lesser of both variances, the temporal one as `_fade` has it, and where there is noise."""
+    # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
+    least = np.float32(1e-8)
+    for y in range(first, last):
+        for x in range(trust.shape[1]):
+            noise = False
+            for c in range(spatial.shape[2]):
+                faded = spatial[y, x, c] + trust[y, x] * (temporal[y, x, c] - spatial[y, x, c])
+                faded = temporal[y, x, c] if trust[y, x] >= np.float32(1) else faded
+                variance[y, x, c] = max(min(faded, spatial[y, x, c]), least)
+                noise = noise or variance[y, x, c] > _NOISELESS
+            noisy[y, x] = noise

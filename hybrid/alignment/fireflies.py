@@ -71,7 +71,7 @@ def _find_highlights(
     the motion, or the one that there is.
     """
     rough = measure_highlights(frame.irradiance, places)
-    centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor)
+    centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor_at)
     asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
     alone = np.ones(len(places), bool)
     still = np.zeros_like(centre.points)
@@ -90,7 +90,7 @@ def _find_highlights(
             moved[side] = moved[side] + _motion(last[side], there, nearest_pixel(centre.points + moved[side]))
             last[side] = there
             pixels = follow_motion(centre, moved[side])
-            lights = measure_highlights(there.irradiance, pixels, there.divisor)
+            lights = measure_highlights(there.irradiance, pixels, there.divisor_at)
             fresh = np.isfinite(lights.light).all(axis=1)
             for other, before in compared:
                 fresh &= not repeats(other.irradiance, there.irradiance)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.motion import Motion, invert_flow
-from hybrid.alignment.transfer import compress, demodulate, measure_exposure, remodulate
+from hybrid.alignment.transfer import ALBEDO_FLOOR, compress, demodulate, measure_exposure, remodulate
 from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
 from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers
@@ -94,12 +94,11 @@ class PreparedFrame:
         guides = [layer for layer in (self.albedo, self.normal) if layer is not None]
         return np.concatenate(guides, axis=-1) if guides else None
 
-    @property
-    def divisor(self) -> Array | None:
-        """Radiance per irradiance (H, W, 3); None if both are the same."""
+    def divisor_at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array | None:
+        """Radiance per irradiance (..., 3) at some pixels (...); None if both are the same."""
         if self.albedo is None or not self.demodulated:
             return None
-        return remodulate(np.ones_like(self.irradiance), self.albedo)
+        return np.maximum(self.albedo[rows, columns], 0) + np.float32(ALBEDO_FLOOR)
 
     @property
     def radiance(self) -> Array:
