@@ -354,7 +354,8 @@ def _summarize_input(request: Request, job: Job) -> None:
     numbers = f"{format_frames(view.numbers)} ({len(view.numbers)})"
     facts = [f"frames {numbers}", f"{width}×{height}", layers.profile, *samples]
     summarize("Input", f"{request.shot.shot}, {', '.join(facts)}")
-    used = [words for role, words in ROLES_IN_WORDS.items() if getattr(layers, role) is not None]
+    found = {words: layer for role, words in ROLES_IN_WORDS.items() if (layer := getattr(layers, role)) is not None}
+    used = [f"{words} ({layer.file})" if layer.file else words for words, layer in found.items()]
     missing = [f"{ROLES_IN_WORDS[role]} ({loss})" for role, loss in LOSSES.items() if getattr(layers, role) is None]
     summarize("Passes", "; without ".join([", ".join(used), *filter(None, [", ".join(missing)])]))
     later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
@@ -436,7 +437,7 @@ class _Report:
                 LOG.warning(f"constant seed: {decision.reason}")
         if self.fireflies:
             frames = format_frames(sorted(self.fireflies))
-            summarize("Note", f"{sum(self.fireflies.values())} fireflies removed, in frames {frames}")
+            summarize("Note", f"fireflies removed: {sum(self.fireflies.values())} (frames {frames})")
         table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
         for row in timings.rows(self.pixels):
             table.add_row(*row)
