@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import sys
 import time
@@ -51,13 +52,13 @@ def decibels(a: Tensor, b: Tensor) -> float:
     return float(-10 * torch.log10(torch.mean((a / (1 + a) - b / (1 + b)).double() ** 2)))
 
 
-def compare(name: str, images: list[np.ndarray], threads: int, rounds: int) -> dict[str, object]:
+def compare(name: str, images: list[np.ndarray], rounds: int) -> dict[str, object]:
     quality, clean = MODES[name]
     layers = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in images]
     exact = load_oidn(name)
     rounded = round_unet(exact)
     runs: dict[str, Callable[[], Any]] = {
-        "oidn": lambda: denoise_oidn(*images, quality=quality, clean=clean, threads=threads),
+        "oidn": lambda: denoise_oidn(*images, quality=quality, clean=clean),
         "float32": lambda: denoise_color(exact, *layers, exposure=autoexposure(images[0])),
         "bfloat16": lambda: denoise_color(rounded, *layers, exposure=autoexposure(images[0])),
     }
@@ -80,12 +81,13 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     reuse_freed_memory()  # as the commands do
     torch.set_num_threads(options.threads)
+    os.environ["OIDN_NUM_THREADS"] = str(options.threads)
     width, height = map(int, options.size.split("x"))
     shot = Path(__file__).resolve().parent.parent / "examples" / "shot"
     frame = open_shot(str(shot / "noisy.####.exr")).read(11)
     rows, columns = (np.arange(length) % side for length, side in zip((height, width), frame.color.shape, strict=False))
     images = [layer[np.ix_(rows, columns)] for layer in (frame.color, frame.albedo, frame.normal)]
-    figures = {name: compare(name, images, options.threads, options.rounds) for name in MODES}
+    figures = {name: compare(name, images, options.rounds) for name in MODES}
     settings = {"size": options.size, "threads": options.threads, "torch": torch.__version__}
     json.dump({**settings, **figures}, sys.stdout, indent=1)
     return 0

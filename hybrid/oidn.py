@@ -33,7 +33,6 @@ def denoise_oidn(
     prefilter: Quality | None = None,
     clean: bool = False,
     scale: float | None = None,
-    threads: int = 0,
     device: str = "cpu",
 ) -> NDArray[np.float32]:
     """Denoise one frame with OIDN's ray-tracing filter in HDR mode (Áfra 2025, https://www.openimagedenoise.org).
@@ -57,8 +56,6 @@ def denoise_oidn(
     scale : float, optional
         What color is multiplied by before the network sees it; measured by OIDN if not given. Part of a frame needs the
         whole frame's (`hybrid.alignment.transfer.autoexposure`).
-    threads : int
-        0 leaves the choice to OIDN (all cores).
     device : str
         "cpu", "cuda", "hip", "sycl" or "metal" (`find_device`).
 
@@ -77,16 +74,16 @@ def denoise_oidn(
         raise ValueError("normal without albedo: OIDN has no such filter; pass both, or neither")
     if prefilter is not None:
         for name in guides:
-            images[name] = _execute({name: images[name]}, prefilter, threads, device)
+            images[name] = _execute({name: images[name]}, prefilter, device)
     clean = (prefilter is not None or clean) and bool(guides)
-    return _execute(images, quality, threads, device, scale, hdr=True, cleanAux=clean)
+    return _execute(images, quality, device, scale, hdr=True, cleanAux=clean)
 
 
 @lru_cache(maxsize=1)
 def why_no_oidn() -> str | None:
     """Say why OIDN cannot be had here: None where it can."""
     try:
-        _device(0, "cpu")
+        _device("cpu")
     except ImportError as error:
         # The package may be there, and not what it imports.
         return "pyoidn is not installed" if isinstance(error.__cause__, ModuleNotFoundError) else f"pyoidn: {error}"
@@ -108,13 +105,12 @@ def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np
 def _execute(
     images: dict[str, NDArray[np.float32]],
     quality: str,
-    threads: int,
     where: str,
     scale: float | None = None,
     **flags: bool,
 ) -> NDArray[np.float32]:
     """Run one filter over `images`."""
-    oidn, device = _device(threads, where)
+    oidn, device = _device(where)
     qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,
                  "fast": oidn.OIDN_QUALITY_FAST}  # fmt: skip
     if quality not in qualities:
@@ -146,7 +142,7 @@ def _execute(
 @contextmanager
 def _reachable(oidn: Any, device: Any, images: dict[str, NDArray[np.float32]]) -> Iterator[dict[str, Any]]:
     """The images where the device can reach them: as they are, or copied to buffers of its own."""
-    if _reads_memory(device):
+    if device.get_bool("systemMemorySupported"):  # as processors and few others read what a program has allocated
         yield dict(images)
         return
     buffers = {name: oidn.Buffer(device, image.nbytes) for name, image in images.items()}
@@ -158,11 +154,6 @@ def _reachable(oidn: Any, device: Any, images: dict[str, NDArray[np.float32]]) -
     finally:
         for buffer in buffers.values():
             buffer.release()
-
-
-def _reads_memory(device: Any) -> bool:
-    """Whether a device reads what a program has allocated, as processors and few others do."""
-    return bool(device.get_bool("systemMemorySupported"))
 
 
 def find_device(name: str) -> str:
@@ -179,15 +170,15 @@ def find_device(name: str) -> str:
 
 def _has_device(kind: str) -> bool:
     try:
-        _device(0, kind)
+        _device(kind)
     except RuntimeError:
         return False
     return True
 
 
 @lru_cache(maxsize=2)
-def _device(threads: int, kind: str) -> tuple[Any, Any]:
-    """The module and a device with that many threads; making one costs as much as a small frame."""
+def _device(kind: str) -> tuple[Any, Any]:
+    """The module and a device, on all cores or OIDN_NUM_THREADS; to open one costs as much as a small frame."""
     if kind not in DEVICES:
         raise ValueError(f"device is {kind!r}, expected one of {', '.join(DEVICES)}")
     try:
@@ -196,8 +187,6 @@ def _device(threads: int, kind: str) -> tuple[Any, Any]:
         raise ImportError('OIDN needs the package pyoidn; expected: pip install "pyoidn"') from error
     device = pyoidn.Device(getattr(pyoidn, f"OIDN_DEVICE_TYPE_{kind.upper()}"))
     _check(device)
-    if kind == "cpu":
-        device.set_int("numThreads", threads)
     device.commit()
     _check(device)
     return pyoidn, device

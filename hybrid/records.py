@@ -226,7 +226,7 @@ def _is_record(document: Any) -> bool:
         and all(type(number) is int and abs(number) < 2**63 for number in document["asked"])
         and isinstance(get("frames"), dict)
         and all(_is_entry(number, entry) for number, entry in document["frames"].items())
-        and _are_different([e["file"] for e in document["frames"].values() if e["state"] != "failed"])
+        and len(files := [e["file"] for e in document["frames"].values() if e["state"] != "failed"]) == len({*files})
     )
 
 
@@ -239,11 +239,6 @@ def _is_entry(number: str, entry: Any) -> bool:
     # A bare name: a file in another folder is no frame of this one.
     plain = isinstance(file, str) and file not in ("", ".", "..") and not {"/", "\\", ":", "\0"} & {*file}
     return entry.get("state") in ("made", "there") and plain and _is_amount(entry.get("seconds"))
-
-
-def _are_different(names: Sequence[str]) -> bool:
-    """Whether no two frames have one file."""
-    return len({*names}) == len(names)
 
 
 def _is_amount(value: Any) -> bool:

@@ -26,7 +26,7 @@ from hybrid.files.profile import ROLES
 from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
-from hybrid.passes import classify_passes, sample_rows
+from hybrid.pass_sums import classify_passes, sample_rows
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -22,18 +22,18 @@ from uuid import uuid4
 import typer
 
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import resource_option
+from hybrid.commands.options import of_resources
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 SchedulerOption = Annotated[
     str | None,
-    resource_option(
+    of_resources(
         "Dask scheduler, such as tcp://host:8786, whose workers run the command over shared folders",
         metavar="ADDRESS",
         envvar="RAVG_SCHEDULER",
     ),
 ]
-ChunkOption = Annotated[int, resource_option("frames in a chunk of --scheduler", min=1, metavar="N")]
+ChunkOption = Annotated[int, of_resources("frames in a chunk of --scheduler", min=1, metavar="N")]
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
 # Seconds that a connection may take.
@@ -144,8 +144,10 @@ def run_chunk(name: str, arguments: Sequence[str], folder: str, topic: str) -> s
     environment = {key: value for key, value in os.environ.items() if key not in ("RAVG_SCHEDULER", "RAVG_LOG_FILE")}
     if not Path(folder).is_dir():
         return f"there is no folder {folder} on {worker.address}, expected shared folders with the same paths"
+    positional = list(arguments).index("--")
+    words = [*arguments[:positional], "--log-format=json", *arguments[positional:]]
     process = subprocess.Popen(
-        [sys.executable, "-m", "hybrid.cli", *_before_positional(arguments, "--log-format=json")],
+        [sys.executable, "-m", "hybrid.cli", *words],
         cwd=folder,
         env={**environment, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1"},
         stdin=subprocess.DEVNULL,
@@ -176,8 +178,3 @@ def run_chunk(name: str, arguments: Sequence[str], folder: str, topic: str) -> s
         worker.log_event(topic, {"chunk": name, **record})
     code = process.wait()
     return "" if code == 0 else f"ended with {code} on {worker.address}: {last}"
-
-
-def _before_positional(arguments: Sequence[str], word: str) -> list[str]:
-    at = list(arguments).index("--")
-    return [*arguments[:at], word, *arguments[at:]]

@@ -14,19 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.console import Console
 
+from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import (
-    FramesOption,
-    LayerOption,
-    MotionOption,
-    ProfileOption,
-    RateOption,
-    StrictOption,
-    choose,
-    input_option,
-    method_option,
-    output_option,
-)
 from hybrid.commands.shots import log_cuts, open_input, validate_renders
 from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot
@@ -55,60 +44,60 @@ def compare(
     ] = None,
     reference: Annotated[
         list[str] | None,
-        input_option(
+        opt.of_input(
             "the same frames at many samples; given twice: two independent halves, whose noise cancels",
             metavar="PATTERN",
         ),
     ] = None,
     output: Annotated[
-        Path | None, output_option("folder for a page with chart and pictures", "-o", "--output", metavar="REPORT")
+        Path | None, opt.of_output("folder for a page with chart and pictures", "-o", "--output", metavar="REPORT")
     ] = None,
     methods: Annotated[
-        str | None, method_option("methods to run, with commas between (default: all)", metavar="NAMES")
+        str | None, opt.of_method("methods to run, with commas between (default: all)", metavar="NAMES")
     ] = None,
     external: Annotated[
-        list[str] | None, input_option("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
+        list[str] | None, opt.of_input("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
     ] = None,
     external_seconds: Annotated[
         list[str] | None,
-        input_option("seconds per frame of an --external denoiser; may be repeated", metavar="NAME=SECONDS"),
+        opt.of_input("seconds per frame of an --external denoiser; may be repeated", metavar="NAME=SECONDS"),
     ] = None,
-    sweep: Annotated[bool, method_option("also vary stages and settings, one at a time", "--sweep")] = False,
-    rounds: Annotated[int, method_option("runs of each method, in turns; the time is their median", min=1)] = 3,
+    sweep: Annotated[bool, opt.of_method("also vary stages and settings, one at a time", "--sweep")] = False,
+    rounds: Annotated[int, opt.of_method("runs of each method, in turns; the time is their median", min=1)] = 3,
     samples: Annotated[
         float | None,
-        input_option(
+        opt.of_input(
             "samples per pixel of SHOT, unless its files state them, as those of Cycles do", metavar="SPP", min=1
         ),
     ] = None,
     level: Annotated[
         list[str] | None,
-        input_option(
+        opt.of_input(
             "SHOT at other samples per pixel, to measure how the noise falls; may be repeated", metavar="PATTERN=SPP"
         ),
     ] = None,
-    exposure: Annotated[float, method_option("factor on radiance before the tone curve of the measures")] = 1.0,
-    clock: Annotated[Literal["wall", "cpu"], output_option("time in chart.png and in the Markdown table")] = "wall",
-    markdown: Annotated[bool, output_option("print the table as Markdown", "--markdown")] = False,
+    exposure: Annotated[float, opt.of_method("factor on radiance before the tone curve of the measures")] = 1.0,
+    clock: Annotated[Literal["wall", "cpu"], opt.of_output("time in chart.png and in the Markdown table")] = "wall",
+    markdown: Annotated[bool, opt.of_output("print the table as Markdown", "--markdown")] = False,
     name: Annotated[
-        str | None, output_option("name of the shot in tables and on the page (default: its folder's name)")
+        str | None, opt.of_output("name of the shot in tables and on the page (default: its folder's name)")
     ] = None,
     with_report: Annotated[
         list[Path] | None,
-        input_option("folder of a finished comparison of another shot, to include; may be repeated", metavar="REPORT"),
+        opt.of_input("folder of a finished comparison of another shot, to include; may be repeated", metavar="REPORT"),
     ] = None,
-    fps: RateOption = 24,
+    fps: opt.RateOption = 24,
     movies: Annotated[
-        bool, output_option("also write a movie of each method in full size, next to the page", "--movies")
+        bool, opt.of_output("also write a movie of each method in full size, next to the page", "--movies")
     ] = False,
     keep_frames: Annotated[
-        bool, output_option("also write the frames of each method as EXR, next to the page", "--keep-frames")
+        bool, opt.of_output("also write the frames of each method as EXR, next to the page", "--keep-frames")
     ] = False,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
-    strict: StrictOption = False,
+    frames: opt.FramesOption = None,
+    layer: opt.LayerOption = None,
+    profile: opt.ProfileOption = None,
+    motion: opt.MotionOption = None,
+    strict: opt.StrictOption = False,
 ) -> None:
     """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.
 
@@ -277,8 +266,8 @@ def _methods(
     frames: str | None,
 ) -> dict[str, Method]:
     """The requested methods, and sequences of other denoisers with their seconds per frame."""
-    wanted = METHODS if names is None else {n.strip(): choose(METHODS, n.strip(), "methods") for n in names.split(",")}
-    chosen = dict(wanted)
+    wanted = METHODS if names is None else map(str.strip, names.split(","))
+    chosen = {name: opt.choose(METHODS, name, "methods") for name in wanted}
     for item in external or ():
         name, separator, pattern = item.partition("=")
         if not separator or not name or not pattern:

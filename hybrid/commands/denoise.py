@@ -18,34 +18,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hybrid.commands import options as opt
 from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
-from hybrid.commands.options import (
-    AovOption,
-    DeviceOption,
-    FirstPassOption,
-    FramesOption,
-    KeepGoingOption,
-    KeepOption,
-    LayerOption,
-    MemoryOption,
-    MotionOption,
-    OffOption,
-    OnOption,
-    OutputOption,
-    PixelsOption,
-    PreviewOption,
-    ProfileOption,
-    RateOption,
-    ResumeOption,
-    SheetOption,
-    ShotArgument,
-    StrictOption,
-    method_option,
-    output_option,
-    resource_option,
-    usage,
-)
 from hybrid.commands.shots import (
     ShotInput,
     expect_views_apart,
@@ -99,7 +74,7 @@ class Request:
     fps: float
 
     def __post_init__(self) -> None:
-        with usage():
+        with opt.usage():
             if self.preview is not None:
                 check_preview(self.preview)
             if self.contact_sheet is not None:
@@ -114,16 +89,16 @@ class Request:
 
 def denoise(
     context: typer.Context,
-    shot: ShotArgument,
-    output: OutputOption,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
-    strict: StrictOption = False,
+    shot: opt.ShotArgument,
+    output: opt.OutputOption,
+    frames: opt.FramesOption = None,
+    layer: opt.LayerOption = None,
+    profile: opt.ProfileOption = None,
+    motion: opt.MotionOption = None,
+    strict: opt.StrictOption = False,
     method: Annotated[
         Literal["network", "classical", "pooled"] | None,
-        method_option(
+        opt.of_method(
             "network: Robust Average network (needs torch); classical: non-local means, guided filter, or the average "
             "of first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)"
         ),
@@ -131,7 +106,7 @@ def denoise(
     preset: Annotated[
         Literal["fast", "balanced", "quality", "tkpcn", "auto", "draft", "standard", "final", "pooled", "gathered"]
         | None,
-        method_option(
+        opt.of_method(
             "network: fast (default), balanced, quality, or auto (the best that fits --budget); classical: draft, "
             "standard (default), final; pooled: pooled",
             metavar="NAME",
@@ -139,25 +114,25 @@ def denoise(
     ] = None,
     budget: Annotated[
         str | None,
-        method_option("longest time per frame, such as 10s; takes the most accurate preset that fits", metavar="TIME"),
+        opt.of_method("longest time per frame, such as 10s; takes the most accurate preset that fits", metavar="TIME"),
     ] = None,
     weights: Annotated[
-        Path | None, method_option("weights file of ravg train, in place of a preset", metavar="FILE")
+        Path | None, opt.of_method("weights file of ravg train, in place of a preset", metavar="FILE")
     ] = None,
     threshold: Annotated[
         float | None,
-        method_option(
+        opt.of_method(
             "for --weights that predict kernels: drop kernel taps below this share (default: as trained)",
             min=0,
             max=0.99,
             metavar="SHARE",
         ),
     ] = None,
-    first_pass: FirstPassOption = None,
-    keep_first_pass: KeepOption = None,
+    first_pass: opt.FirstPassOption = None,
+    keep_first_pass: opt.KeepOption = None,
     passes: Annotated[
         int,
-        method_option(
+        opt.of_method(
             "runs over the shot; each denoises the result of the one before: steadier, and softer",
             min=1,
             metavar="N",
@@ -165,24 +140,24 @@ def denoise(
     ] = 1,
     breakdown: Annotated[
         Path | None,
-        output_option(
+        opt.of_output(
             "write an image of how much each frame of the window contributes; adds these weights as layers",
             metavar="PNG",
         ),
     ] = None,
-    aov: AovOption = None,
+    aov: opt.AovOption = None,
     aov_sum: Annotated[
         Literal["layers", "beauty"],
-        method_option("how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum"),
+        opt.of_method("how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum"),
     ] = "layers",
-    preview: PreviewOption = None,
-    fps: RateOption = 24,
-    contact_sheet: SheetOption = None,
-    stages: OnOption = None,
-    no_stages: OffOption = None,
+    preview: opt.PreviewOption = None,
+    fps: opt.RateOption = 24,
+    contact_sheet: opt.SheetOption = None,
+    stages: opt.OnOption = None,
+    no_stages: opt.OffOption = None,
     tile: Annotated[
         int | None,
-        resource_option(
+        opt.of_resources(
             "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
             min=16,
             metavar="N",
@@ -190,16 +165,16 @@ def denoise(
     ] = None,
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
-        resource_option(
+        opt.of_resources(
             "number format of the network; auto: bfloat16 on processors that have it, else float32",
             envvar="RAVG_PRECISION",
         ),
     ] = "auto",
-    device: DeviceOption = "auto",
-    resume: ResumeOption = False,
-    keep_going: KeepGoingOption = False,
-    max_memory: MemoryOption = None,
-    max_pixels: PixelsOption = None,
+    device: opt.DeviceOption = "auto",
+    resume: opt.ResumeOption = False,
+    keep_going: opt.KeepGoingOption = False,
+    max_memory: opt.MemoryOption = None,
+    max_pixels: opt.PixelsOption = None,
     scheduler: SchedulerOption = None,
     chunk: ChunkOption = 10,
 ) -> None:
@@ -217,7 +192,7 @@ def denoise(
 
     ravg denoise "shot.####.exr" -o out --aov all --aov-sum beauty
     """
-    with usage():
+    with opt.usage():
         options = DenoiseOptions(
             method=method or "",
             preset=preset or "",
@@ -295,7 +270,7 @@ def _denoise(request: Request) -> None:
         output=request.output,
         preset=job.preset,
         options={**asdict(request.shot), **asdict(job.options), **job.settings},
-        estimate=job.first_pass,
+        first_pass=job.first_pass,
     )
     for number in shot.missing:
         record.add(number, "failed", error="there is no such frame")
@@ -407,8 +382,8 @@ class _Report:
             facts |= {"mean": light, "light_removed": share}
         stages = sorted(frame.plan.stages) if frame.plan else None
         self.record.add(frame.number, "there" if frame.resumed else "made", **facts, stages=stages)
-        judged = [vars(finding) for finding in self.findings]
-        self.record.write(self.job.timings, pixels=self.pixels, outliers=self.outliers, judged=judged)
+        findings = [vars(finding) for finding in self.findings]
+        self.record.write(self.job.timings, pixels=self.pixels, outliers=self.outliers, findings=findings)
         return f"frame {frame.number}{' was there' if frame.resumed else ''}"
 
     def _log(self, frame: Finished, share: float) -> None:
@@ -453,8 +428,8 @@ def _run(job: Job, record: Record) -> None:
     found = [finding.message for finding in job.report.findings if not finding.warning]
     for words in (*taken.notes, *found, *view.recompressed_parts(job.views[1:])):
         summarize("Note", words)
-    judged = [vars(finding) for finding in job.report.findings]
-    record.write(job.timings, layers=layers, warnings=view.warnings, judged=judged)
+    findings = [vars(finding) for finding in job.report.findings]
+    record.write(job.timings, layers=layers, warnings=view.warnings, findings=findings)
     report, bar = _Report(job, record), Progress("denoise", job.total())
 
     def advance(step: Step) -> None:

@@ -13,20 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress, printable
-from hybrid.commands.options import (
-    FramesOption,
-    LayerOption,
-    MotionOption,
-    OffOption,
-    OnOption,
-    PixelsOption,
-    ProfileOption,
-    ShotArgument,
-    StrictOption,
-    output_option,
-)
-from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, rules_of, views_of
+from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, split_stages, views_of
 from hybrid.files.layers import Layers, describe_layers
 from hybrid.job import validate_views
 from hybrid.plan import STAGES, Decision, Plan, Rules
@@ -34,16 +23,16 @@ from hybrid.stream import plan_shot
 
 
 def inspect(
-    shot: ShotArgument,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
-    strict: StrictOption = False,
-    stages: OnOption = None,
-    no_stages: OffOption = None,
-    as_json: Annotated[bool, output_option("print one JSON object", "--json")] = False,
-    max_pixels: PixelsOption = None,
+    shot: opt.ShotArgument,
+    frames: opt.FramesOption = None,
+    layer: opt.LayerOption = None,
+    profile: opt.ProfileOption = None,
+    motion: opt.MotionOption = None,
+    strict: opt.StrictOption = False,
+    stages: opt.OnOption = None,
+    no_stages: opt.OffOption = None,
+    as_json: Annotated[bool, opt.of_output("print one JSON object", "--json")] = False,
+    max_pixels: opt.PixelsOption = None,
 ) -> None:
     """Check a shot before denoising: its layers, motion vectors, and the stages that it needs.
 
@@ -54,7 +43,8 @@ def inspect(
     ravg inspect "shot.####.exr" --json > shot.json
     """
     read = ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion, max_pixels=max_pixels)
-    rules = rules_of(stages, no_stages)
+    with opt.usage():
+        rules = Rules(frozenset(split_stages(stages)), frozenset(split_stages(no_stages)))
     views = views_of(shot)
     expect_views_apart(views, read, {}, {})
     for view in views:
@@ -84,7 +74,8 @@ def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> N
             "warnings": shot.warnings,
             "profile": layers[0].profile,
             "reason": layers[0].reason,
-            "judged": [asdict(finding) for finding in findings],
+            "findings": [asdict(finding) for finding in findings],
+            "judged": [asdict(finding) for finding in findings],  # the old name, for one release
             "motion": report.readings(),
             **first,
             **({"others": others} if others else {}),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -22,8 +22,8 @@ def panel(title: str) -> Callable[..., Any]:
     return option
 
 
-input_option, method_option = panel("Input"), panel("Method")
-output_option, resource_option = panel("Output"), panel("Resources")
+of_input, of_method = panel("Input"), panel("Method")
+of_output, of_resources = panel("Output"), panel("Resources")
 
 # Stages in the order of `hybrid.plan.STAGES`, which this module cannot import: a test compares them.
 STAGE_NAMES = (
@@ -34,7 +34,7 @@ STAGE_NAMES = (
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
 DeviceOption = Annotated[
     Device,
-    resource_option(
+    of_resources(
         "device for ravg's networks and OIDN's; auto: the first available of cuda, hip, sycl, cpu",
         "--device",
         envvar="RAVG_DEVICE",
@@ -59,7 +59,7 @@ ShotArgument = Annotated[
 ]
 OutputOption = Annotated[
     str,
-    output_option(
+    of_output(
         "denoised frames: OUT.####.exr, or a folder, which keeps the names of the input",
         "-o",
         "--output",
@@ -69,7 +69,7 @@ OutputOption = Annotated[
 ]
 FramesOption = Annotated[
     str | None,
-    input_option(
+    of_input(
         "frames to use, such as 1001-1010, or 1001-1010x2 for every second one (default: all)",
         "--frames",
         metavar="RANGE",
@@ -77,7 +77,7 @@ FramesOption = Annotated[
 ]
 LayerOption = Annotated[
     list[str] | None,
-    input_option(
+    of_input(
         "use a layer as color, albedo, normal, depth, motion, variance, half_a, half_b or estimate; or the layer of "
         "another sequence: albedo=path/alb.####.exr, with :LAYER if that has several; repeatable (default: by the "
         "names of the renderer)",
@@ -87,7 +87,7 @@ LayerOption = Annotated[
 ]
 ProfileOption = Annotated[
     str | None,
-    input_option(
+    of_input(
         "renderer whose layer names and conventions apply, or a TOML file (docs/renderers.md; default: detect)",
         metavar="NAME|FILE",
         envvar="RAVG_PROFILE",
@@ -95,7 +95,7 @@ ProfileOption = Annotated[
 ]
 MotionOption = Annotated[
     str | None,
-    input_option(
+    of_input(
         "motion-vector convention, such as next,ndc,y-up,scale=2 (docs/renderers.md); auto: detect; none: ignore "
         "the vectors (default: the renderer's)",
         metavar="WORDS",
@@ -103,30 +103,24 @@ MotionOption = Annotated[
 ]
 StrictOption = Annotated[
     bool,
-    input_option("stop at implausible layers and at cuts (default: warn, and leave such layers out)", "--strict"),
+    of_input("stop at implausible layers and at cuts (default: warn, and leave such layers out)", "--strict"),
 ]
 PreviewOption = Annotated[
     Path | None,
-    output_option(
-        "noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames", metavar="FILE"
-    ),
+    of_output("noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames", metavar="FILE"),
 ]
-RateOption = Annotated[
-    float, output_option("frames per second at which movies and pages play", "--fps", min=1, max=240)
-]
+RateOption = Annotated[float, of_output("frames per second at which movies and pages play", "--fps", min=1, max=240)]
 SheetOption = Annotated[
-    Path | None, output_option("one image of frames from all over the shot", "--contact-sheet", metavar="PNG")
+    Path | None, of_output("one image of frames from all over the shot", "--contact-sheet", metavar="PNG")
 ]
 OnOption = Annotated[
     list[str] | None,
-    method_option(f"stages to force on, with commas between: {STAGE_NAMES}", "--stages", metavar="NAMES"),
+    of_method(f"stages to force on, with commas between: {STAGE_NAMES}", "--stages", metavar="NAMES"),
 ]
-OffOption = Annotated[
-    list[str] | None, method_option("stages to force off, as --stages", "--no-stages", metavar="NAMES")
-]
+OffOption = Annotated[list[str] | None, of_method("stages to force off, as --stages", "--no-stages", metavar="NAMES")]
 FirstPassOption = Annotated[
     str | None,
-    method_option(
+    of_method(
         "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
         "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
         "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
@@ -136,18 +130,18 @@ FirstPassOption = Annotated[
 ]
 KeepOption = Annotated[
     str | None,
-    output_option(
+    of_output(
         "keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
         "--keep-first-pass",
         metavar="OUT",
     ),
 ]
 ResumeOption = Annotated[
-    bool, output_option("skip frames that an earlier run with the same options has finished", "--resume")
+    bool, of_output("skip frames that an earlier run with the same options has finished", "--resume")
 ]
 KeepGoingOption = Annotated[
     bool,
-    output_option(
+    of_output(
         "continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
         "--keep-going",
         envvar="RAVG_KEEP_GOING",
@@ -155,7 +149,7 @@ KeepGoingOption = Annotated[
 ]
 MemoryOption = Annotated[
     str | None,
-    resource_option(
+    of_resources(
         "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
         metavar="SIZE",
         envvar="RAVG_MAX_MEMORY",
@@ -163,7 +157,7 @@ MemoryOption = Annotated[
 ]
 PixelsOption = Annotated[
     int | None,
-    resource_option(
+    of_resources(
         "refuse images with more pixels (default: 2^28, about 16384x16384)",
         metavar="N",
         min=1,
@@ -172,7 +166,7 @@ PixelsOption = Annotated[
 ]
 AovOption = Annotated[
     list[str] | None,
-    method_option(
+    of_method(
         "denoise this layer too; all: every light pass and light group; repeatable",
         "--aov",
         metavar="LAYER",
@@ -187,11 +181,6 @@ def check_first_pass(spec: str) -> str:
     with usage():
         check(spec)
     return spec
-
-
-def split_names(names: Sequence[str] | None) -> list[str]:
-    """Split names that are given one by one or separated by commas."""
-    return [name for item in names or () for name in item.split(",")]
 
 
 def choose(table: dict[str, Thing], name: str, option: str) -> Thing:

@@ -12,14 +12,14 @@ from typing import Any, TypeVar
 import typer
 
 from hybrid.commands.log import LOG, printable
-from hybrid.commands.options import split_names, usage
+from hybrid.commands.options import usage
 from hybrid.files.exr import MAX_PIXELS
 from hybrid.files.profile import ROLES, Profile, open_profile, parse_motion
 from hybrid.files.sequences import find_views, name_view, parse_frames
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sidecars import names_sequence
 from hybrid.job import import_neural as import_torch
-from hybrid.plan import OLD_NAMES, Plan, Rules
+from hybrid.plan import OLD_NAMES, Plan
 from hybrid.runtime.compiled import watch_compiling
 from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 
@@ -132,16 +132,12 @@ def expect_views_apart(
         return len({in_view(value, view) for view in views}) < len(views)
 
     different = not is_shared(Path(shot.shot).name)
-    names = {name: value for name, value in folders.items() if value and not (different and _is_folder(value))}
+    names = {n: v for n, v in folders.items() if v and not (different and not v.lower().endswith(".exr"))}
     names |= {name: str(value) for name, value in files.items() if value is not None}
     names |= {f"layer {role}": value for role, value in parse_layers(shot.layer).items() if names_sequence(value)}
     for name, value in names.items():
         if is_shared(value):
             raise typer.BadParameter(f"{name} is {value!r}, expected %V or %v in it, as the shot has")
-
-
-def _is_folder(value: str) -> bool:
-    return not value.lower().endswith(".exr")
 
 
 def open_input(
@@ -156,9 +152,9 @@ def open_input(
     return ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion).open()
 
 
-def log_findings(judgement: ValidationReport, views: Sequence[Shot]) -> None:
+def log_findings(report: ValidationReport, views: Sequence[Shot]) -> None:
     """Warn of each layer that makes no sense, and name the views where there are several."""
-    for warning in judgement.warnings:
+    for warning in report.warnings:
         LOG.warning(printable(warning))
     if len(views) > 1:
         colors = ", ".join(str(view.layers(view.numbers[0]).color) for view in views)
@@ -170,15 +166,15 @@ def validate_renders(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[s
 
     Findings are logged, and errors if `strict`. Of files with several views one has to be chosen.
     """
-    judged = {name: validate_layers(shot) for name, shot in shots.items()}
-    for name, judgement in judged.items():
+    reports = {name: validate_layers(shot) for name, shot in shots.items()}
+    for name, report in reports.items():
         prefix = f"{name}: " if len(shots) > 1 else ""
-        if strict and (warnings := [*shots[name].warnings, *judgement.warnings]):
+        if strict and (warnings := [*shots[name].warnings, *report.warnings]):
             raise ValueError(f"{prefix}{'; '.join(warnings)}")
-        for warning in judgement.warnings:
+        for warning in report.warnings:
             LOG.warning(printable(f"{prefix}{warning}"))
-    findings = tuple(dict.fromkeys(finding for judgement in judged.values() for finding in judgement.findings))
-    applied = {name: replace(judgement, findings=findings).apply(shots[name]) for name, judgement in judged.items()}
+    findings = tuple(dict.fromkeys(finding for report in reports.values() for finding in report.findings))
+    applied = {name: replace(report, findings=findings).apply(shots[name]) for name, report in reports.items()}
     return applied, [finding.message for finding in findings]
 
 
@@ -196,13 +192,8 @@ def log_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = 
 
 def split_stages(names: Sequence[str] | None) -> tuple[str, ...]:
     """Split names of stages, and log a line for each old one."""
-    for old in (stages := split_names(names)):
+    stages = [name for item in names or () for name in item.split(",")]
+    for old in stages:
         if old in OLD_NAMES:
             LOG.warning(f"stage {old} is now {OLD_NAMES[old]}; the old name goes in the next release")
     return tuple(OLD_NAMES.get(name, name) for name in stages)
-
-
-def rules_of(on: Sequence[str] | None, off: Sequence[str] | None) -> Rules:
-    """The stages that the user has forced."""
-    with usage():
-        return Rules(frozenset(split_stages(on)), frozenset(split_stages(off)))

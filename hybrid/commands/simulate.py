@@ -10,7 +10,7 @@ import typer
 
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import input_option, method_option, output_option, resource_option, usage
+from hybrid.commands.options import of_input, of_method, of_output, of_resources, usage
 from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
@@ -21,47 +21,45 @@ def simulate(
     scene: Annotated[
         str, typer.Argument(metavar="SCENE", help="a .blend file, random, hard, validation, test, or one as test:NAME")
     ],
-    output: Annotated[
-        Path, output_option("folder for the frames and meta.json", "-o", "--output", "--out", metavar="OUT")
-    ],
-    frames: Annotated[str, input_option("such as 1001-1010x2", "--frames", metavar="RANGE")] = "1-7",
-    size: Annotated[str, method_option("pixels of the rendered image", metavar="WxH")] = "320x180",
+    output: Annotated[Path, of_output("folder for the frames and meta.json", "-o", "--output", "--out", metavar="OUT")],
+    frames: Annotated[str, of_input("such as 1001-1010x2", "--frames", metavar="RANGE")] = "1-7",
+    size: Annotated[str, of_method("pixels of the rendered image", metavar="WxH")] = "320x180",
     film: Annotated[
-        str | None, method_option("pixels of the whole camera, of which --size is a crop", metavar="WxH")
+        str | None, of_method("pixels of the whole camera, of which --size is a crop", metavar="WxH")
     ] = None,
     center: Annotated[
-        str | None, method_option("center of the crop in the film, as fractions, y down", metavar="X,Y")
+        str | None, of_method("center of the crop in the film, as fractions, y down", metavar="X,Y")
     ] = None,
-    spp: Annotated[str, method_option("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
-    levels: Annotated[str, method_option("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
-    reference: Annotated[int, method_option("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
+    spp: Annotated[str, of_method("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
+    levels: Annotated[str, of_method("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
+    reference: Annotated[int, of_method("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
     reference_frames: Annotated[
-        str | None, method_option("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
+        str | None, of_method("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
     ] = None,
-    seed: Annotated[int, input_option("seed of all random numbers")] = 1,
-    shots: Annotated[int, input_option("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
-    camera: Annotated[str | None, input_option("a camera of the file, or random")] = None,
+    seed: Annotated[int, of_input("seed of all random numbers")] = 1,
+    shots: Annotated[int, of_input("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
+    camera: Annotated[str | None, of_input("a camera of the file, or random")] = None,
     motion: Annotated[
-        Literal["auto", "keep", "add"], method_option("auto: add motion to a file that has none", "--animate")
+        Literal["auto", "keep", "add"], of_method("auto: add motion to a file that has none", "--animate")
     ] = "auto",
     moving_objects: Annotated[
-        int | None, method_option("number of moving objects in added motion", min=0, metavar="N")
+        int | None, of_method("number of moving objects in added motion", min=0, metavar="N")
     ] = None,
-    motion_blur: Annotated[bool, method_option("render with motion blur", "--motion-blur")] = False,
-    halves: Annotated[bool, method_option("add half buffers, for the variance", "--halves")] = False,
+    motion_blur: Annotated[bool, of_method("render with motion blur", "--motion-blur")] = False,
+    halves: Annotated[bool, of_method("add half buffers, for the variance", "--halves")] = False,
     effects: Annotated[
-        Literal["auto", "all"], method_option("auto: the effects that the scene needs; all: every effect")
+        Literal["auto", "all"], of_method("auto: the effects that the scene needs; all: every effect")
     ] = "auto",
-    jobs: Annotated[int, resource_option("Blender processes at a time", min=1, metavar="N")] = 1,
+    jobs: Annotated[int, of_resources("Blender processes at a time", min=1, metavar="N")] = 1,
     threads: Annotated[
         int | None,
-        resource_option(
+        of_resources(
             "threads of each process; default: the cores divided by --jobs", min=1, metavar="N", envvar="RAVG_THREADS"
         ),
     ] = None,
     python: Annotated[
         str | None,
-        resource_option("Python interpreter with bpy; default: this one", metavar="FILE", envvar="RAVG_BLENDER_PYTHON"),
+        of_resources("Python interpreter with bpy; default: this one", metavar="FILE", envvar="RAVG_BLENDER_PYTHON"),
     ] = None,
     scheduler: SchedulerOption = None,
 ) -> None:

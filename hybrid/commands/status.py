@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hybrid.commands.log import duration, printable
-from hybrid.commands.options import FramesOption, output_option, usage
+from hybrid.commands.options import FramesOption, of_output, usage
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
 from hybrid.records import Status, gather_status, is_running, sequence_name
 
@@ -22,7 +22,7 @@ from hybrid.records import Status, gather_status, is_running, sequence_name
 def status(
     output: Annotated[str, typer.Argument(metavar="OUT", help="output of the runs: OUT.####.exr, or a folder")],
     frames: FramesOption = None,
-    as_json: Annotated[bool, output_option("print one JSON object", "--json")] = False,
+    as_json: Annotated[bool, of_output("print one JSON object", "--json")] = False,
 ) -> None:
     """Show which frames are finished, running, missing and failed.
 

@@ -13,23 +13,9 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
+from hybrid.commands import options as opt
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import (
-    DeviceOption,
-    FramesOption,
-    LayerOption,
-    MotionOption,
-    ProfileOption,
-    StrictOption,
-    check_first_pass,
-    input_option,
-    method_option,
-    output_option,
-    panel,
-    resource_option,
-    usage,
-)
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.comparison.samples import samples_of
 from hybrid.files.profile import Profile
@@ -40,7 +26,7 @@ from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.stream import plan_shot
 from network.training.config import SamplerConfig, TrainConfig
 
-training_option = panel("Training")
+training_option = opt.panel("Training")
 
 
 class Levels(NamedTuple):
@@ -102,32 +88,32 @@ def make_clips(
         list[str],
         typer.Argument(metavar="SHOTS...", help="folders, each with LEVEL.####.exr at one or more noise levels"),
     ],
-    output: Annotated[Path, output_option("folder of training clips", "-o", "--output", metavar="CLIPS")],
+    output: Annotated[Path, opt.of_output("folder of training clips", "-o", "--output", metavar="CLIPS")],
     levels: Annotated[
         str | None,
-        input_option("a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers"),
+        opt.of_input("a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers"),
     ] = None,
-    tile: Annotated[int, method_option("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
-    tiles: Annotated[int, method_option("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
-    window: Annotated[int, method_option("frames of a window: 1, 3, 5 or 7")] = 5,
+    tile: Annotated[int, opt.of_method("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
+    tiles: Annotated[int, opt.of_method("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
+    window: Annotated[int, opt.of_method("frames of a window: 1, 3, 5 or 7")] = 5,
     first_pass: Annotated[
-        str, method_option("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=check_first_pass)
+        str, opt.of_method("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=opt.check_first_pass)
     ] = "auto",
     reference: Annotated[
-        bool, input_option("target SHOT/reference.####.exr, and only frames that it has", "--reference")
+        bool, opt.of_input("target SHOT/reference.####.exr, and only frames that it has", "--reference")
     ] = False,
     target: Annotated[
         str | None,
-        input_option(
+        opt.of_input(
             "level whose pseudo-references are the targets of the others; itself it is no input", metavar="LEVEL"
         ),
     ] = None,
-    seed: Annotated[int, method_option("seed of the random positions of clips")] = 0,
-    frames: FramesOption = None,
-    layer: LayerOption = None,
-    profile: ProfileOption = None,
-    motion: MotionOption = None,
-    strict: StrictOption = False,
+    seed: Annotated[int, opt.of_method("seed of the random positions of clips")] = 0,
+    frames: opt.FramesOption = None,
+    layer: opt.LayerOption = None,
+    profile: opt.ProfileOption = None,
+    motion: opt.MotionOption = None,
+    strict: opt.StrictOption = False,
     scheduler: SchedulerOption = None,
 ) -> None:
     """Make training clips of shots at several noise levels.
@@ -148,7 +134,7 @@ def make_clips(
     if reference and target is not None:
         raise typer.BadParameter("--target: expected none with --reference, which is the target")
     neural = import_neural()
-    with usage():
+    with opt.usage():
         samples = None if levels is None else parse_samples(levels)
     roles, chosen = parse_layers(layer), parse_input(profile, motion)
     opened = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
@@ -237,25 +223,25 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
 @_with_settings
 def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
-    output: Annotated[Path, output_option("weights to write", "-o", "--output", metavar="W.safetensors")],
+    output: Annotated[Path, opt.of_output("weights to write", "-o", "--output", metavar="W.safetensors")],
     preset: Annotated[
-        str, method_option("network to train: fast, balanced, quality, unet, multiscale, paper or tkpcn")
+        str, opt.of_method("network to train: fast, balanced, quality, unet, multiscale, paper or tkpcn")
     ] = "fast",
     init: Annotated[
         str | None,
-        input_option("initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone"),
+        opt.of_input("initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone"),
     ] = None,
     window: Annotated[
-        int | None, method_option("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
+        int | None, opt.of_method("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
     ] = None,
     validation: Annotated[
         list[str] | None,
-        input_option("shots to validate on, which are not trained on; with commas between, or repeated"),
+        opt.of_input("shots to validate on, which are not trained on; with commas between, or repeated"),
     ] = None,
-    device: DeviceOption = "auto",
-    threads: Annotated[int | None, resource_option("threads of torch and numba (default: all cores)", min=1)] = None,
-    tensorboard: Annotated[Path | None, output_option("write TensorBoard's logs there", metavar="FOLDER")] = None,
-    resume: Annotated[bool, output_option("continue from W.safetensors.state, same options", "--resume")] = False,
+    device: opt.DeviceOption = "auto",
+    threads: Annotated[int | None, opt.of_resources("threads of torch and numba (default: all cores)", min=1)] = None,
+    tensorboard: Annotated[Path | None, opt.of_output("write TensorBoard's logs there", metavar="FOLDER")] = None,
+    resume: Annotated[bool, opt.of_output("continue from W.safetensors.state, same options", "--resume")] = False,
     **settings: Any,
 ) -> None:
     """Train a network on clips.
@@ -272,7 +258,7 @@ def train(
     if init in (None, "oidn") and preset not in neural.TRAINING_PRESETS:
         known = ", ".join(neural.TRAINING_PRESETS)
         raise typer.BadParameter(f"--preset is {preset!r}, expected one of {known}")
-    with usage():
+    with opt.usage():
         of_sampler = {item.name: settings.pop(item.name) for item in fields(SamplerConfig) if item.name in settings}
         config = TrainConfig(**settings, device=device, sampler=SamplerConfig(**of_sampler))
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]

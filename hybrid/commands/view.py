@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hybrid.commands.options import RateOption, input_option, output_option, resource_option
+from hybrid.commands.options import RateOption, of_input, of_output, of_resources
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 
@@ -18,14 +18,14 @@ def view(
     output: Annotated[str, typer.Argument(metavar="OUT", help="denoised frames: OUT.####.exr, or a folder")],
     beside: Annotated[
         list[str] | None,
-        input_option(
+        of_input(
             "frames to compare with, such as the noisy ones, or those of another denoiser; may be repeated",
             metavar="SHOT",
         ),
     ] = None,
     fps: RateOption = 24,
-    port: Annotated[int, resource_option("port of the page; 0: any free port", min=0, max=65535)] = 0,
-    browser: Annotated[bool, output_option("open the page in a browser, if there is a screen")] = True,
+    port: Annotated[int, of_resources("port of the page; 0: any free port", min=0, max=65535)] = 0,
+    browser: Annotated[bool, of_output("open the page in a browser, if there is a screen")] = True,
 ) -> None:
     """Play denoised frames beside noisy ones in a browser, also while they are being made.
 

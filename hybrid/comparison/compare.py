@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from hybrid.comparison.evaluation import Evaluator, Level, error_of, find_static_pixels, store_flows, store_reference
 from hybrid.comparison.methods import METHODS, Method
@@ -88,7 +89,9 @@ def compare_shot(
         statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, steps)
         law, law_facts = _noise_law(evaluator, statistics, options)
         results = [
-            _absent_result(name, method, timed.absent[name])
+            MethodResult(
+                name, method.settings, method.family, method.sweep, method.base, absent_reason=timed.absent[name]
+            )
             if name in timed.absent
             else _result(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             for name, method in methods.items()
@@ -141,8 +144,7 @@ def _check_levels(numbers: Sequence[int], methods: Mapping[str, Method], options
             raise ValueError(f"level of {count:g} samples has {spans}")
 
 
-@dataclass(frozen=True)
-class _Input:
+class _Input(NamedTuple):
     """A sequence that is read besides the shot, and the frames that are needed."""
 
     name: str
@@ -232,10 +234,6 @@ def _result(
         metrics=metrics,
         worth=None if law is None or name == "noisy" else law.worth(error_of(metrics["psnr"])),
     )
-
-
-def _absent_result(name: str, method: Method, reason: str) -> MethodResult:
-    return MethodResult(name, method.settings, method.family, method.sweep, method.base, absent_reason=reason)
 
 
 def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:

@@ -91,8 +91,13 @@ class Evaluator:
         """
         self._check_frames(name)
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
+
+        def measure_frame(number: int) -> dict[str, float]:
+            image, reference = self.store.load(name, number), self.store.load_reference(number)
+            return {key: measure(image, reference, self.exposure) for key, measure in MEASURES.items()}
+
         with ThreadPoolExecutor(AT_ONCE) as threads:
-            for measured in threads.map(partial(self._measure_frame, name), self.numbers):
+            for measured in threads.map(measure_frame, self.numbers):
                 for key, value in measured.items():
                     values[key].append(value)
             values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
@@ -136,10 +141,6 @@ class Evaluator:
             changes[valid] = np.clip(0.5 + CHANGE_GAIN * difference[valid], 0, 1)
         self.store.save(name, number, changes, CHANGE_MAP)
 
-    def _measure_frame(self, name: str, number: int) -> dict[str, float]:
-        image, reference = self.store.load(name, number), self.store.load_reference(number)
-        return {key: measure(image, reference, self.exposure) for key, measure in MEASURES.items()}
-
     def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
         images = [self.store.load(name, number) for number in pair]
         references = [self.store.load_reference(number) for number in pair]
@@ -174,7 +175,11 @@ class Evaluator:
     ) -> tuple[float, str]:
         """The reference's part in the errors of the levels, and a description of its noise."""
         if isinstance(self.store.load_reference(self.numbers[0]), tuple):
-            level = decibels(np.mean([self._error_of_halves(number) for number in self.numbers]))
+            # The error of the mean is a quarter of that between the halves.
+            halves = (
+                [tone_map(self.store.load(REFERENCE, n, half), self.exposure) for half in HALVES] for n in self.numbers
+            )
+            level = decibels(np.mean([float(np.mean((a - b) ** 2)) / 4 for a, b in halves]))
             return 0.0, (
                 f"Two independent halves; their mean has a noise of {level} PSNR. PSNR, temporal PSNR and relMSE are "
                 "products of the errors against both halves, free of that noise; the other measures use their mean."
@@ -191,11 +196,6 @@ class Evaluator:
             f"One render with a noise of {decibels(floor)} PSNR, {source}. The noise counts as error of the methods "
             "and reduces differences between methods close to it; it is subtracted for the worth in samples only."
         )
-
-    def _error_of_halves(self, number: int) -> float:
-        """Mean squared error of the mean of the reference's halves: a quarter of that between the halves."""
-        a, b = (tone_map(self.store.load(REFERENCE, number, half), self.exposure) for half in HALVES)
-        return float(np.mean((a - b) ** 2)) / 4
 
 
 def error_of(statistic: Statistic) -> float:

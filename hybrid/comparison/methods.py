@@ -96,7 +96,9 @@ class WindowSettings:
 
     def stream(self, shot: Frames) -> FrameStream:
         """The aligned windows of a shot."""
-        frames = shot if self.vectors else MappedShot(shot, _without_vectors)
+        frames = shot
+        if not self.vectors:
+            frames = MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
         rules = replace(self.rules, on=self.rules.on | {"refine"}) if self.solver else self.rules
         backends = Backends()
         if self.source == "bundled":
@@ -106,10 +108,6 @@ class WindowSettings:
         chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_PRESET["fast"], backends=backends)
         refine = partial(refine_flow, **self.solver)
         return FrameStream(frames, rules, chosen.first_pass, radius=self.radius, refine=refine)
-
-
-def _without_vectors(frame: Frame) -> Frame:
-    return replace(frame, motion=None, motion_convention=None)
 
 
 @dataclass(frozen=True)
@@ -213,13 +211,13 @@ def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None =
 
 def oidn_then_average(shot: Frames) -> Iterator[tuple[int, Array]]:
     """Run OIDN's best mode on each frame, then take the aligned robust average of the results."""
-    stream = FrameStream(MappedShot(shot, _denoised_by_oidn), Rules())
+
+    def denoised(frame: Frame) -> Frame:
+        return replace(frame, color=denoise_frame_oidn(frame, prefilter="high"), variance=None)
+
+    stream = FrameStream(MappedShot(shot, denoised), Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(stream.align(number))
-
-
-def _denoised_by_oidn(frame: Frame) -> Frame:
-    return replace(frame, color=denoise_frame_oidn(frame, prefilter="high"), variance=None)
 
 
 def _aligned(family: str, denoise: WindowFilter, source: str = "none", **settings: object) -> Method:

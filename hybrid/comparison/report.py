@@ -94,19 +94,19 @@ def report_images(
     store: FrameStore, comparison: Comparison, frames: Sequence[int], exposure: float = 1.0
 ) -> ShotImages:
     """Return the images that `compare_shot` has stored; points of sweeps are left out: they are many and look alike."""
+
+    def load_map(name: str, title: str, number: int) -> Array | None:
+        return store.load(name, number, title) if store.has(name, number, title) else None
+
     methods = []
     for result in comparison.results:
         if result.absent_reason is None and not result.sweep:
             titles = [t for t in MAP_TITLES if any(store.has(result.name, number, t) for number in frames)]
-            maps = {title: partial(_load_map, store, result.name, title) for title in titles}
+            maps = {title: partial(load_map, result.name, title) for title in titles}
             methods.append(MethodImages(result.name, partial(store.load, result.name), maps))
-    changes = {CHANGE_MAP: partial(_load_map, store, REFERENCE, CHANGE_MAP)}
+    changes = {CHANGE_MAP: partial(load_map, REFERENCE, CHANGE_MAP)}
     there = any(store.has(REFERENCE, number, CHANGE_MAP) for number in frames)
     return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure, changes if there else {})
-
-
-def _load_map(store: FrameStore, name: str, title: str, number: int) -> Array | None:
-    return store.load(name, number, title) if store.has(name, number, title) else None
 
 
 def _check(results: Sequence[MethodResult], images: ShotImages | None) -> None:

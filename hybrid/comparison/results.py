@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -229,13 +229,8 @@ def _stage_value(stage: str, base: str, on: bool, pair: tuple[MethodResult, Meth
             gains[key] = having.metrics[key].mean - lacking.metrics[key].mean
             if not _tied(having.metrics[key], lacking.metrics[key]):
                 significant.append(key)
-    seconds = _difference(having.seconds_per_megapixel, lacking.seconds_per_megapixel)
-    cpu = _difference(having.cpu_seconds_per_megapixel, lacking.cpu_seconds_per_megapixel)
-    return StageValue(stage, base, on, gains, tuple(significant), seconds, cpu)
-
-
-def _difference(a: float | None, b: float | None) -> float | None:
-    return None if a is None or b is None else a - b
+    costs = [(getattr(having, name), getattr(lacking, name)) for name in list(COSTS)[:2]]
+    return StageValue(stage, base, on, gains, tuple(significant), *(None if None in c else c[0] - c[1] for c in costs))
 
 
 def _goodness(value: float, metric: Metric) -> float:
@@ -275,18 +270,14 @@ def to_document(comparison: Comparison) -> dict[str, object]:
         "shot": comparison.shot,
         "facts": dict(comparison.facts),
         "metrics": [asdict(m) for m in metrics],
-        "results": [_plain(r) for r in results],
+        # asdict copies mappings by their own type, which fails for MappingProxyType.
+        "results": [
+            {**vars(r), "settings": settings_as_text(r), "metrics": {k: asdict(v) for k, v in r.metrics.items()}}
+            for r in results
+        ],
         "fronts": {f"{m.key} {cost}": pareto_front(results, m, cost) for m in metrics for cost in COSTS},
         "stages": [asdict(s) for s in stage_values(results)],
     }
-
-
-def _plain(result: MethodResult) -> dict[str, object]:
-    """A result as plain dicts, its settings (objects of any kind) as text."""
-    # asdict copies mappings by their own type, which fails for MappingProxyType.
-    metrics = {k: asdict(v) for k, v in result.metrics.items()}
-    values = {f.name: getattr(result, f.name) for f in fields(result)}
-    return {**values, "settings": settings_as_text(result), "metrics": metrics}
 
 
 def to_plain_numbers(value: object) -> object:
@@ -330,31 +321,22 @@ def read_comparison(path: Path) -> Comparison:
 
 
 def _read_result(entry: Mapping[str, Any]) -> MethodResult:
-    """The inverse of `_plain`."""
-
-    def optional(name: str, convert: Callable[[Any], Any]) -> Any:
-        return None if entry[name] is None else convert(entry[name])
+    """A result of `to_document`."""
 
     def pair(values: Sequence[Any]) -> tuple[float, float]:
         low, high = map(float, values)
         return low, high
 
-    return MethodResult(
-        name=str(entry["name"]),
-        settings=dict(entry["settings"]),
-        family=str(entry["family"]),
-        sweep=str(entry["sweep"]),
-        base=str(entry["base"]),
-        seconds_per_megapixel=optional("seconds_per_megapixel", float),
-        spread=optional("spread", pair),
-        cpu_seconds_per_megapixel=optional("cpu_seconds_per_megapixel", float),
-        peak_bytes=optional("peak_bytes", int),
-        metrics={key: _read_statistic(statistic) for key, statistic in entry["metrics"].items()},
-        worth=optional("worth", float),
-        absent_reason=optional("absent_reason", str),
-    )
-
-
-def _read_statistic(entry: Mapping[str, Any]) -> Statistic:
-    numbers = {name: float(entry[name]) for name in ("mean", "minimum", "maximum", "low", "high")}
-    return Statistic(**numbers, values=tuple(map(float, entry["values"])), shots=tuple(entry["shots"]))
+    optional: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel", "worth"), float),
+        "spread": pair,
+        "peak_bytes": int,
+        "absent_reason": str,
+    }
+    metrics = {}
+    for key, found in entry["metrics"].items():
+        numbers = {name: float(found[name]) for name in ("mean", "minimum", "maximum", "low", "high")}
+        metrics[key] = Statistic(**numbers, values=tuple(map(float, found["values"])), shots=tuple(found["shots"]))
+    values: dict[str, Any] = {name: str(entry[name]) for name in ("name", "family", "sweep", "base")}
+    values |= {name: None if entry[name] is None else convert(entry[name]) for name, convert in optional.items()}
+    return MethodResult(settings=dict(entry["settings"]), metrics=metrics, **values)

@@ -176,13 +176,14 @@ class ExrImage:
         for qualified, (part, _) in self._origin.items():
             groups.setdefault((qualified.rpartition(".")[0], part), []).append(qualified)
         return tuple(
-            Layer(name, part, self._view(name, part), tuple(sorted(channels, key=_component_order)))
+            Layer(
+                name,
+                part,
+                self.parts[part].view or next((view for view in self.views if view in name.split(".")), None),
+                tuple(sorted(channels, key=_component_order)),
+            )
             for (name, part), channels in groups.items()
         )
-
-    def _view(self, layer: str, part: int) -> str | None:
-        tokens = layer.split(".")
-        return self.parts[part].view or next((view for view in self.views if view in tokens), None)
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -495,7 +496,8 @@ def write_exr(
         at, own = source._origin[name]
         pixels, count = _convert(values, old.dtype)
         clamped += count
-        by_part[at][own] = _like(source.parts[at].channels[own], own, pixels)
+        channel = source.parts[at].channels[own]
+        by_part[at][own] = OpenEXR.Channel(own, pixels, channel.xSampling, channel.ySampling, channel.pLinear)
 
     added: list[OpenEXR.Part] = []
     for name, values in (extra or {}).items():
@@ -549,10 +551,6 @@ def _writable(header: Mapping[str, Any]) -> dict[str, Any]:
     The binding refuses an empty list, as it does not know the type of its items.
     """
     return {k: v for k, v in header.items() if k != "channels" and not (isinstance(v, list) and not v)}
-
-
-def _like(channel: OpenEXR.Channel, name: str, pixels: np.ndarray) -> OpenEXR.Channel:
-    return OpenEXR.Channel(name, pixels, channel.xSampling, channel.ySampling, channel.pLinear)
 
 
 def _is_vector(name: str) -> bool:

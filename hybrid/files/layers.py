@@ -187,7 +187,8 @@ def _fit_overrides(image: ExrImage, overrides: Mapping[str, str | Layer]) -> dic
 
 def _find_any_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer:
     """The color of the default view: by its name, as the only picture, or as a gray picture."""
-    color = _find_color(image, profile, notes) or _only_picture(image, profile)
+    named = _name_colors(image, profile, image.views[0] if image.views else None, notes)
+    color = _only(image, "color", named) if named else _only_picture(image, profile)
     if color is None and (gray := _name_grays(image, profile, image.views[0] if image.views else None)):
         color = _only(image, "color", gray)
     if color is None:
@@ -240,12 +241,6 @@ def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
         split = [named] if "" in groups else [[x for x in named if _group(x) == group] for group in sorted(groups)]
         colors += [_only(image, "color", layers) for layers in split if layers]
     return colors
-
-
-def _find_color(image: ExrImage, profile: Profile, notes: list[str]) -> Layer | None:
-    """The one layer of the default view that has a name for the color."""
-    named = _name_colors(image, profile, image.views[0] if image.views else None, notes)
-    return _only(image, "color", named) if named else None
 
 
 def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: list[str]) -> list[Layer]:
@@ -305,7 +300,7 @@ def _find_unused(image: ExrImage, color: Layer, found: Mapping[str, Layer | None
 
 
 def _is_light(layer: Layer) -> bool:
-    """Whether a layer has a name for light; its pixels decide what it is a part of (`hybrid.passes`)."""
+    """Whether a layer has a name for light; its pixels decide what it is a part of (`hybrid.pass_sums`)."""
     plain = plain_name(without_view(layer).rpartition(".")[2])
     return bool(_PASS.fullmatch(plain) or _LIGHT_GROUP.match(plain))
 

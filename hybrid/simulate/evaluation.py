@@ -21,6 +21,7 @@ from hybrid.simulate.motion import aim_camera, key_motion, key_swing
 from hybrid.simulate.random_assets import printed
 from hybrid.simulate.scene_assets import (
     BOTTLES,
+    Hair,
     Rng,
     add_box,
     add_lamp,
@@ -198,8 +199,8 @@ def animal(rng: Rng) -> Any:
         ((0.0165, 0.004, 0.0475), 0.0075, 2600), ((0, -0.017, 0.0215), 0.0095, 2600),
     ):  # fmt: skip
         part = lathe("head", sphere_profile(radius, 18), skin, where, segments=40, parent=head)
-        fur(rng, part, strands, 0.0075 if radius > 0.02 else 0.004, coat, lean=(0.05, 0.25, -0.65), wave=0.35,
-            clumps=strands // 40, clump=0.55, radius=0.00009)  # fmt: skip
+        length = 0.0075 if radius > 0.02 else 0.004
+        fur(rng, part, Hair(strands, length, 0.00009, (0.05, 0.25, -0.65), 0.35, strands // 40, 0.55), coat)
     black = plain("eye", (0.01, 0.008, 0.006), Roughness=0.03, Coat_Weight=1.0)
     for where, radius in (((-0.0095, -0.0215, 0.0325), 0.0032), ((0.0095, -0.0215, 0.0325), 0.0032),
                           ((0, -0.0285, 0.0245), 0.0027)):  # fmt: skip

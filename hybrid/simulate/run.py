@@ -90,7 +90,8 @@ def simulate(
                         metas[worker.out]["plan"] = message["plan"]
                     else:
                         metas[worker.out]["seconds"][message["file"]] = message["seconds"]
-                    _write_meta(metas[worker.out], worker.out)
+                    meta = json.dumps(metas[worker.out], indent=1, ensure_ascii=False)
+                    write_file(worker.out / "meta.json", f"{meta}\n")
                     if on_event is not None:
                         on_event("plan" if "plan" in message else "frame", worker.out, message)
                 if ended:
@@ -130,10 +131,6 @@ def read_meta(shot: ShotSettings, out: Path) -> dict[str, Any]:
     if there["frames"] != asked["frames"] and shot.scene in RANDOM:
         raise ValueError(f"{out}: holds a random shot of other frames; its motion is drawn for them")
     return {**meta, "shot": asked}
-
-
-def _write_meta(meta: dict[str, Any], out: Path) -> None:
-    write_file(out / "meta.json", json.dumps(meta, indent=1, ensure_ascii=False) + "\n")
 
 
 class _Worker:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -305,24 +305,21 @@ def add_strands(path: np.ndarray, radii: np.ndarray, surface: Any) -> Any:
     return add_object("fur", data, surface)
 
 
-def fur(
-    rng: Rng,
-    item: Any,
-    strands: int,
-    length: float,
-    surface: Any,
-    *,
-    radius: float = 0.00004,
-    lean: Point = (0, 0, -0.6),
-    wave: float = 0.25,
-    clumps: int = 400,
-    clump: float = 0.5,
-) -> Any:
-    """Cover a mesh, with its modifiers, with hair that is its child.
+class Hair(NamedTuple):
+    """The shape of hair."""
 
-    `lean` is what gravity and combing add to a strand at its tip, and `wave` its curl, both in strand lengths. Tips
-    gather around `clumps` strands by the share `clump` of the distance.
-    """
+    strands: int
+    length: float
+    radius: float = 0.00004
+    lean: Point = (0, 0, -0.6)  # what gravity and combing add to a strand at its tip, in strand lengths
+    wave: float = 0.25  # its curl, in strand lengths
+    clumps: int = 400  # strands that tips gather around
+    clump: float = 0.5  # by this share of the distance
+
+
+def fur(rng: Rng, item: Any, hair: Hair, surface: Any) -> Any:
+    """Cover a mesh, with its modifiers, with hair that is its child."""
+    strands = hair.strands
     graph = bpy.context.evaluated_depsgraph_get()
     mesh = item.evaluated_get(graph).to_mesh()
     mesh.calc_loop_triangles()
@@ -339,18 +336,18 @@ def fur(
     out /= np.linalg.norm(out, axis=-1, keepdims=True)
     item.evaluated_get(graph).to_mesh_clear()
     t = np.linspace(0, 1, 8)[None, :, None]
-    long = length * rng.uniform(0.6, 1.1, (strands, 1, 1))
+    long = hair.length * rng.uniform(0.6, 1.1, (strands, 1, 1))
     way = out + 0.25 * rng.standard_normal((strands, 3))
     curl, phase = rng.standard_normal((strands, 1, 3)), rng.uniform(0, 2 * math.pi, (strands, 1, 1))
-    path = root[:, None] + long * (t * way[:, None] + t**2 * np.array(lean, float))
-    path = path + long * wave * t * curl * np.sin(5 * t + phase) * 0.5
-    leaders = path[rng.choice(strands, clumps, replace=False)]
+    path = root[:, None] + long * (t * way[:, None] + t**2 * np.array(hair.lean, float))
+    path = path + long * hair.wave * t * curl * np.sin(5 * t + phase) * 0.5
+    leaders = path[rng.choice(strands, hair.clumps, replace=False)]
     # Blocks of strands: the matrix of all distances to the leaders would be large.
     nearest = np.concatenate(
         [((block[:, None] - leaders[None, :, 0]) ** 2).sum(-1).argmin(axis=1) for block in np.array_split(root, 40)]
     )
-    path += clump * t**1.5 * (leaders[nearest] - path)
-    made = add_strands(path, radius * np.linspace(1, 0.25, 8), surface)
+    path += hair.clump * t**1.5 * (leaders[nearest] - path)
+    made = add_strands(path, hair.radius * np.linspace(1, 0.25, 8), surface)
     made.parent = item
     return made
 

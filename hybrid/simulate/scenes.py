@@ -31,6 +31,7 @@ from hybrid.simulate.random_assets import (
     weighted_choice,
 )
 from hybrid.simulate.scene_assets import (
+    Hair,
     Point,
     Rng,
     add_box,
@@ -284,7 +285,10 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
     kind = weighted_choice(rng, {name: weight for name, (weight, _) in SETS.items()})
     view = SETS[kind][1](rng)
     camera = place_camera(rng, view.focus, view.eye)
-    film = shot.film or draw_film(rng, shot.size)
+    film = shot.film
+    if film is None:
+        width, height = map(int, weighted_choice(rng, FILMS).split("x"))
+        film = max(width, shot.size[0]), max(height, shot.size[1])
     center = frame_crop(rng, shot, film)
     added = [motion for name in hard for motion in make_hard(hard_rng, shot, name)]
     if rng.random() < 0.15 or "lens" in hard:
@@ -307,12 +311,6 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
         "lens": camera.data.lens,
         **motion,
     }
-
-
-def draw_film(rng: Rng, size: tuple[int, int]) -> tuple[int, int]:
-    """Draw the size of the whole image, at least `size`: mostly that of a film."""
-    width, height = map(int, weighted_choice(rng, FILMS).split("x"))
-    return max(width, size[0]), max(height, size[1])
 
 
 def open_aperture(camera: Any, distances: list[float], blur: float) -> None:
@@ -354,8 +352,9 @@ def add_random_fur(rng: Rng, item: Any) -> None:
     else:
         coat = material(rng, "diffuse")
     lean, length = [*rng.normal(0, 0.3, 2), rng.normal(-0.4, 0.3)], log_uniform(rng, 0.06, 0.35)
-    fur(rng, item, int(log_uniform(rng, 3000, 16000)), length, coat, radius=log_uniform(rng, 0.0012, 0.005), lean=lean,
-        wave=rng.uniform(0, 0.6), clumps=int(log_uniform(rng, 40, 400)), clump=rng.uniform(0, 0.8))  # fmt: skip
+    strands, radius = int(log_uniform(rng, 3000, 16000)), log_uniform(rng, 0.0012, 0.005)
+    wave, clumps, clump = rng.uniform(0, 0.6), int(log_uniform(rng, 40, 400)), rng.uniform(0, 0.8)
+    fur(rng, item, Hair(strands, length, radius, lean, wave, clumps, clump), coat)
 
 
 def add_volume(rng: Rng, shot: ShotSettings) -> None:

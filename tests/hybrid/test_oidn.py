@@ -83,7 +83,7 @@ class TestDenoise:
     def test_removes_noise_and_leaves_the_input_alone(self, scene, quality) -> None:
         clean, *images = scene
         before = [v.copy() for v in images]
-        result = denoise_oidn(*images, quality=quality, threads=1)
+        result = denoise_oidn(*images, quality=quality)
         assert result.shape == clean.shape
         assert result.dtype == np.float32
         # Measured over three seeds and all qualities: 0.22 to 0.25.
@@ -93,8 +93,8 @@ class TestDenoise:
 
     def test_hdr_is_scale_equivariant(self, scene) -> None:
         _, color, albedo, normal = scene
-        result = denoise_oidn(color, albedo, normal, threads=1)
-        scaled = denoise_oidn(64 * color, albedo, normal, threads=1)
+        result = denoise_oidn(color, albedo, normal)
+        scaled = denoise_oidn(64 * color, albedo, normal)
         # Its exposure comes from the picture; an LDR filter would clip at 1.
         np.testing.assert_allclose(scaled, 64 * result, rtol=2e-3)
 
@@ -102,10 +102,10 @@ class TestDenoise:
     def test_a_part_needs_the_scale_of_the_whole(self, scene, guides) -> None:
         _, color, *rest = scene
         images = [color, *rest[:guides]]
-        whole = denoise_oidn(*images, threads=1)
+        whole = denoise_oidn(*images)
         # OIDN's own measurement, in float32.
-        np.testing.assert_allclose(denoise_oidn(*images, scale=autoexposure(color), threads=1), whole, rtol=1e-4)
-        assert rms(denoise_oidn(*images, scale=0.5 * autoexposure(color), threads=1), whole) > 1e-3
+        np.testing.assert_allclose(denoise_oidn(*images, scale=autoexposure(color)), whole, rtol=1e-4)
+        assert rms(denoise_oidn(*images, scale=0.5 * autoexposure(color)), whole) > 1e-3
 
     def test_prefilter_pays_when_guides_are_noisy(self, scene) -> None:
         clean, color, albedo, normal = scene
@@ -113,21 +113,21 @@ class TestDenoise:
         albedo = np.clip(albedo + 0.4 * rng.normal(size=albedo.shape), 0, 1).astype(np.float32)
         normal = (normal + 0.4 * rng.normal(size=normal.shape)).astype(np.float32)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        given = denoise_oidn(color, albedo, normal, threads=1)
-        best = denoise_oidn(color, albedo, normal, prefilter="high", threads=1)
+        given = denoise_oidn(color, albedo, normal)
+        best = denoise_oidn(color, albedo, normal, prefilter="high")
         # Measured over three seeds: 0.84 to 0.91.
         assert rms(best, clean) < 0.95 * rms(given, clean)
 
     def test_guides_are_optional(self, scene) -> None:
         clean, color, albedo, _ = scene
-        errors = [rms(denoise_oidn(color, *guides, threads=1), clean) for guides in ([], [albedo])]
+        errors = [rms(denoise_oidn(color, *guides), clean) for guides in ([], [albedo])]
         assert errors[1] < errors[0] < rms(color, clean)
-        np.testing.assert_array_equal(denoise_oidn(color, prefilter="high", threads=1), denoise_oidn(color, threads=1))
+        np.testing.assert_array_equal(denoise_oidn(color, prefilter="high"), denoise_oidn(color))
 
     @pytest.mark.parametrize("size", [(1, 1), (3, 5), (17, 33)])
     def test_any_size_and_layout(self, scene, size) -> None:
         images = [cv2.flip(v, 1)[: size[0], : size[1]][:, ::-1] for v in scene[1:]]
-        result = denoise_oidn(*images, threads=1)
+        result = denoise_oidn(*images)
         assert result.shape == (*size, 3)
         assert np.isfinite(result).all()
 
@@ -192,10 +192,10 @@ class TestDevices:
 
     def test_a_device_that_cannot_read_our_memory_is_given_copies(self, scene, monkeypatch):
         _, color, albedo, normal = scene
-        expected = denoise_oidn(color, albedo, normal, prefilter="balanced", threads=1)
+        expected = denoise_oidn(color, albedo, normal, prefilter="balanced")
         asked = []
         monkeypatch.setattr(oidn, "_reads_memory", lambda device: bool(asked.append(device)))
-        np.testing.assert_array_equal(denoise_oidn(color, albedo, normal, prefilter="balanced", threads=1), expected)
+        np.testing.assert_array_equal(denoise_oidn(color, albedo, normal, prefilter="balanced"), expected)
         assert len(asked) == 3  # two guides and the picture
 
     def test_the_command_names_what_was_asked_for_and_what_is_there(self, tmp_path, capsys):

@@ -377,7 +377,7 @@ def test_inspect_says_a_cut_and_is_strict_about_it(tmp_path, capsys) -> None:
     assert main(["inspect", str(spec), "--motion", "none", "--json"]) == 0
     out, err = capsys.readouterr()
     assert "cut between frames 10 and 11" in " ".join(err.split())
-    assert "cut between frames 10 and 11" in json.loads(out)["judged"][-1]["message"]
+    assert "cut between frames 10 and 11" in json.loads(out)["findings"][-1]["message"]
     assert main(["inspect", str(spec), "--motion", "none", "--strict"]) == 1
     assert (
         main(["denoise", "--method=classical", str(spec), "-o", str(tmp_path / "o"), "--motion", "none", "--strict"])

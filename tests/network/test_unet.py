@@ -50,7 +50,7 @@ class TestOidn:
         from hybrid.oidn import denoise_oidn
 
         layers = scene()[:inputs]
-        expected = denoise_oidn(*map(as_image, layers), quality=quality, clean=clean, threads=1)  # type: ignore[arg-type]
+        expected = denoise_oidn(*map(as_image, layers), quality=quality, clean=clean)  # type: ignore[arg-type]
         result = denoise(load_oidn(name), *layers)
         # 120 dB and more were measured; another network's picture is 40 to 60 dB away.
         assert decibels(compressed(result), compressed(as_tensor(expected))) > 90

@@ -10,7 +10,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import Classical
-from hybrid.passes import classify_passes, sample_rows
+from hybrid.pass_sums import classify_passes, sample_rows
 from hybrid.pseudo_reference import DRAFT
 from hybrid.stream import FrameStream
 from hybrid.validation import validate_layers
