@@ -158,7 +158,7 @@ def write_weights(path: Path, frames: int) -> str:
     model = RobustUNet(RobustUNetConfig(frames, "small"))
     model.load_state_dict(load_model(shipped_weights("fast")).state_dict())
     save_model(path, model)
-    return f"denoise --weights {path} --estimate oidn-fast"
+    return f"denoise --weights {path} --first-pass oidn-fast"
 
 
 def sweep(folder: Path) -> None:

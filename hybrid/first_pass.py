@@ -152,37 +152,17 @@ def find_first_pass(
 ) -> FirstPassSource:
     """Find a first pass by its name.
 
-    Parameters
-    ----------
-    spec : str
-        "auto": the denoised picture in the file, else `mode` where OIDN is installed, else the bundled network, else
-        the classical chain. "oidn" (quality high, guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with
-        OIDN's balanced networks, in frames where they hold noise), "oidn-best" (with its largest, in all), "nlm" (the
-        classical chain on each frame's window), "bundled", "none", or the pattern of a finished sequence.
-    shot : Shot
-        The noisy shot.
-    classical : ClassicalPreset
-        The settings of the classical chain.
-    mode : str
-        The mode of OIDN for "auto"; "bundled" has its quality.
-    kept : str, optional
-        A pattern or a folder that keeps OIDN's pictures; those that are there and would be the same are read.
-    forced : str
-        The forced stages (`hybrid.plan.Rules.forced`), on which kept pictures depend.
-    backends : Backends
-        Functions that stand for OIDN.
-    device : str
-        OIDN's device, as for `hybrid.oidn.find_device`.
+    "auto" is the denoised picture in the file, else `mode` where OIDN is installed, else the bundled network, else the
+    classical chain. "oidn" (quality high, guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with OIDN's
+    balanced networks, in frames where they hold noise), "oidn-best" (with its largest, in all), "nlm" (the classical
+    chain on each frame's window), "bundled" (of the quality of `mode`), "none", or the pattern of a finished sequence.
 
-    Raises
-    ------
-    ImportError
-        If OIDN is asked for by name and not installed.
-    ValueError
-        If a sequence lacks frames of the shot, or has each in the place of its neighbour; if `kept` is one file for
-        several frames; if OIDN has no such device.
-    FileNotFoundError
-        If there is no such sequence.
+    `kept` is a pattern or a folder that keeps OIDN's pictures; those that are there and would be the same are read;
+    they depend on the `forced` stages (`hybrid.plan.Rules.forced`).
+
+    Raises ImportError if OIDN is asked for by name and not installed; FileNotFoundError if there is no such sequence;
+    ValueError if a sequence lacks frames of the shot, or has each in the place of its neighbour, if `kept` is one file
+    for several frames, or if OIDN has no such device.
     """
     if spec not in SPECS:
         source = _sequence(spec, shot)

@@ -215,11 +215,7 @@ DEFAULTS = {entry.name: entry.default for entry in fields(DenoiseOptions)}
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
     """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist.
 
-    Parameters
-    ----------
-    options : DenoiseOptions or None
-    changes : mapping of str to object
-        Field → value; "estimate", the old name of `first_pass`, is accepted with a warning.
+    "estimate", the old name of `first_pass`, is accepted with a warning.
     """
     given = dict(changes)
     if "estimate" in given:
@@ -263,20 +259,9 @@ def open_denoiser(
 ) -> WindowDenoiser:
     """Return the denoiser that is asked for; with the preset "auto", the most accurate one.
 
-    Parameters
-    ----------
-    options : DenoiseOptions
-    timings : Timings, optional
-        Counts the stages of the denoiser.
-    breakdown : Breakdown, optional
-        Collects the weights of frames; layers of them are added to each result.
-
-    Raises
-    ------
-    ValueError, OSError
-        If weights cannot be read, a device is not there, or a threshold is given to a network without kernels.
-    ImportError
-        If OIDN is asked for and not installed.
+    A breakdown collects the weights of frames; layers of them are then added to each result. Raises ValueError or
+    OSError if weights cannot be read, a device is not there, or a threshold is given to a network without kernels;
+    ImportError if OIDN is asked for and not installed.
     """
     timings = timings or Timings()
     if options.method == "pooled":
@@ -307,12 +292,7 @@ def open_denoiser(
 def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> FirstPassSource:
     """Return the first pass of a view; errors are those of `hybrid.first_pass.find_first_pass`.
 
-    Parameters
-    ----------
-    view : Shot
-    options : DenoiseOptions
-        With "none", a denoiser that needs a first pass has the classical one.
-    denoiser : WindowDenoiser
+    With the option "none", a denoiser that needs a first pass has the classical one.
     """
     if not denoiser.needs_first_pass:
         return FirstPassSource("none", None, "the denoiser takes none")
@@ -348,21 +328,8 @@ def check_paths(
 ) -> None:
     """Refuse, before any pixel is read, a run that would write over its inputs, or that lacks frames.
 
-    Parameters
-    ----------
-    shot : Shot
-    output : str or Path
-        Pattern or folder of the denoised frames.
-    options : DenoiseOptions
-    first_passes : sequence of FirstPassSource
-    paths : Paths
-
-    Raises
-    ------
-    ValueError, OSError
-        As `hybrid.files.replace.check_outputs`.
-    FileNotFoundError
-        If frames were asked for that are not there, and `keep_going` is not set.
+    Raises ValueError or OSError as `hybrid.files.replace.check_outputs`; FileNotFoundError if frames were asked for
+    that are not there, and `keep_going` is not set.
     """
     if shot.missing and not options.keep_going:
         missing = format_frames(shot.missing)
@@ -381,14 +348,10 @@ def check_paths(
 
 
 def validate_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
-    """Return the views of a shot without layers that make no sense, and the findings.
+    """Return the views of a shot without layers that make no sense, and the findings; `strict` raises these as
+    ValueError.
 
-    Parameters
-    ----------
-    shot : Shot
-        Pairs of its frames are read.
-    strict : bool
-        Raise ValueError with all findings instead.
+    Pairs of the shot's frames are read.
     """
     reports = [validate_layers(view) for view in shot.views]
     findings = [finding for report in reports for finding in report.findings]

@@ -35,38 +35,21 @@ def denoise_oidn(
     scale: float | None = None,
     device: str = "cpu",
 ) -> NDArray[np.float32]:
-    """Denoise one frame with OIDN's ray-tracing filter in HDR mode (Áfra 2025, https://www.openimagedenoise.org).
+    """Denoise one frame (H, W, 3) with OIDN's ray-tracing filter in HDR mode (Áfra 2025,
+    https://www.openimagedenoise.org).
 
-    Parameters
-    ----------
-    color : (H, W, 3) array
-        Linear radiance, finite; OIDN counts negative values as 0.
-    albedo : (H, W, 3) array, optional
-        In [0, 1]; OIDN clips the rest.
-    normal : (H, W, 3) array, optional
-        In [−1, 1], in any fixed space. OIDN takes it only beside an albedo.
-    quality : str
-        "high", "balanced" or "fast".
-    prefilter : str, optional
-        Denoise albedo and normal with filters of their own first, of this quality, and declare them clean
-        (``cleanAux``). With "high" this is OIDN's best mode and Blender's default, at seven times the cost; with
-        "balanced" it takes four times, for pictures that are 0.07 dB worse (mean over 13 shots of 4 to 54 samples).
-    clean : bool
-        Whether albedo and normal are declared clean as they are.
-    scale : float, optional
-        What color is multiplied by before the network sees it; measured by OIDN if not given. Part of a frame needs the
-        whole frame's (`hybrid.alignment.transfer.autoexposure`).
-    device : str
-        "cpu", "cuda", "hip", "sycl" or "metal" (`find_device`).
+    The color is linear radiance, finite; OIDN counts negative values as 0. Albedo is in [0, 1], normals in [−1, 1], in
+    any fixed space; OIDN takes these only beside an albedo.
 
-    Raises
-    ------
-    ImportError
-        If pyoidn is not installed.
-    ValueError
-        If shapes differ, values are not finite, the quality is unknown, or there is a normal alone.
-    RuntimeError
-        If OIDN reports an error, or has no such device here.
+    `prefilter` denoises albedo and normal with filters of their own first, of this quality, and declares them clean
+    (``cleanAux``). With "high" this is OIDN's best mode and Blender's default, at seven times the cost; with "balanced"
+    it takes four times, for pictures that are 0.07 dB worse (mean over 13 shots of 4 to 54 samples). `clean` declares
+    them clean as they are. `scale` is what color is multiplied by before the network sees it; measured by OIDN if not
+    given. Part of a frame needs the whole frame's (`hybrid.alignment.transfer.autoexposure`). `device` is as for
+    `find_device`.
+
+    Raises ImportError if pyoidn is not installed; ValueError if shapes differ, values are not finite, the quality is
+    unknown, or there is a normal alone; RuntimeError if OIDN reports an error, or has no such device here.
     """
     guides = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
     images = {name: _as_input(image, name, color) for name, image in {"color": color, **guides}.items()}

@@ -453,39 +453,18 @@ def write_exr(
 ) -> int:
     """Write a file again with some channels replaced; every other channel, part and attribute is kept.
 
-    Parameters
-    ----------
-    path : str or Path
-        May be the source itself. The file appears when all of it is written.
-    source : ExrImage
-        With pixels.
-    replaced : mapping of str to array
-        Qualified channel name → (H, W), of the size of its part's data window. Converted to the source's pixel type.
-    extra : mapping of str to array, optional
-        Layers to add: name → (H, W) or (H, W, C), of the size of some part's data window; float16, float32 or
-        uint32, stored as such.
-    attributes : mapping of str to str, optional
-        Strings to add to the header of the first part.
+    `path` may be the source itself; the file appears when all of it is written. `replaced` maps qualified channel names
+    to (H, W), of the size of the part's data window, which are converted to the source's pixel type. `extra` maps names
+    of layers to add to (H, W) or (H, W, C), of the size of some part's data window, stored as float16, float32 or
+    uint32; `attributes` are strings for the header of the first part. Returns how many finite values were too large for
+    a half channel, and were written as ±65504 instead of Inf.
 
-    Returns
-    -------
-    int
-        How many finite values were too large for a half channel, and were written as ±65504 instead of Inf.
-
-    Raises
-    ------
-    ExrError
-        If the source has no such channel.
-    ValueError
-        If an array has the wrong shape, an added layer exists already, or an attribute would replace one that is not
-        a string.
-    OSError
-        If the file cannot be written; no partial file is left.
-
-    Notes
-    -----
     Channels that are not replaced keep their values exactly: a part with such channels whose compression loses a little
     each time it is written (DWA, B44) is written with ZIP. Deep parts are kept.
+
+    Raises ExrError if the source has no such channel; ValueError if an array has the wrong shape, an added layer exists
+    already, or an attribute would replace one that is not a string; OSError if the file cannot be written; no partial
+    file is left.
     """
     by_part: list[dict[str, OpenEXR.Channel]] = [dict(part.channels) for part in source.parts]
     clamped = 0

@@ -30,30 +30,13 @@ def open_network(
 ) -> NetworkDenoiser:
     """Load weights, and return the denoiser that runs them.
 
-    Parameters
-    ----------
-    weights : Path
-        Output of a training, or of a preset.
-    tile : int, optional
-        Side of the squares that the network processes at once, pixels; a halo is added around each. Default: the
-        denoiser's `default_tile`.
-    precision : str
-        One of `PRECISIONS`; "auto" is bfloat16 where the processor computes in it.
-    device : str
-        As for `network.devices.find_device`.
-    threshold : float, optional
-        t·K of predicted kernels, in [0, 1); higher stays closer to the input. Default: that of the training.
-    breakdown : Breakdown, optional
-        Counts the weights of the frames; each frame's contribution and weight are then further layers.
-    add_layers : bool
-        Whether the image is the sum of its light passes, instead of these being scaled to it.
-    timings : Timings, optional
-        Counts the stage "network".
+    `tile` is the side of the squares that the network processes at once, pixels; a halo is added around each.
+    `precision` "auto" is bfloat16 where the processor computes in it. `threshold` is t·K of predicted kernels, in [0,
+    1); higher stays closer to the input; by default that of the training. A breakdown counts the weights of the frames;
+    each frame's contribution and weight are then further layers. With `add_layers` the image is the sum of its light
+    passes, instead of these being scaled to it.
 
-    Raises
-    ------
-    ValueError
-        A bad option, a threshold for a network without kernels, or a file without a model.
+    Raises ValueError for a bad option, a threshold for a network without kernels, or a file without a model.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision is {precision!r}, expected one of {', '.join(PRECISIONS)}")
