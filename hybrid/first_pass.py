@@ -276,8 +276,9 @@ class _KeptPictures:
         Raises ValueError if another file is there, which no run has kept as a first pass.
         """
         path, shot = self.places[frame.number], self._shot
-        files = shot.sources(shot.neighbours(frame.number, self._support))
-        made_from = describe_sources(files, frame=frame.number, layers=shot.layer_summary(frame.number), **self._facts)
+        files = shot.reader.sources(shot.neighbours(frame.number, self._support))
+        layers = shot.reader.layer_summary(frame.number)
+        made_from = describe_sources(files, frame=frame.number, layers=layers, **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
                 raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")

@@ -192,7 +192,7 @@ class _ShotDenoiser:
         Then begin to read the first frame that the `following` one needs beyond this one's.
         """
         started, attributes = time.perf_counter(), self.settings.attributes
-        read_as = [view.shot.layer_summary(number) for view in self.views]
+        read_as = [view.shot.reader.layer_summary(number) for view in self.views]
         # With its number: in a shot that one window holds, all frames are made from the same files.
         made_from = describe_sources(self.sources(number), frame=number, layers=read_as, size=list(self.shot.shape))
         planned = {**attributes, BESIDE: _others(number, self.denoisers[0].neighbours(number)), MADE_FROM: made_from}
@@ -238,7 +238,7 @@ class _ShotDenoiser:
         with self.timings.background("write"):
             for read in (self.shot, *(view.first_pass.files for view in self.views if view.first_pass is not None)):
                 if read is not None:
-                    read.check_unchanged(n for n in self.shot.neighbours(number, self.support) if read.has(n))
+                    read.reader.check_unchanged(n for n in self.shot.neighbours(number, self.support) if read.has(n))
             first, *others = ({"color": r.denoised.color, **r.denoised.aovs} for r in results)
             pictures = [
                 (view.shot, layers, result.denoised.extra)
@@ -272,10 +272,10 @@ def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: Source
         near = shot.neighbours(number, support)
         if earlier is not None:
             return {name: source for n in near for name, source in earlier(n).items()}
-        files = shot.sources(near)
+        files = shot.reader.sources(near)
         for view in views:
             if view.first_pass is not None and (given := view.first_pass.files) is not None:
-                files |= given.sources((n for n in near if given.has(n)), "estimate")
+                files |= given.reader.sources((n for n in near if given.has(n)), "estimate")
         return files
 
     return sources

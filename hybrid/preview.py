@@ -95,7 +95,7 @@ class _Pairs:
     def __init__(self, shot: Shot, output: str | Path) -> None:
         self.noisy = shot
         self.denoised = shot.reopened({number: output_path(output, shot, number) for number in shot.numbers})
-        middle, _ = replace_nonfinite(shot.read_color(shot.numbers[len(shot.numbers) // 2]))
+        middle, _ = replace_nonfinite(shot.reader.read_color(shot.numbers[len(shot.numbers) // 2]))
         self._exposure = np.float32(measure_exposure(middle) / 0.18)
 
     def read(self, number: int) -> tuple[Image8, Image8]:
@@ -103,7 +103,7 @@ class _Pairs:
         return self._encoded(self.noisy, number), self._encoded(self.denoised, number)
 
     def _encoded(self, shot: Shot, number: int) -> Image8:
-        color, _ = replace_nonfinite(shot.read_color(number))
+        color, _ = replace_nonfinite(shot.reader.read_color(number))
         return encode_bytes(color / self._exposure)
 
 

@@ -157,7 +157,7 @@ def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str
     for pair in _pair_numbers(shot):
         with suppress(ValueError, OSError):  # a file that cannot be read is an error when it is denoised
             pictures = [picture for number in pair if (picture := finished(number)) is not None]
-            colors = [shot.read_color(number) for number in pair]
+            colors = [shot.reader.read_color(number) for number in pair]
             if [picture.shape for picture in pictures] == [color.shape for color in colors]:
                 edges.append(_match_edges(_edges_of(pictures), _edges_of(colors)))
     return _other_frame(edges) if edges else None
@@ -172,7 +172,7 @@ def find_sequence_grade(shot: Shot, finished: Callable[[int], Array | None]) -> 
     pictures = []
     for number in numbers:
         with suppress(ValueError, OSError):  # a file that cannot be read is an error when it is denoised
-            picture, color = finished(number), shot.read_color(number)
+            picture, color = finished(number), shot.reader.read_color(number)
             if picture is not None and picture.shape == color.shape:
                 pictures.append((picture, color))
     return find_grade(pictures) if pictures else None

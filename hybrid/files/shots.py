@@ -22,7 +22,6 @@ from hybrid.files.reader import Interpretation, ShotFiles, ShotHeaders, ShotRead
 from hybrid.files.replace import identities
 from hybrid.files.sequences import find_files, format_frames, name_holes, parse_frames, parse_pattern, pattern_of
 from hybrid.files.sidecars import SidecarSequence, find_companions, gather_folder, names_sequence, open_sidecar
-from hybrid.files.sources import Source
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,18 +177,6 @@ class Shot:
         """Return the layers of a frame; raise ExrError if a layer is missing, or is not that of the first frame."""
         return self.reader.layers(number)
 
-    def layer_summary(self, number: int) -> str:
-        """Describe how the layers of a frame are read: if two texts differ, the pictures differ."""
-        return self.reader.layer_summary(number)
-
-    def sources(self, numbers: Iterable[int], name: str = "frame") -> dict[str, Source]:
-        """Return the files of frames as they were when first read, under ``name 1001`` (`ShotReader.sources`)."""
-        return self.reader.sources(numbers, name)
-
-    def check_unchanged(self, numbers: Iterable[int]) -> None:
-        """Raise OSError if a file of these frames has changed since it was read."""
-        self.reader.check_unchanged(numbers)
-
     def read(self, number: int) -> Frame:
         """Read a frame, or return it from memory.
 
@@ -197,10 +184,6 @@ class Shot:
         its size is not that of the first frame.
         """
         return self.reader.read(number)
-
-    def read_color(self, number: int) -> np.ndarray:
-        """Read the color of a frame alone, in half the time of `read`; not held."""
-        return self.reader.read_color(number)
 
     def write(
         self,

@@ -76,10 +76,10 @@ def test_a_file_that_was_exchanged_is_seen_whatever_its_time_and_size(tmp_path):
     """A run that went on over it ended with exit code 0."""
     shot = open_shot(save_frames(tmp_path, [1, 2]))
     shot.read(1)
-    shot.check_unchanged([1, 2])
+    shot.reader.check_unchanged([1, 2])
     Path(shutil.copy2(shot.path(1), tmp_path / "spare")).replace(shot.path(1))
     with pytest.raises(OSError, match=r"shot\.0001\.exr has changed since it was read"):
-        shot.check_unchanged([1, 2])
+        shot.reader.check_unchanged([1, 2])
 
 
 def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):
@@ -90,4 +90,4 @@ def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):
         save_file(tmp_path / f"a.{number}.exr", channels, {"samplesPerPixel": samples, "renderTimeSeconds": 1.0})
     shot = open_shot(tmp_path)
     assert [shot.read(number).variance.max() for number in (1, 2)] == [1 / 64, 1 / 256]
-    assert "variance 0.00390625" in shot.layer_summary(2)
+    assert "variance 0.00390625" in shot.reader.layer_summary(2)

@@ -277,7 +277,7 @@ def test_a_file_that_changes_after_validation_is_seen(tmp_path):
     validated = shot.reinterpreted(Interpretation(variance_scale=2.0))
     exchange(shot.path(1))
     with pytest.raises(OSError, match="has changed since it was read"):
-        validated.check_unchanged([1])
+        validated.reader.check_unchanged([1])
 
 
 def test_a_file_that_changes_between_two_views_is_seen(tmp_path):
