@@ -125,7 +125,7 @@ def _execute(
 @contextmanager
 def _reachable(oidn: Any, device: Any, images: dict[str, NDArray[np.float32]]) -> Iterator[dict[str, Any]]:
     """The images where the device can reach them: as they are, or copied to buffers of its own."""
-    if device.get_bool("systemMemorySupported"):  # as processors and few others read what a program has allocated
+    if _reads_memory(device):
         yield dict(images)
         return
     buffers = {name: oidn.Buffer(device, image.nbytes) for name, image in images.items()}
@@ -137,6 +137,11 @@ def _reachable(oidn: Any, device: Any, images: dict[str, NDArray[np.float32]]) -
     finally:
         for buffer in buffers.values():
             buffer.release()
+
+
+def _reads_memory(device: Any) -> bool:
+    """Whether a device reads what a program has allocated, as processors and few others do."""
+    return bool(device.get_bool("systemMemorySupported"))
 
 
 def find_device(name: str) -> str:

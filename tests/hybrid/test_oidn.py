@@ -133,7 +133,7 @@ class TestDenoise:
 
     def test_error_of_the_library_is_raised(self, scene) -> None:
         with pytest.raises(RuntimeError, match="OIDN: unsupported combination"):
-            oidn._execute({"color": scene[1], "normal": scene[3]}, "high", 1, "cpu", hdr=True)
+            oidn._execute({"color": scene[1], "normal": scene[3]}, "high", "cpu", hdr=True)
 
     def test_unknown_quality_is_an_error(self, scene) -> None:
         with pytest.raises(ValueError, match="quality must be one of high, balanced, fast"):
