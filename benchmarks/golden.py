@@ -238,7 +238,8 @@ def main() -> int:
         if not (folder / "shots").exists():
             (folder / "shots").mkdir(parents=True)
             write_shots(folder / "shots")
-            shutil.copy(options.base / "network" / "weights" / "tkpcn.safetensors", folder / "shots")
+            weights = next((options.base / "network").rglob("tkpcn.safetensors"))
+            shutil.copy(weights, folder / "shots")
         kept = folder / "before.pickle"
         before = pickle.loads(kept.read_bytes()) if kept.exists() else {}
         if missing := [name for name in names if name not in before]:

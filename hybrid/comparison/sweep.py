@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 from hybrid.comparison.methods import METHODS, Classical, Method, Network, Run, WindowSettings
 from hybrid.plan import Plan, Rules
@@ -29,7 +30,7 @@ def sweep_methods(plan: Plan) -> dict[str, Method]:
 
     Each stage is switched to the opposite of the plan; the presets are among `METHODS` already.
     """
-    return dict([*_stages(plan), *_windows(), *_tvl1(), *_nlm(), *_network(), *_threads()])
+    return dict([*_stages(plan), *_filters(), *_networks(), *_threads()])
 
 
 def _variant(sweep: str, base: str, settings: Mapping[str, object], run: Run) -> tuple[str, Method]:
@@ -66,32 +67,27 @@ def _stages(plan: Plan) -> Iterator[tuple[str, Method]]:
         yield _variant("Stages", CLASSICAL, {stage: "off"}, _classical(preset=preset))
 
 
-def _windows() -> Iterator[tuple[str, Method]]:
+def _filters() -> Iterator[tuple[str, Method]]:
+    """Lengths of the window, settings of TV-L1, and radii of the non-local means."""
     for radius in RADII:
         yield _variant("Window", CLASSICAL, {"window": 2 * radius + 1}, _classical(WindowSettings(radius=radius)))
-
-
-def _tvl1() -> Iterator[tuple[str, Method]]:
     for scales, warps, iterations in product(SCALES, WARPS, ITERATIONS):
         solver = {"scales": scales, "warps": warps, "iterations": iterations}
         yield _variant("TV-L1", CLASSICAL, solver, _classical(WindowSettings(solver=solver)))
-
-
-def _nlm() -> Iterator[tuple[str, Method]]:
     for radius, patch in product(NLM_RADII, PATCH_RADII):
         preset = replace(STANDARD, nlm_radius=radius, nlm_patch_radius=patch)
         yield _variant("NLM", CLASSICAL, {"radius": radius, "patch": patch}, _classical(preset=preset))
 
 
-def _network() -> Iterator[tuple[str, Method]]:
-    for threshold in THRESHOLDS:
-        run = replace(_network_run(KERNELS), threshold=threshold)
-        yield _variant("Kernel threshold", KERNELS, {"threshold": threshold}, run)
-    for precision in PRECISIONS:
-        run = replace(_network_run(NETWORK), precision=precision)
-        yield _variant("Precision", NETWORK, {"precision": precision}, run)
-    for tile in TILES:
-        yield _variant("Tile", NETWORK, {"tile": tile}, replace(_network_run(NETWORK), tile=tile))
+def _networks() -> Iterator[tuple[str, Method]]:
+    for sweep, base, name, values in (
+        ("Kernel threshold", KERNELS, "threshold", THRESHOLDS),
+        ("Precision", NETWORK, "precision", PRECISIONS),
+        ("Tile", NETWORK, "tile", TILES),
+    ):
+        for value in values:
+            settings: dict[str, Any] = {name: value}
+            yield _variant(sweep, base, settings, replace(_network_run(base), **settings))
 
 
 def _threads() -> Iterator[tuple[str, Method]]:
