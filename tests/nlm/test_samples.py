@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from nlm.samples import SampleMean, average_neighbours, blend_samples, restore_mean
+from nlm.samples import SampleMean, average_neighbours, blend_samples, restore_mean, spatial_variance
 
 SHAPE = (96, 128)
 ONES = np.ones((*SHAPE, 3), np.float32)
@@ -116,11 +117,30 @@ def test_a_frame_alone_that_is_flat_has_no_noise() -> None:
 @pytest.mark.parametrize("spread", [1, 3])
 def test_a_frame_alone_with_noise_is_left_to_the_picture(spread: int) -> None:
     """Filters of a renderer may spread samples over several pixels: smooth noise is noise nevertheless."""
-    import cv2
+
 
     alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
     own = cv2.GaussianBlur(noisy(ONES, 0.5, 5), (0, 0), 0.8) if spread > 1 else noisy(ONES, 0.5, 5)
     assert np.abs(blend_samples(ONES, own, alone, 1.0) - ONES).max() < 0.02
+
+
+@pytest.mark.parametrize("spread", [0.5, 0.8, 1.0])
+def test_the_variance_of_noise_that_a_pixel_filter_spreads_is_measured(spread: float) -> None:
+    grain = np.random.default_rng(7).standard_normal(ONES.shape).astype(np.float32)
+    spread_grain = cv2.GaussianBlur(grain, (0, 0), spread)
+    for noise in (grain, spread_grain):
+        found = spatial_variance(ONES + np.float32(0.05) * noise, ONES, np.ones(SHAPE, np.float32))
+        assert found.mean() == pytest.approx(3 * 0.05**2 * noise.var(), rel=0.2)
+
+
+def test_a_wrong_outline_is_mended_where_the_alignment_is_off_too() -> None:
+    """Along an outline frames differ by more than their noise; the noise beside it is the same."""
+    truth = np.where(np.arange(SHAPE[1]) < SHAPE[1] // 2, 0.2, 1.0).astype(np.float32)
+    truth = np.broadcast_to(truth[:, None], ONES.shape).copy()
+    soft = cv2.GaussianBlur(truth, (0, 0), 1.5)
+    sides = window(cv2.GaussianBlur(np.roll(truth, 1, axis=1), (0, 0), 0.7), 0.003)[1]
+    mended = blend_samples(soft, noisy(truth, 0.003, 8), sides, 0.5)
+    assert error(mended, truth) < 0.4 * error(soft, truth)
 
 
 def test_the_variance_of_the_renderer_counts_where_no_frame_beside_does() -> None:
