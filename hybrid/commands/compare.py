@@ -19,14 +19,15 @@ from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import log_cuts, open_input, validate_renders
 from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot
+from hybrid.comparison.ladder import join_ladders
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
-from hybrid.comparison.results import Comparison, Cost, MethodResult, join, read_comparison
+from hybrid.comparison.results import Comparison, Cost, join, read_comparison
 from hybrid.comparison.running import run_in_process
 from hybrid.comparison.samples import samples_of
 from hybrid.comparison.store import FrameStore
 from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
-from hybrid.comparison.tables import markdown_table, result_table
+from hybrid.comparison.tables import ladder_rows, ladder_table, markdown_rows, markdown_table, result_table
 from hybrid.files.movies import check_movie
 from hybrid.files.shots import Shot, open_matching_sequence
 from hybrid.runtime.allocator import reuse_freed_memory
@@ -73,9 +74,14 @@ def compare(
     level: Annotated[
         list[str] | None,
         opt.of_input(
-            "SHOT at other samples per pixel, to measure how the noise falls; may be repeated", metavar="PATTERN=SPP"
+            "SHOT at other samples per pixel (SPP, unless its files state them), to measure how the noise falls; "
+            "may be repeated",
+            metavar="PATTERN[=SPP]",
         ),
     ] = None,
+    ladder: Annotated[
+        bool, opt.of_method("also run the methods on every --level: error against samples", "--ladder")
+    ] = False,
     exposure: Annotated[float, opt.of_method("factor on radiance before the tone curve of the measures")] = 1.0,
     clock: Annotated[Literal["wall", "cpu"], opt.of_output("time in chart.png and in the Markdown table")] = "wall",
     markdown: Annotated[bool, opt.of_output("print the table as Markdown", "--markdown")] = False,
@@ -107,6 +113,8 @@ def compare(
 
     ravg compare "noisy.####.exr" --reference "clean.####.exr" --methods "OIDN high" --external "mine=mine.####.exr"
 
+    ravg compare "s008.####.exr" --level "s032.####.exr" --level "s128.####.exr" --ladder --reference "clean.####.exr"
+
     ravg compare --with-report one --with-report two -o both   (join finished reports)
     """
     cost: Cost = "seconds_per_megapixel" if clock == "wall" else "cpu_seconds_per_megapixel"
@@ -119,10 +127,14 @@ def compare(
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
+    if ladder and not level:
+        raise typer.BadParameter("--ladder runs the methods on levels, expected --level with it")
     opened = open_input(shot, frames, layer, profile=profile, motion=motion)
     alike, findings = validate_renders({"shot": opened}, strict=strict)
     noisy = alike["shot"]
     clean = [_open_matching(spec, noisy, frames) for spec in reference]
+    open_level = partial(open_input, frames=frames, layer=layer, profile=profile, motion=motion)
+    levels = [_with_samples(pattern, open_level(pattern), count) for pattern, count in _levels(level)]
     chosen = _methods(methods, external, _seconds(external_seconds), noisy, frames)
     plan = cache(partial(run_in_process, plan_shot, noisy))
     if sweep:
@@ -134,7 +146,8 @@ def compare(
         rounds=rounds,
         samples=samples or samples_of(noisy),
         reference_samples=samples_of(clean[0]),
-        levels=[(open_input(pattern, frames, layer, profile=profile), count) for pattern, count in _levels(level)],
+        levels=[(_validated(found, strict) if ladder else found, count) for found, count in levels],
+        ladder=ladder,
         findings=findings,
         check_shot=lambda: [finding.message for finding in log_cuts(plan(), (), strict=strict)],
         maps=output is not None,
@@ -152,7 +165,7 @@ def compare(
             report.write(comparison, images)
             if keep_frames:
                 _write_frames(output / FRAMES, noisy, images)
-    report.show([comparison, *report.read_others()], comparison.results)
+    report.show([comparison, *report.read_others()], comparison)
 
 
 class _ProgressBar:
@@ -205,10 +218,12 @@ class _Report:
     def show_joined(self) -> None:
         """Join finished comparisons, without running a method."""
         others = self.read_others()
-        joined = Comparison(" + ".join(c.shot for c in others), tuple(join(others)), {})
+        joined = Comparison(
+            " + ".join(c.shot for c in others), tuple(join(others)), {}, join_ladders([c.ladder for c in others])
+        )
         if self.output is not None:
             self.write(joined, None)
-        self.show(others, joined.results)
+        self.show(others, joined)
 
     def write(self, comparison: Comparison, images: ShotImages | None) -> None:
         """Write the page and its files."""
@@ -218,12 +233,17 @@ class _Report:
         report = Report(comparison, images, self.read_others(), self.cost, self.rate, self.movies)
         LOG.info(f"wrote {write_report(self.output, report)}")
 
-    def show(self, comparisons: Sequence[Comparison], results: Sequence[MethodResult]) -> None:
-        """Print results as Markdown, or as a table for a terminal."""
+    def show(self, comparisons: Sequence[Comparison], shown: Comparison) -> None:
+        """Print results and ladder as Markdown, or as tables for a terminal."""
+        rows = ladder_rows(shown.ladder)
         if self.markdown:
             typer.echo(markdown_table(comparisons, self.cost), nl=False)
+            if rows:
+                typer.echo("\n" + markdown_rows([rows[0], ["---"] * len(rows[0]), *rows[1:]]), nl=False)
         else:
-            Console().print(result_table(results))
+            Console().print(result_table(shown.results))
+            if rows:
+                Console().print("", ladder_table(rows))
 
 
 def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
@@ -280,12 +300,28 @@ def _methods(
     return chosen
 
 
-def _levels(level: Sequence[str] | None) -> list[tuple[str, float]]:
-    """Patterns and samples per pixel; a pattern may hold "=" itself."""
-    levels = []
+def _validated(level: Shot, strict: bool) -> Shot:
+    """A level without layers that make no sense in it."""
+    return validate_renders({"level": level}, strict=strict)[0]["level"]
+
+
+def _with_samples(pattern: str, level: Shot, stated: float | None) -> tuple[Shot, float]:
+    """A level and its samples per pixel, from its files where they are not stated."""
+    samples = stated or samples_of(level)
+    if samples is None:
+        raise ValueError(f"{pattern} does not state its samples per pixel, expected --level PATTERN=SPP")
+    return level, samples
+
+
+def _levels(level: Sequence[str] | None) -> list[tuple[str, float | None]]:
+    """Patterns and samples per pixel, None where these are not stated; a pattern that holds "=" has them stated."""
+    levels: list[tuple[str, float | None]] = []
     for item in level or ():
         pattern, separator, count = item.rpartition("=")
-        if not separator or not pattern or not count:
+        if not separator and item:
+            levels.append((item, None))
+            continue
+        if not pattern or not count:
             raise typer.BadParameter(f"--level is {item!r}, expected PATTERN=SPP")
         try:
             samples = float(count)

@@ -19,7 +19,8 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from matplotlib.transforms import Affine2D, Bbox
 
-from hybrid.comparison.results import COSTS, INPUT_FAMILY, Cost, MethodResult, Metric, pareto_front
+from hybrid.comparison.ladder import INPUT
+from hybrid.comparison.results import COSTS, INPUT_FAMILY, METRICS, Cost, Ladder, MethodResult, Metric, pareto_front
 from hybrid.comparison.tables import column_title, format_bytes, format_seconds, format_value
 
 # Okabe and Ito's palette, which people with any common color blindness can distinguish, without its yellow, which is
@@ -30,6 +31,8 @@ SIZES = (1.0, 0.95, 1.1, 0.85, 1.6, 1.1, 1.15, 1.05, 1.15)  # of the markers, fo
 WIDTH, HEIGHT, PNG_DPI = 10.0, 5.4, 160  # inches, and dots per inch
 GUTTER = 0.09  # of the cost axis: the columns of methods that cost nothing, and of those whose cost is unknown
 LEGEND_COLUMNS, LEGEND_ROW = 4, 0.3  # the height of a row in inches
+LADDER_COLUMNS, LADDER_HEIGHT = 5, 4.0  # of the chart of a ladder; the height in inches
+ERRORS = {"psnr": "Squared error", "temporal_psnr": "Squared error of changes"}  # where a measure is not the error
 LONGEST_LABEL = 34
 # Where a label may stand, in order of preference: offset in points, alignment. The front's line leads to a point from
 # below and from it to the right, so labels above cross it least.
@@ -125,15 +128,19 @@ def _set_cost_axis(axes: Axes, costs: dict[int, float | None], cost: Cost) -> di
 def _set_measure_axis(axes: Axes, metric: Metric) -> None:
     if metric.logarithmic:
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.minorticks_off()
+        _set_plain_ticks(axes)
     axes.yaxis.set_inverted(metric.better != "higher")
     axes.set_title(f"{column_title(metric)}, better ↑", loc="left", fontsize=10)
     axes.grid(color="#88888833", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(length=0, labelsize=9, labelcolor="#555")
     axes.spines[["top", "left", "right"]].set_visible(False)
+
+
+def _set_plain_ticks(axes: Axes) -> None:
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.minorticks_off()
 
 
 def _leave_out_input(axes: Axes, shown: Collection[MethodResult], metric: Metric) -> tuple[float, float]:
@@ -238,12 +245,51 @@ def draw_curves(results: Sequence[MethodResult], metric: Metric, pair: tuple[str
     return to_svg(figure, f"curve-{metric.key}")
 
 
-def _draw_legend(figure: Figure, names: Sequence[str]) -> None:
+def draw_ladder(ladder: Ladder) -> Figure | None:
+    """Draw error against samples per pixel, both logarithmic, one panel for each measure; None without a curve."""
+    metrics = [m for m in METRICS if m.key in ladder]
+    if not metrics:
+        return None
+    names = list(dict.fromkeys(name for m in metrics for name in ladder[m.key]))
+    legend_height = LEGEND_ROW * -(-len(names) // LADDER_COLUMNS) + 0.05
+    height = LADDER_HEIGHT + legend_height
+    figure = Figure(figsize=(WIDTH, height), facecolor="none")
+    width = 1 / len(metrics)
+    for index, metric in enumerate(metrics):
+        place = (index + 0.14) * width, (0.5 + legend_height) / height, 0.82 * width, (LADDER_HEIGHT - 0.9) / height
+        axes = figure.add_axes(place, facecolor="none")
+        counts = sorted({n for curve in ladder[metric.key].values() for n, _ in curve})
+        for name, curve in ladder[metric.key].items():
+            color, kind, size = _style(names.index(name))
+            style = "--" if name == INPUT else "-"
+            axes.plot(*zip(*curve, strict=True), color=color, marker=kind, markersize=0.8 * size, linestyle=style)
+        axes.set(xscale="log", yscale="log")
+        if metric.key not in ERRORS:  # the range of FLIP seldom has a power of ten
+            _set_plain_ticks(axes)
+        axes.set_xticks(counts, [f"{n:g}" for n in counts])
+        axes.xaxis.minorticks_off()
+        axes.set_xlabel("samples per pixel →", loc="right")
+        axes.set_title(f"{ERRORS.get(metric.key, metric.label)}, better ↓", loc="left", fontsize=11)
+        axes.grid(color="#88888833", linewidth=0.8)
+        axes.tick_params(which="both", length=0, labelcolor="#555")
+        axes.spines[["top", "left", "right"]].set_visible(False)
+    _draw_legend(figure, names, LADDER_COLUMNS, lines=True)
+    return figure
+
+
+def _style(index: int) -> tuple[str, str, float]:
+    """Color, marker and its size, by the index of a family or of a method."""
+    return COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)], 8 * SIZES[index % len(SIZES)]
+
+
+def _draw_legend(figure: Figure, names: Sequence[str], columns: int = LEGEND_COLUMNS, *, lines: bool = False) -> None:
     handles = []
-    for i in range(len(names)):
-        color, kind, size = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], 8 * SIZES[i % len(SIZES)]
-        handles.append(Line2D([], [], color=color, marker=kind, linestyle="", markersize=size))
-    legend = figure.legend(handles, ["-"] * len(names), loc=(0.05, 0), ncols=LEGEND_COLUMNS, frameon=False)
+    for i, name in enumerate(names):
+        color, kind, size = _style(i)
+        handle = Line2D([], [], color=color, marker=kind, markersize=size)
+        handle.set_linestyle("" if not lines else "--" if name == INPUT else "-")
+        handles.append(handle)
+    legend = figure.legend(handles, ["-"] * len(names), loc=(0.05, 0), ncols=columns, frameon=False)
     for text, name in zip(legend.get_texts(), names, strict=True):  # given as labels, names with a leading "_" are lost
         text.set(text=" ".join(name.split()), parse_math=False, fontsize=9)
 

@@ -14,8 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from hybrid.comparison.evaluation import Evaluator, Level, error_of, find_static_pixels, store_flows, store_reference
+from hybrid.comparison.ladder import build_ladder
 from hybrid.comparison.methods import METHODS, Method
-from hybrid.comparison.results import Comparison, MethodResult, Statistic
+from hybrid.comparison.results import Comparison, Ladder, MethodResult, Statistic
 from hybrid.comparison.running import ENOUGH, WARM_UP, OnStep, RunCost, run_in_process, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
 from hybrid.comparison.store import FrameStore
@@ -39,6 +40,7 @@ class CompareOptions:
     samples: float | None = None
     reference_samples: float | None = None
     levels: Sequence[Level] = ()  # renders of the shot at other samples per pixel, to measure how the error falls
+    ladder: bool = False  # run the methods on the levels too
     findings: Sequence[str] = ()  # findings on the shot's layers, for the facts
     # returns further findings; called in the background while reference and motion are read. An exception ends the
     # comparison before any method runs.
@@ -64,15 +66,15 @@ def compare_shot(
     method that is not installed, or whose process died, has an `absent_reason` instead of measurements.
 
     Raises ValueError before any method runs: if shot and reference have no frame in common; if another input lacks a
-    frame or differs in size; if levels are given without samples or without the method "noisy". Afterwards: if a method
-    has left out frames.
+    frame or differs in size; if levels are given without samples or without the method "noisy"; if a ladder has one
+    number of samples twice, or a level without some frame. Afterwards: if a method has left out frames.
     """
     options = options or CompareOptions()
     halves = reference if isinstance(reference, tuple) else (reference,)
     numbers = _common_frames(shot, halves)
     _check_levels(numbers, methods, options)
     inputs = _inputs(numbers, halves, methods, options.levels)
-    steps = _Steps(on_step, options.rounds, methods, options.maps)
+    steps = _Steps(on_step, methods, options)
     steps.start("read the shot, its motion and the reference", 0)
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         store = FrameStore(Path(kept))
@@ -96,21 +98,24 @@ def compare_shot(
             else _result(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             for name, method in methods.items()
         ]
+        ladder = _measure_ladder(evaluator, methods, statistics, options, steps)
         map_facts = _store_all_maps(store, shot, {n: methods[n] for n in timed.runs}, evaluator, steps)
         steps.start("done", steps.total)
     facts = _facts_of_frames(evaluator) | law_facts
     if findings:
         facts["Layers"] = "; ".join(findings)
-    return Comparison(options.title, tuple(results), facts | map_facts | _facts_of_runs(options, load))
+    return Comparison(options.title, tuple(results), facts | map_facts | _facts_of_runs(options, load), ladder)
 
 
 class _Steps:
-    """Numbers the steps of a comparison and reports them: reading, runs, FLIP, measuring, maps."""
+    """Numbers the steps of a comparison and reports them: reading, runs, FLIP, measuring, levels, maps."""
 
-    def __init__(self, on_step: OnStep | None, rounds: int, methods: Mapping[str, Method], maps: bool) -> None:
-        self.mapped = [name for name, method in methods.items() if maps and method.maps is not None]
-        self.first_measure = 1 + rounds * len(methods)
-        self.first_map = self.first_measure + 1 + len(methods)
+    def __init__(self, on_step: OnStep | None, methods: Mapping[str, Method], options: CompareOptions) -> None:
+        self.mapped = [name for name, method in methods.items() if options.maps and method.maps is not None]
+        self.first_measure = 1 + options.rounds * len(methods)
+        self.first_level = self.first_measure + 1 + len(methods)
+        levels = len(options.levels) if options.ladder else 0
+        self.first_map = self.first_level + levels * (1 + len(_methods_of_levels(methods)))
         self.total = self.first_map + len(self.mapped)
         self._on_step = on_step
 
@@ -142,6 +147,15 @@ def _check_levels(numbers: Sequence[int], methods: Mapping[str, Method], options
         if not any(level.has(number) for number in numbers):
             spans = f"frames {_span(level.numbers)}, expected some of {_span(numbers)}"
             raise ValueError(f"level of {count:g} samples has {spans}")
+    if options.ladder:
+        counts = [options.samples, *(count for _, count in options.levels)]
+        if twice := [count for count in counts if counts.count(count) > 1]:
+            raise ValueError(f"the ladder has {twice[0]:g} samples per pixel twice, expected different levels")
+        for level, count in options.levels:
+            if missing := [number for number in numbers if number not in level.numbers]:
+                raise ValueError(
+                    f"level of {count:g} samples has no frame {missing[0]}, expected all of {_span(numbers)}"
+                )
 
 
 class _Input(NamedTuple):
@@ -207,6 +221,34 @@ def _noise_law(
         statistics["noisy"]["psnr"], options.samples, options.levels, options.reference_samples
     )
     return law, {"Reference": words, "Worth in samples": law.describe()}
+
+
+def _methods_of_levels(methods: Mapping[str, Method]) -> dict[str, Method]:
+    """The methods that run on levels: finished frames show the shot alone, and sweeps would take days."""
+    return {name: method for name, method in methods.items() if method.given is None and not method.sweep}
+
+
+def _measure_ladder(
+    evaluator: Evaluator,
+    methods: Mapping[str, Method],
+    statistics: Mapping[str, Mapping[str, Statistic]],
+    options: CompareOptions,
+    steps: _Steps,
+) -> Ladder:
+    """The errors of the methods on the shot and on every level; frames of a level have names of their own."""
+    if not options.ladder or options.samples is None:
+        return {}
+    chosen = _methods_of_levels(methods)
+    measured = {options.samples: {name: statistics[name] for name in chosen if name in statistics}}
+    for index, (level, samples) in enumerate(options.levels):
+        first = steps.first_level + index * (1 + len(chosen))
+        names = {f"{name} at {samples:g} samples": name for name in chosen if name in statistics}
+        at_level = {long: chosen[name] for long, name in names.items()}
+        timed = time_methods(at_level, level, 1, evaluator.store, partial(steps.start, first=first))
+        steps.start(f"measure the level of {samples:g} samples", len(chosen), first=first)
+        evaluator.map_flip(list(timed.runs))
+        measured[samples] = {names[long]: evaluator.measure(long, flip=True, change=False) for long in timed.runs}
+    return build_ladder(measured)
 
 
 def _result(

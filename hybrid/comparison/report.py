@@ -39,14 +39,21 @@ from hybrid.comparison.results import (
     to_plain_numbers,
 )
 from hybrid.comparison.store import CHANGE_MAP, MAP_TITLES, REFERENCE, FrameStore
-from hybrid.comparison.tables import format_bytes, format_change, format_seconds, format_value, format_worth
+from hybrid.comparison.tables import (
+    format_bytes,
+    format_change,
+    format_seconds,
+    format_value,
+    format_worth,
+    ladder_rows,
+)
 from hybrid.files.replace import check_outputs, write_file
 
 Array = NDArray[np.float32]
 
 RATES = (4, 12, 24, 25, 30, 60)  # frames per second that the page offers
 MOVIES = "movies"  # folder next to the page
-FILES = ("report.html", "results.json", "chart.png")
+FILES = ("report.html", "results.json", "chart.png", "ladder.png")
 
 
 @dataclass(frozen=True)
@@ -63,7 +70,7 @@ class Report:
 
 
 def write_report(folder: Path | str, report: Report) -> Path:
-    """Write ``report.html``, ``results.json`` and ``chart.png`` into a folder; return the path of the page.
+    """Write `FILES` into a folder, ``ladder.png`` where there is a ladder; return the path of the page.
 
     Raises ValueError if two results have one name, images have no result or no frames, or images differ in shape.
     """
@@ -78,6 +85,8 @@ def write_report(folder: Path | str, report: Report) -> Path:
     figure = chart.draw_chart(results, charted[0], report.cost, legend=True) if charted else None
     if figure is not None:
         write_file(folder / "chart.png", chart.to_png(figure))
+    if (ladder := chart.draw_ladder(report.comparison.ladder)) is not None:
+        write_file(folder / "ladder.png", chart.to_png(ladder))
     write_file(folder / "report.html", _page(report, embedded, document, charted))
     return folder / "report.html"
 
@@ -182,6 +191,8 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
         absent=[r for r in results if r.absent_reason is not None],
         sweeps=_sweep_tables(present, metrics),
         stages=stage_values(results),
+        ladder=None if (ladder := chart.draw_ladder(comparison.ladder)) is None else chart.to_svg(ladder, "ladder"),
+        ladder_rows=ladder_rows(comparison.ladder),
         shots=_shot_table([comparison, *report.others]),
         pictures=embedded.pictures,
         animations=embedded.animations,

@@ -65,6 +65,10 @@ class MethodResult:
     absent_reason: str | None = None  # why a requested method has no measurements
 
 
+Curve = Sequence[tuple[float, float]]  # (samples per pixel, error), by rising samples
+Ladder = Mapping[str, Mapping[str, Curve]]  # curves by `Metric.key` and name of the method
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Results of all methods on one shot, and facts on how they were measured."""
@@ -72,6 +76,7 @@ class Comparison:
     shot: str
     results: tuple[MethodResult, ...]
     facts: Mapping[str, str] = field(default_factory=dict)
+    ladder: Ladder = field(default_factory=dict)  # of renders at several samples per pixel
 
 
 # Their definitions are in page/definitions.html.
@@ -277,6 +282,7 @@ def to_document(comparison: Comparison) -> dict[str, object]:
         ],
         "fronts": {f"{m.key} {cost}": pareto_front(results, m, cost) for m in metrics for cost in COSTS},
         "stages": [asdict(s) for s in stage_values(results)],
+        "ladder": comparison.ladder,
     }
 
 
@@ -314,7 +320,11 @@ def read_comparison(path: Path) -> Comparison:
         document = json.loads(text)
         results = tuple(_read_result(entry) for entry in document["results"])
         facts = {str(name): str(value) for name, value in document["facts"].items()}
-        return Comparison(str(document["shot"]), results, facts)
+        ladder = {
+            str(key): {str(name): tuple((float(n), float(e)) for n, e in curve) for name, curve in curves.items()}
+            for key, curves in document.get("ladder", {}).items()
+        }
+        return Comparison(str(document["shot"]), results, facts, ladder)
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise ValueError(f"{path} is no result of a comparison: {words}") from None

@@ -11,12 +11,14 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
+from hybrid.comparison.ladder import RIVAL, Factor, factors
 from hybrid.comparison.results import (
     CHART_METRICS,
     MARKDOWN_METRICS,
     METRICS,
     Comparison,
     Cost,
+    Ladder,
     MethodResult,
     Metric,
     best_and_ties,
@@ -57,6 +59,12 @@ def format_bytes(value: int | None) -> str:
 def format_worth(value: float | None) -> str:
     """Format the worth in samples, "–" where unknown."""
     return "–" if value is None or math.isnan(value) else f"{value:.2g}×" if value < 10 else f"{value:.0f}×"
+
+
+def format_factor(factor: Factor | None) -> str:
+    """Format a factor on samples: "2.3×", ">16×" for more than it, "–" where unknown."""
+    sign = {"": "", "more than": ">", "less than": "<"}
+    return "–" if factor is None else sign[factor.bound] + format_worth(factor.value)
 
 
 def column_title(metric: Metric) -> str:
@@ -112,6 +120,38 @@ def result_table(results: Sequence[MethodResult]) -> Table:
     return table
 
 
+def ladder_rows(ladder: Ladder) -> list[list[str]]:
+    """Return head and rows of a table: how many times its samples `RIVAL` needs to be as good as each method.
+
+    A row for each method and measure, a column for each number of samples per pixel; empty without a rival.
+    """
+    tables = {metric.label: factors(ladder[metric.key]) for metric in METRICS if metric.key in ladder}
+    names = dict.fromkeys(name for table in tables.values() for name in table)
+    counts = sorted({n for table in tables.values() for found in table.values() for n in found})
+    rows = [
+        [name, label, *(format_factor(table[name].get(n)) for n in counts)]
+        for name in names
+        for label, table in tables.items()
+        if name in table
+    ]
+    return (
+        [[f"times its samples that {RIVAL} needs to equal", "by", *(f"{n:g} spp" for n in counts)], *rows]
+        if rows
+        else []
+    )
+
+
+def ladder_table(rows: Sequence[Sequence[str]]) -> Table:
+    """Build the terminal's table of `ladder_rows`."""
+    (first, *titles), *cells = rows
+    table = Table(first, box=SIMPLE_HEAD, padding=0, show_edge=False)
+    for index, title in enumerate(titles):
+        table.add_column(title, justify="right" if index else "left", no_wrap=True)
+    for row in cells:
+        table.add_row(*map(escape, row))
+    return table
+
+
 def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
     """Write the README's table: PSNR and temporal PSNR on each shot, then the costs on the first one.
 
@@ -135,7 +175,12 @@ def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
         measures = [" / ".join(shot.cells(name, "**{}**", "≈ {}")) for shot in shots]
         seconds = format_seconds(first.cpu_seconds_per_megapixel if cpu else first.seconds_per_megapixel)
         rows.append([name, *measures, seconds, format_bytes(first.peak_bytes), format_worth(first.worth)])
-    return "".join(f"| {' | '.join(_markdown_cell(c) for c in row)} |\n" for row in [*rows, *absent])
+    return markdown_rows([*rows, *absent])
+
+
+def markdown_rows(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows of cells as Markdown; a table's second row is its rule."""
+    return "".join(f"| {' | '.join(_markdown_cell(c) for c in row)} |\n" for row in rows)
 
 
 def _markdown_cell(text: str) -> str:

@@ -493,7 +493,8 @@ def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, ca
         (["--methods", "noisy,unheard-of"], "expected one of noisy"),
         (["--external", "nameless"], "expected NAME=PATTERN"),
         (["--external", "noisy=x.exr"], "a name that no other method has"),
-        (["--level", "x.####.exr"], "expected PATTERN=SPP"),
+        (["--level", "x.####.exr="], "expected PATTERN=SPP"),
+        (["--ladder"], "expected --level with it"),
         (["--clock", "sun"], "'wall', 'cpu'"),
     ],
 )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hybrid.cli import main
+from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
 from hybrid.comparison.results import Comparison, read_comparison
 from hybrid.files.shots import open_shot
@@ -159,6 +160,49 @@ def test_levels_are_measured(shots: tuple[Path, Path], tmp_path: Path) -> None:
         image, reference = (open_shot(folder).read(number).color for folder in (level, clean))
         scores.append(10 ** (-psnr(image, reference) / 10))
     assert f"32: {-10 * np.log10(np.mean(scores)):.2f} dB" in said
+
+
+def test_a_ladder_is_printed_and_joined_with_others(
+    shots: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METHODS, "OIDN best", METHODS["aligned average"])  # OIDN need not be installed
+    noisy, clean = shots
+    level = write_noisy(tmp_path / "level", 9, SMALL.noise / 2)
+    words = ["compare", str(noisy), "--reference", str(clean), "--rounds", "1", "--ladder", "--samples", "8"]
+    words += ["--methods", "noisy,OIDN best,aligned robust average"]
+    report = tmp_path / "report"
+    assert main([*words, "--level", f"{level}=32", "-o", str(report), "--markdown"]) == 0
+    printed = capsys.readouterr().out
+    head, rule, *rows = printed.splitlines()[-5:]
+    assert head.endswith(" | by | 8 spp | 32 spp |")
+    assert rule == "| --- | --- | --- | --- |"
+    measures = ("PSNR", "Temporal PSNR", "FLIP")
+    assert [row.split(" | ")[:2] for row in rows] == [["| aligned robust average", by] for by in measures]
+    assert (report / "ladder.png").exists()
+    ladder = results_of(report).ladder
+    errors = {name: dict(curve) for name, curve in ladder["psnr"].items()}
+    assert errors["noisy"][32] < errors["noisy"][8]
+    assert errors["OIDN best"][8] < errors["noisy"][8]
+    others = ["--with-report", str(report), "--with-report", str(report)]
+    assert main(["compare", *others, "-o", str(tmp_path / "both")]) == 0
+    assert "8 spp" in capsys.readouterr().out
+    joined = results_of(tmp_path / "both").ladder
+    assert joined.keys() == ladder.keys()
+    assert dict(joined["psnr"]["noisy"]) == pytest.approx(errors["noisy"])
+
+
+def test_samples_of_a_level_come_from_its_files_or_are_asked_for(
+    shots: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noisy, clean = shots
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1", "--samples", "8"]
+    assert main([*words, "--level", str(noisy)]) == 1
+    assert "does not state its samples per pixel, expected --level PATTERN=SPP" in capsys.readouterr().err
+    bundled = Path(__file__).parents[3] / "examples" / "shot"
+    noisy, clean = bundled / "noisy.####.exr", bundled / "reference.####.exr"
+    words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1", "--frames", "11"]
+    assert main([*words, "--level", str(bundled / "reference_b.####.exr"), "-o", str(tmp_path / "report")]) == 0
+    assert ", 512: " in results_of(tmp_path / "report").facts["Worth in samples"]
 
 
 def test_frames_are_kept_and_the_time_of_others_is_theirs_to_state(tmp_path: Path) -> None:

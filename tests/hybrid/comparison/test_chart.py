@@ -54,6 +54,21 @@ def test_better_is_up_dearer_is_right_and_the_axis_is_logarithmic(metric: Metric
     assert [tick.get_text() for tick in figure.axes[0].get_xticklabels()][-2:] == ["nothing", "unknown"]
 
 
+def test_a_ladder_is_drawn_on_logarithmic_axes_from_its_errors() -> None:
+    curve = ((8, 0.4), (32, 0.1), (128, 0.05))
+    figure = chart.draw_ladder({"psnr": {"noisy": curve, "_ours": curve[:2]}, "flip": {"_ours": curve}})
+    assert figure is not None
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["Squared error, better ↓", "FLIP, better ↓"]
+    first, second = figure.axes
+    assert (first.get_xscale(), first.get_yscale()) == ("log", "log")
+    assert not first.yaxis_inverted()
+    assert [tick.get_text() for tick in first.get_xticklabels()] == ["8", "32", "128"]
+    np.testing.assert_array_equal(first.lines[0].get_xydata(), curve)
+    assert first.lines[1].get_color() == second.lines[0].get_color() != first.lines[0].get_color()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["noisy", "_ours"]
+    assert chart.draw_ladder({}) is None
+
+
 def test_labels_lie_inside_and_never_on_each_other() -> None:
     rng = np.random.default_rng(3)
     crowd = [result(f"method {i:02d}", float(rng.uniform(28, 32)), float(rng.uniform(0.5, 3))) for i in range(30)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from hybrid.comparison import compare
 from hybrid.comparison.compare import CompareOptions, compare_shot
+from hybrid.comparison.ladder import LEAST_ERROR
 from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, MAP_TITLES, REFERENCE, FrameStore
@@ -60,6 +63,29 @@ def test_a_finished_sequence_is_judged_and_not_timed() -> None:
     del other.frames[5]
     with pytest.raises(ValueError, match="'theirs' gave no frame 5"):
         compare_shot(shot, reference, {"theirs": external(other)})
+
+
+def test_methods_run_on_the_levels_of_a_ladder() -> None:
+    """Finished frames show the shot alone."""
+    shot, reference = make_shots()
+    halfway = {n: (f.color + reference.read(n).color) / 2 for n, f in shot.frames.items()}
+    level = MemoryShot({n: replace(f, color=halfway[n]) for n, f in shot.frames.items()})
+    methods = NOISY | ways(perfect=perfect, gone=not_installed) | {"theirs": external(reference)}
+    steps: list[tuple[int, int]] = []
+    options = CompareOptions(samples=32, levels=[(level, 8)])
+    run = partial(compare_shot, shot, reference, methods, on_step=lambda _, done, total: steps.append((done, total)))
+    comparison = run(replace(options, ladder=True))
+    curves = comparison.ladder["psnr"]
+    assert curves.keys() == {"noisy", "perfect"}
+    for (samples, error), frames in zip(curves["noisy"], (level, shot), strict=True):
+        errors = [10 ** (-psnr(frames.read(n).color, reference.read(n).color) / 10) for n in shot.numbers]
+        assert (samples, error) == (8 if frames is level else 32, pytest.approx(np.mean(errors)))
+    assert curves["perfect"] == ((8, LEAST_ERROR), (32, LEAST_ERROR))
+    assert comparison.ladder.keys() == {"psnr", "temporal_psnr", "flip"}
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+    assert len({total for _, total in steps}) == 1
+    assert [result.name for result in comparison.results] == list(methods)
+    assert run(options).ladder == {}
 
 
 def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
@@ -150,3 +176,5 @@ def test_wrong_input_is_found_before_any_method_runs(monkeypatch: pytest.MonkeyP
     refuses("expected the method 'noisy'", ways(perfect=perfect), samples=8, levels=[(shot, 4)])
     refuses("expected some of 4–6", samples=8, levels=[(make_shots((8, 9))[0], 4)])
     refuses("frame 4 of level of 4 samples is 31x24", samples=8, levels=[(small, 4)])
+    refuses("ladder has 8 samples per pixel twice", samples=8, levels=[(shot, 8)], ladder=True)
+    refuses("level of 4 samples has no frame 5", samples=8, levels=[(short, 4)], ladder=True)

@@ -17,7 +17,7 @@ for _package in ("jinja2", "matplotlib"):
 
 from hybrid.comparison.embedding import MethodImages, ShotImages
 from hybrid.comparison.report import Report, check_report, write_report
-from hybrid.comparison.results import Comparison
+from hybrid.comparison.results import Comparison, read_comparison
 from tests.hybrid.comparison.outcomes import RESULTS, SWEPT, result
 
 
@@ -54,6 +54,25 @@ def test_the_page_shows_stages_sweeps_and_other_shots(tmp_path: Path) -> None:
     alone = write_report(tmp_path, Report(Comparison("Hall", RESULTS))).read_text(encoding="utf-8")
     assert "Effect of each stage" not in alone
     assert "All shots" not in alone
+
+
+def test_page_and_picture_show_a_ladder(tmp_path: Path) -> None:
+    curves = {"OIDN best": ((8, 0.4), (32, 0.1)), "<ours>": ((8, 0.2), (32, 0.05))}
+    ladder = {"psnr": curves, "flip": {"OIDN best": ((8, 0.3),), "<ours>": ((8, 0.4),)}}
+    page = write_report(tmp_path / "a", Report(Comparison("Hall", RESULTS, ladder=ladder)))
+    text = page.read_text(encoding="utf-8")
+    assert "Error against samples" in text
+    assert "samples per pixel →" in text
+    ours = '<tr><th scope="row">&lt;ours&gt;</th>'
+    assert f"{ours}<td>PSNR</td><td>2×</td><td>&gt;1×</td></tr>" in text
+    assert f"{ours}<td>FLIP</td><td>&lt;1×</td><td>–</td></tr>" in text
+    picture = cv2.imread(str(page.parent / "ladder.png"))
+    assert picture is not None
+    assert picture.shape[1] == 1600
+    assert read_comparison(page.parent / "results.json").ladder == ladder
+    alone = write_report(tmp_path / "b", Report(Comparison("Hall", RESULTS))).read_text(encoding="utf-8")
+    assert "Error against samples" not in alone
+    assert not (tmp_path / "b" / "ladder.png").exists()
 
 
 def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:

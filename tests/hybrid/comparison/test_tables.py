@@ -16,6 +16,8 @@ from hybrid.comparison.tables import (
     format_seconds,
     format_value,
     format_worth,
+    ladder_rows,
+    ladder_table,
     markdown_table,
     result_table,
 )
@@ -73,6 +75,17 @@ def test_no_figure_and_no_word_breaks_at_80_columns() -> None:
     assert any(all(figure in line for figure in figures) for line in lines)
     assert all(word in "\n".join(lines) for word in ("aligned", "robust", "average", "Temporal", "worth"))
     assert "…" not in "\n".join(lines)
+
+
+def test_a_ladder_has_a_column_for_each_level_and_a_factor_for_each_measure() -> None:
+    rival, ours = ((8, 0.4), (32, 0.1)), ((8, 0.2), (32, 0.05))
+    rows = ladder_rows({"flip": {"OIDN best": rival, "a": ours}, "psnr": {"OIDN best": rival, "a": ours[:1]}})
+    head = ["times its samples that OIDN best needs to equal", "by", "8 spp", "32 spp"]
+    assert rows == [head, ["a", "PSNR", "2×", "–"], ["a", "FLIP", "2×", ">1×"]]
+    console = Console(width=60, record=True, file=io.StringIO())
+    console.print(ladder_table(rows))
+    assert [line.split() for line in console.export_text().splitlines()][-2:] == rows[1:]
+    assert ladder_rows({"psnr": {"noisy": rival, "a": ours}}) == ladder_rows({}) == []
 
 
 @pytest.mark.parametrize("name", ["[/bold] [red]", "[link=x]y", "a\\[b]"])
