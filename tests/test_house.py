@@ -68,7 +68,8 @@ def room_of(module: str) -> str:
 
 
 def test_the_map_shows_who_imports_whom():
-    rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", (DEVELOPERS / "architecture.md").read_text(), re.M)
+    text = (DEVELOPERS / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", text, re.M)
     drawn = {room: set() if names == "–" else set(names.split(", ")) for room, names in rows}
     built: dict[str, set[str]] = {}
     for path in (path for package in sorted(OURS) for path in (ROOT / package).rglob("*.py")):
@@ -122,7 +123,9 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
 def test_a_modules_tests_are_where_anyone_would_look(package):
     modules = [path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py"]
     assert modules
-    without = {str(path) for path in modules if not (ROOT / "tests" / path.parent / f"test_{path.name}").is_file()}
+    without = {
+        path.as_posix() for path in modules if not (ROOT / "tests" / path.parent / f"test_{path.name}").is_file()
+    }
     assert without <= WITHOUT_TESTS_OF_THEIR_OWN
 
 

@@ -134,7 +134,7 @@ def hard_window(level: float) -> dict[str, torch.Tensor]:
     estimate = color.mean((-2, -1), keepdim=True).expand_as(color)
     color[0, 2, :, 5, 5] = 1e6
     confidence = torch.randint(0, 2, (1, 5, 1, 32, 32)).float()
-    exposure = torch.tensor([measure_exposure(color.movedim(2, -1).numpy())])
+    exposure = torch.tensor([measure_exposure(color[0].movedim(1, -1).reshape(-1, 32, 3).numpy())])
     return {
         "color": color,
         "estimate": estimate,
