@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ Array = NDArray[np.float32]
 # By how much a pixel may change at most where results are averaged; and where samples correct a pixel that has parts,
 # which change with it, so that the color is the same with and without them but where it was next to nothing.
 MOST, CORRECTED = 2.0, 1e4
+# Layers of the trust in the frame before, and of that in the frame after.
+NEIGHBOURS = "before", "after"
 # Where this share of a frame's bright pixels move together, the others are content too: hidden, or leaving the frame.
 CONTENT = 0.6
 
@@ -75,8 +77,7 @@ class WindowResult:
     plan: Plan  # the stages that ran on the window
     # the samples of the other frames at the centre's pixels; with the stage "blend-samples"
     neighbour_samples: SampleMean | None
-    # from the first row of a band to the trust in the frames before and after
-    trust: dict[int, tuple[Trust | None, Trust | None]]
+    trust: tuple[Trust | None, ...]  # in the frames before and after
     drift_weight: Array | None  # (H, W): as `AlignedWindow.drift_weight`
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
@@ -180,7 +181,7 @@ class FrameDenoiser:
         plan = stream.plan(numbers, Context(window.first_pass is not None, stream.radius))
         brightest = max(frame.mean for frame in window.frames if frame is not None)
         exposure, layers, bands = window.lit.as_rendered.exposure, _Layers(stream.shot.shape), self._bands()
-        trust, outliers, aligned = {}, 0, None
+        outliers = 0
         for band in bands:
             assert window is not None
             aligned = align(window, band, timings=stream.timings)
@@ -188,13 +189,17 @@ class FrameDenoiser:
                 window = None  # frees its composed flows while the denoiser runs
             denoised = self.denoise(aligned)
             outliers += aligned.outliers
-            trust[band.start] = aligned.neighbour_trust
-            layers.add(band, aligned.inner, {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight})
-            layers.add(band, aligned.inner, {("aovs", name): layer for name, layer in denoised.aovs.items()})
-            layers.add(band, aligned.inner, {("extra", name): layer for name, layer in denoised.extra.items()})
-            sides = {} if aligned.neighbour_samples is None else aligned.neighbour_samples._asdict()
-            layers.add(band, aligned.inner, {("sides", name): layer for name, layer in sides.items()})
-        assert aligned is not None
+            named: dict[tuple[str, str], NDArray[Any] | None]
+            named = {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight}
+            named |= {("aovs", name): layer for name, layer in denoised.aovs.items()}
+            named |= {("extra", name): layer for name, layer in denoised.extra.items()}
+            groups = aligned.neighbour_samples, *aligned.neighbour_trust
+            for kind, group in zip(("sides", *NEIGHBOURS), groups, strict=True):
+                named |= {} if group is None else {(kind, name): layer for name, layer in group._asdict().items()}
+            layers.add(band, aligned.inner, named)
+            shares, parts = aligned.shares, denoised.parts
+            repaired, fireflies = aligned.repaired, aligned.fireflies
+            del aligned, denoised, named  # before the next band is aligned
         samples = layers.named("sides")
         color = layers.named("color")[""]
         frame, excess = stream.frame(number), None
@@ -202,16 +207,16 @@ class FrameDenoiser:
             with stream.timings.stage("blend-samples"):
                 excess = _excess(frame, color)
         return WindowResult(
-            Denoised(color, layers.named("aovs"), layers.named("extra"), denoised.parts),
-            replace(plan, shares=aligned.shares),
+            Denoised(color, layers.named("aovs"), layers.named("extra"), parts),
+            replace(plan, shares=shares),
             SampleMean(**samples) if samples else None,
-            trust,
+            tuple(Trust(**found) if (found := layers.named(side)) else None for side in NEIGHBOURS),
             layers.named("drift").get(""),
             exposure,
             brightest,
             excess,
-            aligned.repaired,
-            aligned.fireflies,
+            repaired,
+            fireflies,
             outliers,
         )
 
@@ -224,8 +229,9 @@ class FrameDenoiser:
         with timings.stage("stabilize"):
             stillness = measure_stillness(result.drift_weight, color.shape[:2])
         for band in self._bands():
-            trust = result.trust[band.start]
-            aligned, confidence = align_results(window, trust, stillness, result.exposure, band, timings=timings)
+            aligned, confidence = align_results(
+                window, result.trust, stillness, result.exposure, band, timings=timings
+            )
             with timings.stage("stabilize"):
                 color[band] = average(aligned, confidence)
         with timings.stage("stabilize"):
@@ -285,9 +291,9 @@ class _Layers:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._shape = shape
-        self._layers: dict[tuple[str, str], Array] = {}
+        self._layers: dict[tuple[str, str], NDArray[Any]] = {}
 
-    def add(self, band: slice, inner: slice, layers: Mapping[tuple[str, str], Array | None]) -> None:
+    def add(self, band: slice, inner: slice, layers: Mapping[tuple[str, str], NDArray[Any] | None]) -> None:
         """Write a band's rows, which are the rows `inner` of these layers."""
         for key, layer in layers.items():
             if layer is None:
@@ -296,10 +302,10 @@ class _Layers:
                 self._layers[key] = layer
                 continue
             if key not in self._layers:
-                self._layers[key] = np.empty((*self._shape, *layer.shape[2:]), np.float32)
+                self._layers[key] = np.empty((*self._shape, *layer.shape[2:]), layer.dtype)
             self._layers[key][band] = layer[inner]
 
-    def named(self, kind: str) -> dict[str, Array]:
+    def named(self, kind: str) -> dict[str, Any]:
         """The layers of a kind."""
         return {name: layer for (other, name), layer in self._layers.items() if other == kind}
 

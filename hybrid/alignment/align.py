@@ -167,7 +167,7 @@ def align_results(
     window : Window
         Three frames, with their results in the place of a first pass.
     trust : sequence of Trust or None
-        Of the two neighbours, at the padded rows (`AlignedWindow.neighbour_trust`).
+        Of the two neighbours, for the whole frame.
     stillness : Stillness
         Of the centre (`measure_stillness`).
     exposure : float
@@ -193,7 +193,8 @@ def align_results(
     confidence[1] = coverage[1] = centre.valid[padded]
     for index, known in zip((0, 2), trust, strict=True):
         if known is not None and window.frames[index] is not None and window.links[index] is not None:
-            _set_trust(confidence, coverage, window, index, known, padded)
+            here = Trust(known.coverage[padded], known.confidence[padded])
+            _set_trust(confidence, coverage, window, index, here, padded)
     assert window.first_pass is not None
     results = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("stabilize"):

@@ -58,7 +58,7 @@ def aligned_results(maker, number, colors):
     result = maker._results[number]
     window = maker.stream.window_of_results(number, colors)
     stillness = measure_stillness(result.drift_weight, maker.stream.shot.shape)
-    return align_results(window, result.trust[0], stillness, result.exposure)
+    return align_results(window, result.trust, stillness, result.exposure)
 
 
 def made(shot, denoise, number=MIDDLE, rules=None, **options):
