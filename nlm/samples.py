@@ -177,8 +177,9 @@ def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
 
 def _energy_of(image: Floats, rate: Floats) -> Floats:
     """Squares of second differences relative to the light, summed over channels: of white noise its variance."""
+    image, rate = np.ascontiguousarray(image), np.ascontiguousarray(rate)
     energy = np.empty(rate.shape, np.float32)
-    run_bands(_energy, len(rate), second_differences(np.ascontiguousarray(image)), rate, energy)
+    run_bands(_energy, len(rate), second_differences(image), rate, energy)
     return energy
 
 

@@ -4,7 +4,7 @@ numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it
 function" where neither the package's folder nor the user's can be written to, as on a render farm, and any error of
 unpickling a truncated file.
 
-As a program it compiles the slowest loop, for the process that has started it as a helper.
+As a program it compiles loops that are needed late, for the process that has started it as a helper.
 """
 
 from __future__ import annotations
@@ -153,5 +153,11 @@ Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
 
 if __name__ == "__main__":
     from nlm.nonlocal_means import joint_nlm
+    from nlm.samples import average_neighbours, blend_samples, restore_mean
 
     joint_nlm(np.zeros((1, 4, 4, 1), np.float32), np.zeros((4, 4, 1), np.float32))
+    window, image = np.zeros((3, 4, 4, 3), np.float32), np.zeros((4, 4, 3), np.float32)
+    confidence = np.zeros(window.shape[:3], np.float32)
+    # Every run reaches these late; what is compiled by then is loaded.
+    mean = average_neighbours(window, window, confidence, confidence, image)
+    restore_mean(blend_samples(image, image, mean, 1.0), image, 1.0)
