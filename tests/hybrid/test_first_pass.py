@@ -361,7 +361,7 @@ def test_the_command_says_what_was_taken(tmp_path, capfd):
     assert main(["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "auto"]) == 0
     assert "First pass  file (the file holds a denoised picture)" in capfd.readouterr().err
     assert open_shot(out).numbers == open_shot(folder).numbers
-    assert [record["estimate"] for _, record in read_records(out)] == ["file"]
+    assert [record["first_pass"] for _, record in read_records(out)] == ["file"]
     assert (
         main(
             [
