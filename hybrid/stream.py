@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flow.tvl1 import refine_flow
-from hybrid.alignment.align import align
+from hybrid.alignment.align import align, expect_equal_layers
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
@@ -189,6 +189,7 @@ class FrameStream:
         frames: tuple[PreparedFrame | None, ...],
         denoised: tuple[Array | None, ...] | None,
     ) -> Window:
+        expect_equal_layers(frames)  # before anything compares them
         middle = len(numbers) // 2
         plan = self.plan(numbers, Context(denoised is not None, middle))
         forth: dict[int, Flow | None] = {}

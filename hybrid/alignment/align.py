@@ -72,11 +72,10 @@ def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
 def align(window: Window, rows: slice | None = None, *, timings: Timings | None = None) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
-    With `rows` only these rows of the frame, and `MARGIN` around them. Raises ValueError if one frame has a layer that
-    another one lacks, or the centre has no first pass and others do.
+    With `rows` only these rows of the frame, and `MARGIN` around them. Raises ValueError if the centre has no first pass
+    and others do. All frames have the same layers (`expect_equal_layers`).
     """
     timings = timings or Timings()
-    _expect_equal_layers(window)
     centre, stages, given = window.centre, window.stages, window.first_pass is not None
     padded, inner = _pad_rows(rows, len(centre.irradiance))
     light = "gate" in stages and not given
@@ -234,10 +233,11 @@ def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Sti
     return Stillness(still, np.float32(t * t * (3 - 2 * t)))
 
 
-def _expect_equal_layers(window: Window) -> None:
-    """Refuse a window whose frames differ in layers: light divided by an albedo is no color."""
-    centre = window.centre
-    for there in (frame for frame in window.frames if frame is not None):
+def expect_equal_layers(frames: Sequence[PreparedFrame | None]) -> None:
+    """Raise ValueError if frames of a window differ in layers: light divided by an albedo is no color."""
+    centre = frames[len(frames) // 2]
+    assert centre is not None
+    for there in (frame for frame in frames if frame is not None):
         if different := sorted(_names(centre) ^ _names(there)):
             has, lacks = (there, centre) if different[0] in _names(there) else (centre, there)
             raise ValueError(
