@@ -72,8 +72,8 @@ def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
 def align(window: Window, rows: slice | None = None, *, timings: Timings | None = None) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
-    With `rows` only these rows of the frame, and `MARGIN` around them. Raises ValueError if the centre has no first pass
-    and others do. All frames have the same layers (`expect_equal_layers`).
+    With `rows` only these rows of the frame, and `MARGIN` around them. All frames have the same layers
+    (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()
     centre, stages, given = window.centre, window.stages, window.first_pass is not None

@@ -133,11 +133,10 @@ def test_a_frame_is_the_same_in_chunks(folder, event):
 @pytest.mark.parametrize(
     ("edit", "late", "stage", "frames"),
     [
-        (flare(5), None, "gate", "1005-1009"),
         (burst, None, "warp", "1006-1011"),
         (None, sparks(1), "fireflies", "1005-1009"),
     ],
-    ids=["light", "motion", "fireflies"],
+    ids=["motion", "fireflies"],
 )
 def test_inspect_names_the_frames(folder, edit, late, stage, frames):
     said = ravg("inspect", shot(folder, 18, edit, late)).words
