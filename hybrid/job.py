@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
@@ -60,49 +60,7 @@ MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))
 class DenoiseOptions:
     """Everything that is asked for when a shot is denoised, validated before any file is opened.
 
-    Attributes
-    ----------
-    method : str
-        "network" (needs torch), "classical" or "pooled"; default: that of the preset, or "network".
-    preset : str
-        One of `PRESETS` of the method, by default the first, or "auto" with a `budget`, which "auto" needs.
-    budget : str or None
-        Time per frame, such as "10s": the most accurate preset that is measured to fit is taken.
-    weights : Path or None
-        A weights file in place of a preset.
-    threshold : float or None
-        For weights that predict kernels, in [0, 1): higher drops more taps.
-    first_pass : str
-        Source of a denoised image per frame (`hybrid.first_pass.find_first_pass`), or a finished sequence. Default:
-        "auto" for a network, "none" for the classical chain, "oidn-fast" for pooled samples.
-    keep_first_pass : str or None
-        Pattern or folder where OIDN's first pass is kept for later runs.
-    passes : int
-        Runs over the shot, each on the frames of the one before.
-    breakdown : Path or None
-        PNG of the share that each frame of the window contributes; adds layers to the frames.
-    aov_sum : str
-        "layers": light passes are scaled to the denoised beauty; "beauty": the beauty is the sum of its layers.
-    stages, no_stages : collection of str
-        Stages that run, or do not, whatever was measured.
-    tile : int or None
-        Pixels on a side that the network processes at once, at least 16.
-    precision : str
-        Of the network: "float32", "bfloat16", or "auto", bfloat16 where the processor has it.
-    device : str
-        For ravg's networks and OIDN's: "cpu", "cuda", "hip", "sycl", "metal", or "auto", the first that is there.
-    resume : bool
-        Skip frames that are there, whole, and would be the same.
-    keep_going : bool
-        Continue after a frame that cannot be denoised.
-    max_memory : str or None
-        Such as "8G": frames are denoised in bands of rows.
-    strict : bool
-        Refuse layers that make no sense, and cuts, instead of working around them.
-    reuse_freed_memory : bool
-        Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
-    threads : int or None
-        Threads of numba, OpenCV and torch in this process; None leaves them as they are.
+    Texts beside fields are the help of the options of `ravg denoise`.
 
     Raises
     ------
@@ -110,27 +68,89 @@ class DenoiseOptions:
         If an option does not exist, or two contradict each other.
     """
 
-    method: str = ""
-    preset: str = ""
-    budget: str | None = None
-    weights: Path | None = None
-    threshold: float | None = None
-    first_pass: str = ""
-    keep_first_pass: str | None = None
-    passes: int = 1
-    breakdown: Path | None = None
-    aov_sum: str = "layers"
-    stages: Collection[str] = ()
-    no_stages: Collection[str] = ()
-    tile: int | None = None
-    precision: str = "auto"
-    device: str = "auto"
-    resume: bool = False
-    keep_going: bool = False
-    max_memory: str | None = None
-    strict: bool = False
+    method: Annotated[
+        str,
+        "network: Robust Average network (needs torch); classical: non-local means, guided filter, or the average of "
+        "first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)",
+        {"metavar": "[network|classical|pooled]"},
+    ] = ""
+    preset: Annotated[
+        str,
+        "network: fast (default), balanced, quality, or auto (the best that fits --budget); classical: draft, "
+        "standard (default), final; pooled: pooled",
+        {"metavar": "NAME"},
+    ] = ""
+    budget: Annotated[
+        str | None,
+        "longest time per frame, such as 10s; takes the most accurate preset that fits",
+        {"metavar": "TIME"},
+    ] = None
+    weights: Annotated[Path | None, "weights file of ravg train, in place of a preset", {"metavar": "FILE"}] = None
+    threshold: Annotated[
+        float | None,
+        "for --weights that predict kernels: drop kernel taps below this share (default: as trained)",
+        {"metavar": "SHARE"},
+    ] = None
+    first_pass: Annotated[
+        str,
+        "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
+        "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
+        "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
+        {"metavar": "SOURCE"},
+    ] = ""
+    keep_first_pass: Annotated[
+        str | None,
+        "keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
+        {"panel": "Output", "metavar": "OUT"},
+    ] = None
+    passes: Annotated[
+        int,
+        "runs over the shot; each denoises the result of the one before: steadier, and softer",
+        {"metavar": "N"},
+    ] = 1
+    breakdown: Annotated[
+        Path | None,
+        "write an image of how much each frame of the window contributes; adds these weights as layers",
+        {"panel": "Output", "metavar": "PNG"},
+    ] = None
+    aov_sum: Annotated[
+        Literal["layers", "beauty"],
+        "how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum",
+    ] = "layers"
+    stages: Collection[str] = ()  # forced on, whatever was measured
+    no_stages: Collection[str] = ()  # forced off
+    tile: Annotated[
+        int | None,
+        "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
+        {"panel": "Resources", "metavar": "N"},
+    ] = None
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"],
+        "number format of the network; auto: bfloat16 on processors that have it, else float32",
+        {"panel": "Resources", "envvar": "RAVG_PRECISION"},
+    ] = "auto"
+    device: str = (
+        "auto"  # for ravg's networks and OIDN's: cpu, cuda, hip, sycl, metal, or auto, the first that is there
+    )
+    resume: Annotated[
+        bool,
+        "skip frames that an earlier run with the same options has finished",
+        {"panel": "Output", "names": ("--resume",)},
+    ] = False
+    keep_going: Annotated[
+        bool,
+        "continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
+        {"panel": "Output", "names": ("--keep-going",), "envvar": "RAVG_KEEP_GOING"},
+    ] = False
+    max_memory: Annotated[
+        str | None,
+        "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
+        {"panel": "Resources", "metavar": "SIZE", "envvar": "RAVG_MAX_MEMORY"},
+    ] = None
+    strict: bool = False  # refuse layers that make no sense, and cuts, instead of working around them
+    # Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
     reuse_freed_memory: bool = True
-    threads: int | None = None
+    threads: int | None = None  # of numba, OpenCV and torch in this process; None leaves them as they are
 
     def __post_init__(self) -> None:
         preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release

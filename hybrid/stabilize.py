@@ -229,9 +229,7 @@ class FrameDenoiser:
         with timings.stage("stabilize"):
             stillness = measure_stillness(result.drift_weight, color.shape[:2])
         for band in self._bands():
-            aligned, confidence = align_results(
-                window, result.trust, stillness, result.exposure, band, timings=timings
-            )
+            aligned, confidence = align_results(window, result.trust, stillness, result.exposure, band, timings=timings)
             with timings.stage("stabilize"):
                 color[band] = average(aligned, confidence)
         with timings.stage("stabilize"):

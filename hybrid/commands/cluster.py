@@ -54,7 +54,7 @@ def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str
     for parameter in context.command.params:
         name = str(parameter.name)
         value = changes.get(name, context.params.get(name))
-        if name in NOT_PASSED_ON or value is None or value is False:
+        if name in NOT_PASSED_ON or value is None or value is False or value == "":
             continue
         values = [str(item) for item in value] if isinstance(value, list | tuple) else [str(value)]
         if parameter.param_type_name == "argument":

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any
 
 import numpy as np
 import typer
@@ -87,6 +87,7 @@ class Request:
         return Paths({"profile": self.shot.profile}, writes)
 
 
+@opt.with_fields(DenoiseOptions, title="Method")
 def denoise(
     context: typer.Context,
     shot: opt.ShotArgument,
@@ -96,87 +97,17 @@ def denoise(
     profile: opt.ProfileOption = None,
     motion: opt.MotionOption = None,
     strict: opt.StrictOption = False,
-    method: Annotated[
-        Literal["network", "classical", "pooled"] | None,
-        opt.of_method(
-            "network: Robust Average network (needs torch); classical: non-local means, guided filter, or the average "
-            "of first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)"
-        ),
-    ] = None,
-    preset: Annotated[
-        Literal["fast", "balanced", "quality", "tkpcn", "auto", "draft", "standard", "final", "pooled", "gathered"]
-        | None,
-        opt.of_method(
-            "network: fast (default), balanced, quality, or auto (the best that fits --budget); classical: draft, "
-            "standard (default), final; pooled: pooled",
-            metavar="NAME",
-        ),
-    ] = None,
-    budget: Annotated[
-        str | None,
-        opt.of_method("longest time per frame, such as 10s; takes the most accurate preset that fits", metavar="TIME"),
-    ] = None,
-    weights: Annotated[
-        Path | None, opt.of_method("weights file of ravg train, in place of a preset", metavar="FILE")
-    ] = None,
-    threshold: Annotated[
-        float | None,
-        opt.of_method(
-            "for --weights that predict kernels: drop kernel taps below this share (default: as trained)",
-            min=0,
-            max=0.99,
-            metavar="SHARE",
-        ),
-    ] = None,
-    first_pass: opt.FirstPassOption = None,
-    keep_first_pass: opt.KeepOption = None,
-    passes: Annotated[
-        int,
-        opt.of_method(
-            "runs over the shot; each denoises the result of the one before: steadier, and softer",
-            min=1,
-            metavar="N",
-        ),
-    ] = 1,
-    breakdown: Annotated[
-        Path | None,
-        opt.of_output(
-            "write an image of how much each frame of the window contributes; adds these weights as layers",
-            metavar="PNG",
-        ),
-    ] = None,
     aov: opt.AovOption = None,
-    aov_sum: Annotated[
-        Literal["layers", "beauty"],
-        opt.of_method("how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum"),
-    ] = "layers",
     preview: opt.PreviewOption = None,
     fps: opt.RateOption = 24,
     contact_sheet: opt.SheetOption = None,
     stages: opt.OnOption = None,
     no_stages: opt.OffOption = None,
-    tile: Annotated[
-        int | None,
-        opt.of_resources(
-            "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
-            min=16,
-            metavar="N",
-        ),
-    ] = None,
-    precision: Annotated[
-        Literal["auto", "float32", "bfloat16"],
-        opt.of_resources(
-            "number format of the network; auto: bfloat16 on processors that have it, else float32",
-            envvar="RAVG_PRECISION",
-        ),
-    ] = "auto",
     device: opt.DeviceOption = "auto",
-    resume: opt.ResumeOption = False,
-    keep_going: opt.KeepGoingOption = False,
-    max_memory: opt.MemoryOption = None,
     max_pixels: opt.PixelsOption = None,
     scheduler: SchedulerOption = None,
     chunk: ChunkOption = 10,
+    **settings: Any,
 ) -> None:
     """Denoise the frames of a shot, and write each as an EXR file with all its other layers.
 
@@ -194,27 +125,13 @@ def denoise(
     """
     with opt.usage():
         options = DenoiseOptions(
-            method=method or "",
-            preset=preset or "",
-            budget=budget,
-            weights=weights,
-            threshold=threshold,
-            first_pass=first_pass or "",
-            keep_first_pass=keep_first_pass,
-            passes=passes,
-            breakdown=breakdown,
-            aov_sum=aov_sum,
+            **settings,
             stages=split_stages(stages),
             no_stages=split_stages(no_stages),
-            tile=tile,
-            precision=precision,
             device=device,
-            resume=resume,
-            keep_going=keep_going,
-            max_memory=max_memory,
             strict=strict,
         )
-        if scheduler is not None and (budget is not None or breakdown is not None):
+        if scheduler is not None and (options.budget is not None or options.breakdown is not None):
             raise ValueError("--budget and --breakdown are of one machine, expected no --scheduler with them")
     read = ShotInput(shot, frames, tuple(layer or ()), tuple(aov or ()), profile, motion, max_pixels)
     request = Request(read, output, options, preview, contact_sheet, fps)
@@ -222,8 +139,8 @@ def denoise(
         import_neural()
     views = views_of(shot)
     sequence = None if options.first_pass in SPECS else options.first_pass
-    pictures = {"preview": preview, "contact-sheet": contact_sheet, "breakdown": breakdown}
-    folders = {"output": output, "keep-first-pass": keep_first_pass}
+    pictures = {"preview": preview, "contact-sheet": contact_sheet, "breakdown": options.breakdown}
+    folders = {"output": output, "keep-first-pass": options.keep_first_pass}
     expect_views_apart(views, read, folders, {"first-pass": sequence, **pictures})
     for view in views:
         if view:

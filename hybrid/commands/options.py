@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import typer
 
@@ -24,6 +26,34 @@ def panel(title: str) -> Callable[..., Any]:
 
 of_input, of_method = panel("Input"), panel("Method")
 of_output, of_resources = panel("Output"), panel("Resources")
+
+
+def with_fields(*configs: type, title: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command an option for each field of dataclasses that has a help text; it gets their values by keyword.
+
+    Such a field is ``Annotated[type, help, {…}]``: the panel if not `title`, names if not the field's, other settings.
+    """
+
+    def add(command: Callable[..., None]) -> Callable[..., None]:
+        signature = inspect.signature(command, eval_str=True)
+        parameters = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+        for config in configs:
+            hints = get_type_hints(config, include_extras=True)
+            for item in fields(config):
+                text, *rest = getattr(hints[item.name], "__metadata__", (None,))
+                if text is None:
+                    continue
+                settings = dict(*rest)
+                names = settings.pop("names", (f"--{item.name.replace('_', '-')}",))
+                option = panel(settings.pop("panel", title))(text, *names, show_default=item.default != "", **settings)
+                annotation = Annotated[hints[item.name].__origin__, option]  # type: ignore[valid-type]
+                kind = inspect.Parameter.KEYWORD_ONLY
+                parameters.append(inspect.Parameter(item.name, kind, default=item.default, annotation=annotation))
+        command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        return command
+
+    return add
+
 
 # Stages in the order of `hybrid.plan.STAGES`, which this module cannot import: a test compares them.
 STAGE_NAMES = (
@@ -118,43 +148,6 @@ OnOption = Annotated[
     of_method(f"stages to force on, with commas between: {STAGE_NAMES}", "--stages", metavar="NAMES"),
 ]
 OffOption = Annotated[list[str] | None, of_method("stages to force off, as --stages", "--no-stages", metavar="NAMES")]
-FirstPassOption = Annotated[
-    str | None,
-    of_method(
-        "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
-        "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
-        "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
-        "--first-pass",
-        metavar="SOURCE",
-    ),
-]
-KeepOption = Annotated[
-    str | None,
-    of_output(
-        "keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
-        "--keep-first-pass",
-        metavar="OUT",
-    ),
-]
-ResumeOption = Annotated[
-    bool, of_output("skip frames that an earlier run with the same options has finished", "--resume")
-]
-KeepGoingOption = Annotated[
-    bool,
-    of_output(
-        "continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
-        "--keep-going",
-        envvar="RAVG_KEEP_GOING",
-    ),
-]
-MemoryOption = Annotated[
-    str | None,
-    of_resources(
-        "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
-        metavar="SIZE",
-        envvar="RAVG_MAX_MEMORY",
-    ),
-]
 PixelsOption = Annotated[
     int | None,
     of_resources(

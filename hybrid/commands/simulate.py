@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import of_input, of_method, of_output, of_resources, usage
+from hybrid.commands.options import of_input, of_method, of_output, of_resources, usage, with_fields
 from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
 
 
+@with_fields(ShotSettings, title="Method")
 def simulate(
     context: typer.Context,
     scene: Annotated[
@@ -32,24 +33,11 @@ def simulate(
     ] = None,
     spp: Annotated[str, of_method("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
     levels: Annotated[str, of_method("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
-    reference: Annotated[int, of_method("samples per pixel of a reference; 0: none", min=0, metavar="SPP")] = 0,
     reference_frames: Annotated[
         str | None, of_method("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
     ] = None,
     seed: Annotated[int, of_input("seed of all random numbers")] = 1,
     shots: Annotated[int, of_input("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
-    camera: Annotated[str | None, of_input("a camera of the file, or random")] = None,
-    motion: Annotated[
-        Literal["auto", "keep", "add"], of_method("auto: add motion to a file that has none", "--animate")
-    ] = "auto",
-    moving_objects: Annotated[
-        int | None, of_method("number of moving objects in added motion", min=0, metavar="N")
-    ] = None,
-    motion_blur: Annotated[bool, of_method("render with motion blur", "--motion-blur")] = False,
-    halves: Annotated[bool, of_method("add half buffers, for the variance", "--halves")] = False,
-    effects: Annotated[
-        Literal["auto", "all"], of_method("auto: the effects that the scene needs; all: every effect")
-    ] = "auto",
     jobs: Annotated[int, of_resources("Blender processes at a time", min=1, metavar="N")] = 1,
     threads: Annotated[
         int | None,
@@ -62,6 +50,7 @@ def simulate(
         of_resources("Python interpreter with bpy; default: this one", metavar="FILE", envvar="RAVG_BLENDER_PYTHON"),
     ] = None,
     scheduler: SchedulerOption = None,
+    **fields: Any,
 ) -> None:
     """Render shots with Cycles for training and comparison: several noise levels, and references.
 
@@ -84,16 +73,10 @@ def simulate(
             frames=tuple(parse_frames(frames)),
             size=parse_size(size, "size"),
             levels=parse_levels(levels, parse_samples(spp, seed)),
-            reference=reference,
             reference_frames=parse_numbers(reference_frames) if reference_frames else None,
             film=parse_size(film, "film") if film else None,
             center=parse_center(center) if center else None,
-            camera=camera,
-            motion=motion,
-            moving_objects=moving_objects,
-            motion_blur=motion_blur,
-            halves=halves,
-            effects=effects,
+            **fields,
         )
 
     with usage():

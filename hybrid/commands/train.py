@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import glob
-import inspect
 import re
-from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -25,8 +23,6 @@ from hybrid.plan import Context
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.stream import plan_shot
 from network.training.config import SamplerConfig, TrainConfig
-
-training_option = opt.panel("Training")
 
 
 class Levels(NamedTuple):
@@ -202,25 +198,7 @@ def parse_samples(text: str) -> dict[str, float]:
     return samples
 
 
-def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each setting of `TrainConfig`; it gets their values as keyword arguments."""
-    signature = inspect.signature(command, eval_str=True)
-    parameters = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
-    for config in (TrainConfig, SamplerConfig):
-        hints = get_type_hints(config, include_extras=True)
-        for item in fields(config):
-            setting, *_ = getattr(hints[item.name], "__metadata__", (None,))
-            if setting is not None:
-                names = setting.names or (f"--{item.name.replace('_', '-')}",)
-                option = training_option(setting.help, *names)
-                annotation = Annotated[hints[item.name].__origin__, option]  # type: ignore[valid-type]
-                kind = inspect.Parameter.KEYWORD_ONLY
-                parameters.append(inspect.Parameter(item.name, kind, default=item.default, annotation=annotation))
-    command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    return command
-
-
-@_with_settings
+@opt.with_fields(TrainConfig, SamplerConfig, title="Training")
 def train(
     clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
     output: Annotated[Path, opt.of_output("weights to write", "-o", "--output", metavar="W.safetensors")],

@@ -1,35 +1,26 @@
-"""Settings of a training, with defaults and help texts for `ravg train`; importing this needs no torch."""
+"""Settings of a training, with defaults and help texts for options of `ravg train`; importing this needs no torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from network.devices import DEVICES
 
 LOSSES = ("l1", "smape", "relmse", "display", "perceptual")
 TERMS = ("temporal", "power", "spatial")
 # The second is the former name of the option.
-BACKBONE = ("--backbone-rate", "--trunk-rate")
-
-
-class Setting(NamedTuple):
-    """Help text of a setting that is an option of `ravg train`, and names of the option, if not that of the field."""
-
-    help: str
-    names: tuple[str, ...] = ()
+BACKBONE = {"names": ("--backbone-rate", "--trunk-rate")}
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
     """How samples are drawn and varied. Probabilities are per sample."""
 
-    crop: Annotated[int, Setting("pixels on a side of a sample; drawn by importance from larger clips")] = 128
-    sets: Annotated[int, Setting("disjoint sets of clips, one for each epoch; the paper's ten")] = 10
-    drop_frames: Annotated[
-        float, Setting("chance that side frames of a sample are dropped, as at the ends of a shot")
-    ] = 0.1
-    pseudo: Annotated[float, Setting("chance of a pseudo-reference as target where there are renders too")] = 0.5
+    crop: Annotated[int, "pixels on a side of a sample; drawn by importance from larger clips"] = 128
+    sets: Annotated[int, "disjoint sets of clips, one for each epoch; the paper's ten"] = 10
+    drop_frames: Annotated[float, "chance that side frames of a sample are dropped, as at the ends of a shot"] = 0.1
+    pseudo: Annotated[float, "chance of a pseudo-reference as target where there are renders too"] = 0.5
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure given to the network is off by up to this, either way
 
@@ -46,42 +37,34 @@ class SamplerConfig:
 class TrainConfig:
     """One training; with the clips and the model it determines the weights."""
 
-    steps: Annotated[int | None, Setting("stop after so many steps; reproducible from the seed")] = None
-    minutes: Annotated[float | None, Setting("stop after so many minutes")] = None
-    batch: Annotated[int, Setting("samples of a step, of all processes together")] = 2
-    rate: Annotated[float, Setting("peak learning rate")] = 1e-3
-    backbone_rate: Annotated[float, Setting("factor of the rate for a pretrained backbone; 0: frozen", BACKBONE)] = 0.1
+    steps: Annotated[int | None, "stop after so many steps; reproducible from the seed"] = None
+    minutes: Annotated[float | None, "stop after so many minutes"] = None
+    batch: Annotated[int, "samples of a step, of all processes together"] = 2
+    rate: Annotated[float, "peak learning rate"] = 1e-3
+    backbone_rate: Annotated[float, "factor of the rate for a pretrained backbone; 0: frozen", BACKBONE] = 0.1
     # The kernels start at a reasonable mean, which a full rate at once would destroy.
-    warmup: Annotated[int, Setting("steps in which the rate rises to its peak")] = 200
+    warmup: Annotated[int, "steps in which the rate rises to its peak"] = 200
     weight_decay: float = 1e-4
     clip_norm: Annotated[
-        float, Setting("largest norm of a gradient, as one sample may hold a firefly", ("--clip",))
+        float, "largest norm of a gradient, as one sample may hold a firefly", {"names": ("--clip",)}
     ] = 1.0
-    ema: Annotated[float, Setting("decay of the moving average of the weights, which is validated and saved")] = 0.999
+    ema: Annotated[float, "decay of the moving average of the weights, which is validated and saved"] = 0.999
     # relmse leaves the mean alone.
-    loss: Annotated[str, Setting("relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)")] = (
-        "relmse"
-    )
-    vgg: Annotated[str | None, Setting("torchvision's VGG19 weights: a file, or hub to download them")] = None
+    loss: Annotated[str, "relmse, l1, smape, display (for clean targets), or perceptual (with --vgg)"] = "relmse"
+    vgg: Annotated[str | None, "torchvision's VGG19 weights: a file, or hub to download them"] = None
     terms: Annotated[
-        str | None,
-        Setting("of networks that predict kernels: temporal, power (every subset of the window), or spatial"),
+        str | None, "of networks that predict kernels: temporal, power (every subset of the window), or spatial"
     ] = None
-    whole: Annotated[float, Setting("weight of the term of the whole window beside the temporal terms")] = 1.0
+    whole: Annotated[float, "weight of the term of the whole window beside the temporal terms"] = 1.0
     differences: Annotated[
-        float,
-        Setting(
-            "weight of the error of differences between frames, along the motion (clips of whole frames: --tile 0)"
-        ),
+        float, "weight of the error of differences between frames, along the motion (clips of whole frames: --tile 0)"
     ] = 0.0
-    slope: Annotated[
-        float, Setting("λ of the asymmetric loss, for clean targets: more than 1 leaves noise before detail")
-    ] = 1.0
-    seed: Annotated[int, Setting("seed of initial weights and samples")] = 0
-    workers: Annotated[int, Setting("processes that read clips; 0: the training itself")] = 0
-    float32: Annotated[bool, Setting("compute convolutions in float32 where the device has bfloat16 too")] = False
-    compile: Annotated[bool, Setting("compile the network: a minute at the start, pays on a GPU")] = False
-    validate_minutes: Annotated[float, Setting("minutes between validations, and between checkpoints")] = 5.0
+    slope: Annotated[float, "λ of the asymmetric loss, for clean targets: more than 1 leaves noise before detail"] = 1.0
+    seed: Annotated[int, "seed of initial weights and samples"] = 0
+    workers: Annotated[int, "processes that read clips; 0: the training itself"] = 0
+    float32: Annotated[bool, "compute convolutions in float32 where the device has bfloat16 too"] = False
+    compile: Annotated[bool, "compile the network: a minute at the start, pays on a GPU"] = False
+    validate_minutes: Annotated[float, "minutes between validations, and between checkpoints"] = 5.0
     device: str = "auto"
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
