@@ -40,7 +40,7 @@ LARGEST = 256
 DEEPEST = 5
 #: Parameters of a network: twenty times those of the largest here.
 PARAMETERS = 10**8
-#: Characters of a description or of notes, and of what a message quotes.
+#: Characters of a description, and of what a message quotes.
 LONGEST, QUOTED = 2**24, 160
 
 
@@ -153,7 +153,9 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     where = f"weights {os.fspath(path)!r}"
     with _open(path) as (file, metadata):
         try:
-            description = _parse(metadata, "description")
+            if len(text := metadata["description"]) > LONGEST:
+                raise ValueError(f"description: expected at most {LONGEST} characters, got {len(text)}")
+            description = json.loads(text)
             _refuse_huge(description)
             with torch.device("meta"):  # shapes alone, which take no memory
                 expected = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
@@ -197,27 +199,10 @@ def _refuse_huge(value: Any, name: str = "", depth: int = 0) -> None:
         raise ValueError(f"model description: {name}: expected a number up to {bound}, got {_short(value)}")
 
 
-def _parse(metadata: Mapping[str, str], name: str) -> Any:
-    """JSON value of an entry of the metadata."""
-    if len(text := metadata[name]) > LONGEST:
-        raise ValueError(f"{name}: expected at most {LONGEST} characters, got {len(text)}")
-    return json.loads(text)
-
-
 def _short(words: object) -> str:
     """Text from a file, shortened to one line for a message."""
     text = " ".join(str(words).split())
     return text if len(text) <= QUOTED else f"{text[:QUOTED]}…"
-
-
-def load_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Load the notes given to `save_model`; raises as `load_model`."""
-    with _open(path) as (_, metadata):
-        try:
-            notes: dict[str, Any] = _parse(metadata, "notes")
-        except (KeyError, ValueError, RecursionError) as error:
-            raise ValueError(f"weights {os.fspath(path)!r}: {_short(repr(error))}") from error
-    return notes
 
 
 @contextmanager

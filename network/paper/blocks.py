@@ -1,14 +1,11 @@
-"""Blocks of the paper's networks: residual, Robust Average with a weight per pixel, temporal module, U-Net."""
+"""Blocks of the paper's networks: residual, Robust Average with a weight per pixel, temporal module."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from network.robust_average import outermost_first, ravg
 
@@ -77,37 +74,3 @@ class TemporalModule(nn.Module):
         for block in self.blocks:
             joint = block(joint)
         return torch.cat(self.split(torch.relu(joint)).chunk(frames, 1))
-
-
-class UNet(nn.Module):
-    """U-Net shared over the frames, connected in time by RA blocks on the way down; widths are those of the finest
-    first.
-
-    One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
-    addition up.
-    """
-
-    def __init__(self, inputs: int, widths: Sequence[int], ra_scales: Sequence[int]) -> None:
-        super().__init__()
-        self.stem = nn.Conv2d(inputs, widths[0], 3, padding=1)
-        self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
-        self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in ra_scales})
-        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
-        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
-        self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
-
-    def scales(self, x: Tensor, frames: int) -> list[Tensor]:
-        """Features of every scale, finest first, after the ReLU, of ``(T·N, inputs, H, W)``, time first."""
-        x = self.stem(x)
-        scales: list[Tensor] = []
-        for scale, block in enumerate(self.encode):
-            if scale:
-                x = self.down[scale - 1](x)
-            x = block(x)
-            if str(scale) in self.average:
-                x = self.average[str(scale)](x, frames)
-            scales.append(x)
-        for scale in reversed(range(len(self.decode))):
-            up = functional.interpolate(self.up[scale](scales[scale + 1]), scale_factor=2.0, mode="nearest")
-            scales[scale] = self.decode[scale](scales[scale] + up)
-        return [torch.relu(x) for x in scales]

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule, UNet
+from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.paper.inputs import CHANNELS, KernelWindow, network_inputs
 from network.paper.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
 from network.robust_unet import channels_last
@@ -163,15 +164,17 @@ class KernelHead(nn.Module):
         return predict_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)
 
 
-class RAUNet(UNet):
-    """Small U-Net: shared over the frames, connected in time by RA blocks on the way down; see `filter_window`."""
+class KernelNetwork(nn.Module):
+    """A network at one resolution: `trunk` makes features of frames, `head` kernels; see `filter_window`."""
 
-    def __init__(self, config: RAUNetConfig) -> None:
-        super().__init__(CHANNELS, config.widths, config.ra_scales)
-        self.config = config
-        self.head = KernelHead(config.widths[0], config.kernel)
-        #: Height and width must be multiples of this.
-        self.multiple = int(2 ** (len(config.widths) - 1))
+    #: Height and width must be multiples of this.
+    multiple = 1
+    stem: nn.Conv2d
+    head: KernelHead
+
+    def __init__(self, config: RAUNetConfig | RAResNetConfig | TKPCNConfig) -> None:
+        super().__init__()
+        self.config: Any = config
         #: Length of the windows, T.
         self.frames = config.kernel.frames
 
@@ -180,13 +183,54 @@ class RAUNet(UNet):
         return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
 
     def trunk(self, features: Tensor) -> Tensor:
-        """``(T·N, C, H, W)`` features, time first, that kernels are predicted from."""
-        x = _time_first(features, self.frames, self.multiple, self.stem.weight.dtype)
-        return self.scales(x, self.frames)[0]
+        """Features ``(T·N, width, H, W)``, time first, that kernels are predicted from, of ``(N, T, C, H, W)``."""
+        raise NotImplementedError
+
+    def _enter(self, features: Tensor) -> Tensor:
+        """Check each axis of ``(N, T, C, H, W)`` by itself, and run the first convolution: ``(T·N, width, H, W)``."""
+        if features.ndim != 5 or tuple(features.shape[1:3]) != (self.frames, CHANNELS):
+            raise ValueError(f"features: expected (N, {self.frames}, {CHANNELS}, H, W), got {tuple(features.shape)}")
+        check_size("features", features, self.multiple)
+        x = features.transpose(0, 1).flatten(0, 1)
+        return cast(Tensor, self.stem(x.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last)))
 
 
-class RAResNet(nn.Module):
-    """The paper's network (figure 1): residual blocks at full resolution, RA blocks among them; see `filter_window`.
+class RAUNet(KernelNetwork):
+    """Small U-Net: shared over the frames, connected in time by RA blocks on the way down.
+
+    One residual block per scale and direction; strided convolution down; 1×1 convolution, nearest neighbour and
+    addition up.
+    """
+
+    def __init__(self, config: RAUNetConfig) -> None:
+        super().__init__(config)
+        widths = config.widths
+        self.stem = nn.Conv2d(CHANNELS, widths[0], 3, padding=1)
+        self.encode = nn.ModuleList(ResidualBlock(width) for width in widths)
+        self.average = nn.ModuleDict({str(scale): RobustAverage(widths[scale]) for scale in config.ra_scales})
+        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
+        self.decode = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
+        self.head = KernelHead(widths[0], config.kernel)
+        self.multiple = int(2 ** (len(widths) - 1))
+
+    def trunk(self, features: Tensor) -> Tensor:
+        """See `KernelNetwork.trunk`."""
+        x = self._enter(features)
+        scales: list[Tensor] = []
+        for scale, block in enumerate(self.encode):
+            x = block(self.down[scale - 1](x) if scale else x)
+            if str(scale) in self.average:
+                x = self.average[str(scale)](x, self.frames)
+            scales.append(x)
+        for scale in reversed(range(len(self.decode))):
+            up = functional.interpolate(self.up[scale](x), scale_factor=2.0, mode="nearest")
+            x = self.decode[scale](scales[scale] + up)
+        return torch.relu(x)
+
+
+class RAResNet(KernelNetwork):
+    """The paper's network (figure 1): residual blocks at full resolution, RA blocks among them.
 
     The paper's figure shows skip connections after the first four RA blocks and does not say how they join. Here
     each section (residual blocks up to and with an RA block) is skipped: its input is concatenated to its output
@@ -196,14 +240,8 @@ class RAResNet(nn.Module):
     VGG19 in its loss (20.0 M) come close to that.
     """
 
-    #: Height and width must be multiples of this.
-    multiple = 1
-
     def __init__(self, config: RAResNetConfig) -> None:
-        super().__init__()
-        self.config = config
-        #: Length of the windows, T.
-        self.frames = config.kernel.frames
+        super().__init__(config)
         width, size = config.width, config.conv_size
         self.stem = nn.Conv2d(CHANNELS, width, size, padding=size // 2)
         self.blocks = nn.ModuleList(ResidualBlock(width, size) for _ in range(config.blocks))
@@ -211,13 +249,9 @@ class RAResNet(nn.Module):
         self.skip = nn.ModuleList(nn.Conv2d(2 * width, width, 1) for _ in range(config.skips))
         self.head = KernelHead(width, config.kernel)
 
-    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Predict ``(N, taps, H, W)`` kernels; see `KernelHead.forward`."""
-        return cast(Tensor, self.head(self.trunk(features), confidence, threshold))
-
     def trunk(self, features: Tensor) -> Tensor:
-        """``(T·N, C, H, W)`` features, time first, that kernels are predicted from."""
-        x = self.stem(_time_first(features, self.frames, self.multiple, self.stem.weight.dtype))
+        """See `KernelNetwork.trunk`."""
+        x = self._enter(features)
         section, skips = x, iter(self.skip)
         for count, block in enumerate(self.blocks, start=1):
             x = block(x)
@@ -230,30 +264,23 @@ class RAResNet(nn.Module):
         return torch.relu(x)
 
 
-class TKPCN(nn.Module):
+class TKPCN(KernelNetwork):
     """The paper's baseline: a spatial network with shared weights, then one temporal module; no RA blocks."""
 
-    #: Height and width must be multiples of this.
-    multiple = 1
-
     def __init__(self, config: TKPCNConfig) -> None:
-        super().__init__()
-        self.config = config
-        #: Length of the windows, T.
-        self.frames = config.kernel.frames
+        super().__init__(config)
         width, size = config.width, config.conv_size
         self.stem = nn.Conv2d(CHANNELS, width, size, padding=size // 2)
         self.blocks = nn.ModuleList(ResidualBlock(width, size) for _ in range(config.blocks))
         self.temporal = TemporalModule(width, config.kernel.frames, config.temporal_blocks, size)
         self.head = KernelHead(width, config.kernel)
 
-    def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Predict ``(N, taps, H, W)`` kernels; see `KernelHead.forward`."""
-        x = self.stem(_time_first(features, self.frames, self.multiple, self.stem.weight.dtype))
+    def trunk(self, features: Tensor) -> Tensor:
+        """See `KernelNetwork.trunk`."""
+        x = self._enter(features)
         for block in self.blocks:
             x = block(x)
-        x = self.temporal(x, self.frames)
-        return cast(Tensor, self.head(torch.relu(x), confidence, threshold))
+        return torch.relu(self.temporal(x, self.frames))
 
 
 class MultiScale(nn.Module):
@@ -291,7 +318,7 @@ class MultiScale(nn.Module):
         return Pyramid(tuple(kernels), tuple(blends))
 
 
-KernelModel = RAUNet | RAResNet | TKPCN | MultiScale
+KernelModel = KernelNetwork | MultiScale
 
 
 def filter_window(
@@ -312,11 +339,3 @@ def for_inference(model: KernelModel, bfloat16: bool) -> KernelModel:
     for parameter in model.parameters():
         parameter.data = parameter.to(torch.bfloat16 if bfloat16 else torch.float32)
     return channels_last(model)
-
-
-def _time_first(features: Tensor, frames: int, multiple: int, dtype: torch.dtype) -> Tensor:
-    """``(N, T, C, H, W)`` to ``(T·N, C, H, W)`` channels last, after checking each axis by itself."""
-    if features.ndim != 5 or tuple(features.shape[1:3]) != (frames, CHANNELS):
-        raise ValueError(f"features: expected (N, {frames}, {CHANNELS}, H, W), got {tuple(features.shape)}")
-    check_size("features", features, multiple)
-    return features.transpose(0, 1).flatten(0, 1).to(dtype=dtype, memory_format=torch.channels_last)

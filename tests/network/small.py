@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors import safe_open
 
 from network.paper.models import (
     TKPCN,
@@ -20,6 +24,12 @@ from network.paper.models import (
 )
 from network.presets import Model
 from network.robust_unet import RobustUNet, RobustUNetConfig
+
+
+def notes_of(path: Path) -> dict[str, Any]:
+    """The notes that `save_model` has written."""
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["notes"])
 
 
 def make_model(seed: int = 0) -> RAUNet:

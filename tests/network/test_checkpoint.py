@@ -18,9 +18,9 @@ torch = pytest.importorskip("torch")
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from network.checkpoint import _NAMES_OF_3, build, describe, load_model, load_notes, save_model, shipped_weights
+from network.checkpoint import _NAMES_OF_3, build, describe, load_model, save_model, shipped_weights
 from network.paper.models import RAResNet, RAResNetConfig
-from tests.network.small import MODELS, make_model, make_robust
+from tests.network.small import MODELS, make_model, make_robust, notes_of
 
 pytestmark = pytest.mark.neural
 
@@ -33,7 +33,7 @@ def test_weights_come_back(tmp_path: Path) -> None:
     for (name, value), other in zip(model.named_parameters(), loaded.parameters(), strict=True):
         assert other.dtype == torch.float32, name
         assert torch.equal(other, value.half().float())
-    assert load_notes(path) == {"hours": 0.5}
+    assert notes_of(path) == {"hours": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["w.safetensors"]
 
 

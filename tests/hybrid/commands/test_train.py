@@ -23,12 +23,13 @@ from hybrid.files.exr import read_exr  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.files.sources import MADE_FROM  # noqa: E402
 from hybrid.neural import TrainInputs  # noqa: E402
-from network.checkpoint import load_model, load_notes, save_model  # noqa: E402
+from network.checkpoint import load_model, save_model  # noqa: E402
 from network.presets import build_preset  # noqa: E402
 from network.robust_unet import RobustUNet, RobustUNetConfig  # noqa: E402
 from network.training.clips import open_clips  # noqa: E402
 from network.training.config import SamplerConfig, TrainConfig  # noqa: E402
 from tests.exr_files import write_layers  # noqa: E402
+from tests.network.small import notes_of  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -191,7 +192,7 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines()[-1] == said
     assert run(*train, "--steps", "2", "--validation", "other", "--tensorboard", tmp_path / "logs") == 0
     assert "denoised" in capsys.readouterr().err
-    assert load_notes(out)["training"]["steps"] == 2
+    assert notes_of(out)["training"]["steps"] == 2
     assert load_model(out).config.frames == 3
     assert list((tmp_path / "logs").glob("events.*"))
 

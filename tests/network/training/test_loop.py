@@ -19,7 +19,7 @@ torch = pytest.importorskip("torch")
 
 
 import network.training.loop
-from network.checkpoint import load_model, load_notes
+from network.checkpoint import load_model
 from network.presets import Model
 from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
 from network.training import losses
@@ -27,7 +27,7 @@ from network.training.clips import Clip, Clips, Sample, Samples, open_clips, spl
 from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
 from network.training.loop import batch_loss, image_loss, predict, train, validate
 from network.training.perceptual import VGG19, Perceptual
-from tests.network.small import MODELS, make_model, make_robust
+from tests.network.small import MODELS, make_model, make_robust, notes_of
 
 pytestmark = pytest.mark.neural
 
@@ -361,7 +361,7 @@ def test_what_is_logged_tells_how_it_goes(sets: tuple[Clips, Clips], tmp_path: P
     assert [values["done"] for values in steps] == [pytest.approx(step / 6) for step in range(1, 7)]
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(steps))
     assert "validation/denoised" in logged[-1][1]  # at the end, always
-    assert load_notes(tmp_path / "w")["validation"][-1]["step"] == 6
+    assert notes_of(tmp_path / "w")["validation"][-1]["step"] == 6
 
 
 def _train_in_a_group(rank: int, folder: str, out: str) -> None:
