@@ -64,7 +64,7 @@ def plan_rows(
     ValueError, with what is needed, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
-    prepared, written or worked on. `benchmarks/bench_memory.py` measures the true peak.
+    prepared, written or worked on. `tests/reliability/test_memory.py` measures the true peak.
     """
     height, width = shot.shape
     layers, neural = shot.layers(shot.numbers[0]), network is not None

@@ -118,7 +118,6 @@ def test_a_frame_alone_that_is_flat_has_no_noise() -> None:
 def test_a_frame_alone_with_noise_is_left_to_the_picture(spread: int) -> None:
     """Filters of a renderer may spread samples over several pixels: smooth noise is noise nevertheless."""
 
-
     alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
     own = cv2.GaussianBlur(noisy(ONES, 0.5, 5), (0, 0), 0.8) if spread > 1 else noisy(ONES, 0.5, 5)
     assert np.abs(blend_samples(ONES, own, alone, 1.0) - ONES).max() < 0.02

@@ -1,31 +1,23 @@
 """Made-up shots under noise from 100 % to 0.1 %: no preset makes a picture that is worse than what went in.
 
-    python benchmarks/noise_ladder.py [--presets fast,balanced,quality,draft,standard,final] [--noise 1,0.3,…]
-
 Four scenes whose truth is known: a wall with texture and lines of one pixel that passes by, the same seen through a
 camera that stands still while its light changes, an object of 2 % of the frame on black, and a flat picture behind
-textured guides. Noise is unbiased, skewed and independent between frames. Prints PSNR on x / (1 + x) of the noisy
-frames and of the denoised ones, and exits with 1 where one is more than 0.05 dB worse.
+textured guides. Noise is unbiased, skewed and independent between frames.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import pytest
 
 from hybrid import denoise_shot, open_shot
 from tests.exr_files import write_layers
 
+pytestmark = pytest.mark.reliability
 HEIGHT, WIDTH, FRAMES = 96, 160, 7
 JUDGED = range(2, 5)
-LEVELS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-PRESETS = ("fast", "balanced", "quality", "draft", "standard", "final")
 WORSE_DB = 0.05
 
 
@@ -83,29 +75,15 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(max(np.mean(np.square(a - b)), 1e-12)))
 
 
-def main() -> int:
-    """Run all and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--presets", default=",".join(PRESETS))
-    parser.add_argument("--noise", default=",".join(map(str, LEVELS)))
-    parser.add_argument("--scenes", default="wall,still,object,flat")
-    arguments = parser.parse_args()
-    worse = 0
-    for name in arguments.scenes.split(","):
-        for noise in map(float, arguments.noise.split(",")):
-            with tempfile.TemporaryDirectory() as folder:
-                truths = write_shot(Path(folder), name, noise)
-                shot = open_shot(folder, frames="-".join(str(JUDGED[end] + 1) for end in (0, -1)))
-                row = [np.mean([psnr(shot.read(n + 1).color, truths[n]) for n in JUDGED])]
-                for preset in arguments.presets.split(","):
-                    out = Path(folder) / preset
-                    made = [open_shot(f.path).read(f.number).color for f in denoise_shot(shot, out, preset=preset)]
-                    row.append(np.mean([psnr(image, truths[n]) for image, n in zip(made, JUDGED, strict=True)]))
-            worse += sum(found < row[0] - WORSE_DB for found in row[1:])
-            print(f"{name:8s} {noise:7.3%}  " + "  ".join(f"{value:6.2f}" for value in row), flush=True)
-    print(f"{worse} worse than the input; columns: noisy, {arguments.presets}")
-    return int(worse > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+@pytest.mark.parametrize("noise", [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001])
+@pytest.mark.parametrize("name", ["wall", "still", "object", "flat"])
+def test_no_preset_makes_a_picture_worse_than_its_input(tmp_path: Path, name: str, noise: float) -> None:
+    truths = write_shot(tmp_path, name, noise)
+    shot = open_shot(tmp_path, frames="-".join(str(JUDGED[end] + 1) for end in (0, -1)))
+    noisy = np.mean([psnr(shot.read(n + 1).color, truths[n]) for n in JUDGED])
+    found = {}
+    for preset in ("fast", "balanced", "quality", "draft", "standard", "final"):
+        frames = denoise_shot(shot, tmp_path / preset, preset=preset)
+        made = [open_shot(frame.path).read(frame.number).color for frame in frames]
+        found[preset] = np.mean([psnr(image, truths[n]) for image, n in zip(made, JUDGED, strict=True)])
+    assert min(found.values()) >= noisy - WORSE_DB, found
