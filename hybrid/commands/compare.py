@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,7 +15,7 @@ from rich.console import Console
 
 from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.shots import log_cuts, open_input, validate_renders
+from hybrid.commands.shots import ShotInput, log_cuts, validate_renders
 from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot
 from hybrid.comparison.ladder import join_ladders
@@ -129,12 +128,13 @@ def compare(
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
     if ladder and not level:
         raise typer.BadParameter("--ladder runs the methods on levels, expected --level with it")
-    opened = open_input(shot, frames, layer, profile=profile, motion=motion)
-    alike, findings = validate_renders({"shot": opened}, strict=strict)
+    read = ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion)
+    alike, findings = validate_renders({"shot": read.open()}, strict=strict)
     noisy = alike["shot"]
     clean = [_open_matching(spec, noisy, frames) for spec in reference]
-    open_level = partial(open_input, frames=frames, layer=layer, profile=profile, motion=motion)
-    levels = [_with_samples(pattern, open_level(pattern), count) for pattern, count in _levels(level)]
+    levels = list(_open_levels(level, read))
+    if ladder:
+        levels = [(validate_renders({"level": found}, strict=strict)[0]["level"], count) for found, count in levels]
     chosen = _methods(methods, external, _seconds(external_seconds), noisy, frames)
     plan = cache(partial(run_in_process, plan_shot, noisy))
     if sweep:
@@ -146,7 +146,7 @@ def compare(
         rounds=rounds,
         samples=samples or samples_of(noisy),
         reference_samples=samples_of(clean[0]),
-        levels=[(_validated(found, strict) if ladder else found, count) for found, count in levels],
+        levels=levels,
         ladder=ladder,
         findings=findings,
         check_shot=lambda: [finding.message for finding in log_cuts(plan(), (), strict=strict)],
@@ -268,13 +268,10 @@ def _seconds(stated: Sequence[str] | None) -> dict[str, float]:
     """Seconds per frame, by the names of --external."""
     seconds = {}
     for item in stated or ():
-        name, separator, count = item.rpartition("=")
-        try:
-            seconds[name] = float(count)
-        except ValueError:
-            separator = ""
-        if not separator or not name or not 0 < seconds[name] < math.inf:
+        name, count = opt.split_number(item)
+        if not name or count is None:
             raise typer.BadParameter(f"--external-seconds is {item!r}, expected NAME=SECONDS, more than 0")
+        seconds[name] = count
     return seconds
 
 
@@ -300,34 +297,13 @@ def _methods(
     return chosen
 
 
-def _validated(level: Shot, strict: bool) -> Shot:
-    """A level without layers that make no sense in it."""
-    return validate_renders({"level": level}, strict=strict)[0]["level"]
-
-
-def _with_samples(pattern: str, level: Shot, stated: float | None) -> tuple[Shot, float]:
-    """A level and its samples per pixel, from its files where they are not stated."""
-    samples = stated or samples_of(level)
-    if samples is None:
-        raise ValueError(f"{pattern} does not state its samples per pixel, expected --level PATTERN=SPP")
-    return level, samples
-
-
-def _levels(level: Sequence[str] | None) -> list[tuple[str, float | None]]:
-    """Patterns and samples per pixel, None where these are not stated; a pattern that holds "=" has them stated."""
-    levels: list[tuple[str, float | None]] = []
-    for item in level or ():
-        pattern, separator, count = item.rpartition("=")
-        if not separator and item:
-            levels.append((item, None))
-            continue
-        if not pattern or not count:
-            raise typer.BadParameter(f"--level is {item!r}, expected PATTERN=SPP")
-        try:
-            samples = float(count)
-        except ValueError:
-            samples = 0.0
-        if not samples > 0:
-            raise typer.BadParameter(f"--level is {count!r}, expected a positive number")
-        levels.append((pattern, samples))
-    return levels
+def _open_levels(levels: Sequence[str] | None, read: ShotInput) -> Iterator[tuple[Shot, float]]:
+    """Levels with their samples per pixel: stated (a pattern that holds "=" has them stated), or from their files."""
+    for item in levels or ():
+        pattern, stated = opt.split_number(item) if "=" in item else (item, None)
+        if not pattern or ("=" in item and stated is None):
+            raise typer.BadParameter(f"--level is {item!r}, expected PATTERN=SPP, more than 0 samples per pixel")
+        level = replace(read, shot=pattern).open()
+        if (samples := stated or samples_of(level)) is None:
+            raise ValueError(f"{pattern} does not state its samples per pixel, expected --level PATTERN=SPP")
+        yield level, samples

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -181,6 +182,16 @@ def choose(table: dict[str, Thing], name: str, option: str) -> Thing:
     if name not in table:
         raise typer.BadParameter(f"--{option} is {name!r}, expected one of {', '.join(table)}")
     return table[name]
+
+
+def split_number(item: str) -> tuple[str, float | None]:
+    """Split NAME=NUMBER at the last "="; None in place of what is no number above 0."""
+    name, _, text = item.rpartition("=")
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    return name, number if 0 < number < math.inf else None
 
 
 @contextmanager

@@ -140,18 +140,6 @@ def expect_views_apart(
             raise typer.BadParameter(f"{name} is {value!r}, expected %V or %v in it, as the shot has")
 
 
-def open_input(
-    shot: str,
-    frames: str | None,
-    layer: Sequence[str] | None,
-    *,
-    profile: str | None = None,
-    motion: str | None = None,
-) -> Shot:
-    """Open a shot as `ShotInput.open`."""
-    return ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion).open()
-
-
 def log_findings(report: ValidationReport, views: Sequence[Shot]) -> None:
     """Warn of each layer that makes no sense, and name the views where there are several."""
     for warning in report.warnings:

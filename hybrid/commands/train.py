@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import re
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -191,10 +190,10 @@ def parse_samples(text: str) -> dict[str, float]:
     """Read ``a=24,b=24,c=8``: levels, and their samples per pixel; ValueError if it is not of that form."""
     samples = {}
     for item in text.split(","):
-        name, _, count = item.partition("=")
-        if not name or not re.fullmatch(r"\d+(\.\d+)?", count) or float(count) <= 0:
+        name, count = opt.split_number(item)
+        if not name or count is None:
             raise ValueError(f"levels: expected NAME=SAMPLES,…, got {text!r}")
-        samples[name] = float(count)
+        samples[name] = count
     return samples
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from hybrid.comparison import chart, page
 from hybrid.comparison.animations import embed_animations, write_movies
-from hybrid.comparison.embedding import Embedded, MethodImages, ShotImages, embed_pictures
+from hybrid.comparison.embedding import MethodImages, ShotImages, embed_pictures
 from hybrid.comparison.results import (
     CHART_METRICS,
     COSTS,
@@ -136,28 +137,19 @@ def _check(results: Sequence[MethodResult], images: ShotImages | None) -> None:
 # Content of the page
 
 
-@dataclass(frozen=True)
-class _Images:
-    """Encoded images of a page, and the movies next to it by method."""
-
-    pictures: Embedded | None = None
-    animations: Embedded | None = None
-    movies: Mapping[str, str] | None = None
-
-
-def _embed(folder: Path, report: Report) -> _Images:
-    """Encode the images of a page; a single frame has no animation."""
+def _embed(folder: Path, report: Report) -> dict[str, Any]:
+    """Encode the images of a page, `animations` of more than one frame, and write the movies next to it by method."""
     images = report.images
-    if images is None:
-        return _Images()
-    pictures = embed_pictures(images)
-    if len(images.frames) < 2:
-        return _Images(pictures)
+    pictures = None if images is None else embed_pictures(images)
+    if images is None or len(images.frames) < 2:
+        return {"pictures": pictures, "animations": None, "movies": None}
     movies = write_movies(folder / MOVIES, images, report.rate) if report.movies else None
-    return _Images(pictures, embed_animations(images), movies)
+    return {"pictures": pictures, "animations": embed_animations(images), "movies": movies}
 
 
-def _page(report: Report, embedded: _Images, document: Mapping[str, object], charted: Sequence[Metric]) -> Markup:
+def _page(
+    report: Report, embedded: Mapping[str, Any], document: Mapping[str, Any], charted: Sequence[Metric]
+) -> Markup:
     """The page as HTML."""
     comparison, results = report.comparison, report.comparison.results
     metrics = present_metrics(results, METRICS)
@@ -170,8 +162,7 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
         "cost": report.cost,
         "pair": pair,
         "exposure": report.images.exposure if report.images is not None else 1.0,
-        "pictures": embedded.pictures and embedded.pictures.info,
-        "animations": embedded.animations and embedded.animations.info,
+        **{name: embedded[name] and embedded[name].info for name in ("pictures", "animations")},
     }
     return page.render(
         "report.html",
@@ -194,9 +185,7 @@ def _page(report: Report, embedded: _Images, document: Mapping[str, object], cha
         ladder=None if (ladder := chart.draw_ladder(comparison.ladder)) is None else chart.to_svg(ladder, "ladder"),
         ladder_rows=ladder_rows(comparison.ladder),
         shots=_shot_table([comparison, *report.others]),
-        pictures=embedded.pictures,
-        animations=embedded.animations,
-        movies=embedded.movies,
+        **embedded,
         rates=sorted({*RATES, report.rate}),
         fps=report.rate,
         data=to_plain_numbers(data),

@@ -12,7 +12,6 @@ from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.robust_unet import RobustUNet
 
-PRECISIONS = ("auto", "float32", "bfloat16")
 # Side of a tile where memory is short, pixels.
 SMALL_TILE = 384
 
@@ -36,14 +35,9 @@ def open_network(
     each frame's contribution and weight are then further layers. With `add_layers` the image is the sum of its light
     passes, instead of these being scaled to it.
 
-    Raises ValueError for a bad option, a threshold for a network without kernels, or a file without a model.
+    Options are those of `hybrid.job.DenoiseOptions`, which validates them. Raises ValueError for a threshold for a
+    network without kernels, a device that is not there, or a file without a model.
     """
-    if precision not in PRECISIONS:
-        raise ValueError(f"precision is {precision!r}, expected one of {', '.join(PRECISIONS)}")
-    if tile is not None and tile < 16:
-        raise ValueError(f"tile is {tile}, expected at least 16 pixels")
-    if threshold is not None and not 0 <= threshold < 1:
-        raise ValueError(f"threshold is {threshold}, expected 0 <= threshold < 1, in units of 1/K")
     name, torch_device = find_device(device)
     bfloat16 = precision == "bfloat16" or (precision == "auto" and has_bfloat16(torch_device))
     setup = Setup(

@@ -139,13 +139,7 @@ def sync_file(descriptor: int) -> None:
 
 
 def replace_path(source: Path, target: Path) -> None:
-    """Rename a file, replacing `target`; on Windows retry for `_PATIENCE` seconds while a program has it open.
-
-    Parameters
-    ----------
-    source, target : Path
-        In one folder.
-    """
+    """Rename a file in its folder, replacing `target`; on Windows retry for `_PATIENCE` seconds while it is open."""
     end = time.monotonic() + (_PATIENCE if sys.platform == "win32" else 0.0)
     while True:
         try:
@@ -185,12 +179,7 @@ def expand_home(words: Sequence[str]) -> list[str]:
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:
-    """Return whether two statuses are of one file; True if the file system has no inodes, as some network drives.
-
-    Parameters
-    ----------
-    one, other : os.stat_result
-    """
+    """Return whether two statuses are of one file; True if the file system has no inodes, as some network drives."""
     return not (one.st_ino and other.st_ino) or os.path.samestat(one, other)
 
 

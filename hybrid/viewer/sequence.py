@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, Part, component_of, read_exr
+from hybrid.files.decode import Window, data_window, display_size, place
+from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
 from hybrid.files.png import encode_srgb
 from hybrid.files.profile import find_profile
@@ -101,7 +102,10 @@ class Sequence:
         because it is incomplete so far.
         """
         image, layer, pixels = self._read_layer(number, name)
-        return _on_display_window(self._encode(pixels, layer, _layers(image), gain, ev), image.parts[layer.part])
+        part = image.parts[layer.part]
+        width, height = display_size(part)
+        encoded = self._encode(pixels, layer, _layers(image), gain, ev)
+        return place(encoded, data_window(part), Window(0, 0, width - 1, height - 1))
 
     def values(self, number: int, name: str, x: int, y: int) -> dict[str, float | None]:
         """Return the values of a layer's pixel by component, None if not finite; {} outside of the data window.
@@ -110,7 +114,7 @@ class Sequence:
         """
         image, layer, pixels = self._read_layer(number, name)
         part = image.parts[layer.part]
-        column, row = x + part.display_window[0] - part.data_window[0], y + part.display_window[1] - part.data_window[1]
+        column, row = x - data_window(part).left, y - data_window(part).top
         if not (0 <= row < pixels.shape[0] and 0 <= column < pixels.shape[1]):
             return {}
         found = (float(value) for value in pixels[row, column])
@@ -244,28 +248,12 @@ def _name(layer: Layer) -> str:
 def _refuse_large_display(image: ExrImage) -> None:
     """Raise ExrError for a display window that is too large, however few pixels are stored."""
     for part in image.parts:
-        left, top, right, bottom = part.display_window
-        width, height = right - left + 1, bottom - top + 1
+        width, height = display_size(part)
         if max(width, height) > LARGEST_SIDE or width * height > MAX_PIXELS:
             raise ExrError(
                 f"{image.path}: display window of {width}x{height} pixels, expected sides up to {LARGEST_SIDE} and "
                 f"{MAX_PIXELS} pixels"
             )
-
-
-def _on_display_window(picture: Image8, part: Part) -> Image8:
-    """An image of the data window, cropped or padded with black to the display window."""
-    left, top, right, bottom = part.display_window
-    x, y, last_x, last_y = part.data_window
-    if (left, top, right, bottom) == (x, y, last_x, last_y):
-        return picture
-    shown = np.zeros((bottom - top + 1, right - left + 1, 3), np.uint8)
-    rows = slice(max(top, y), min(bottom, last_y) + 1)
-    columns = slice(max(left, x), min(right, last_x) + 1)
-    if rows.start < rows.stop and columns.start < columns.stop:
-        cut = picture[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
-        shown[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = cut
-    return shown
 
 
 def encode_picture(picture: Image8, suffix: str) -> bytes:

@@ -15,7 +15,7 @@ from hybrid import budget, job
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
-from hybrid.commands.shots import open_input
+from hybrid.commands.shots import ShotInput
 from hybrid.comparison.results import Comparison
 from hybrid.files.decode import decode_frame
 from hybrid.files.exr import read_exr
@@ -229,11 +229,11 @@ def test_one_name_for_several_frames_is_refused_with_those_beside_them(shot_fold
 def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch):
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
-    pages, asked, profiles = [], [], []
+    pages, asked, profiles, open_input = [], [], [], ShotInput.open
 
-    def open_noted(*args, profile, **options):
-        profiles.append(profile)
-        return open_input(*args, profile=profile, **options)
+    def open_noted(read):
+        profiles.append(read.profile)
+        return open_input(read)
 
     def compare_shot(shot, reference, methods, options, **more):
         asked.append(options)
@@ -243,7 +243,7 @@ def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch)
     monkeypatch.setattr("hybrid.comparison.report.report_images", lambda *_: None)
     monkeypatch.setattr("hybrid.comparison.report.write_report", lambda _, report: pages.append(report))
     monkeypatch.setattr("hybrid.commands.compare.read_comparison", lambda path: Comparison(path.parent.name, (), {}))
-    monkeypatch.setattr("hybrid.commands.compare.open_input", open_noted)
+    monkeypatch.setattr(ShotInput, "open", open_noted)
     folder, other = str(shot_folder), str(tmp_path / "other")
     words = ["compare", folder, "--reference", folder, "--methods", "draft", "-o", str(tmp_path / "report")]
     words += ["--rounds", "7", "--name", "title", "--clock", "cpu", "--fps", "5", "--with-report", other]
