@@ -20,11 +20,13 @@ from torch.nn import functional
 
 from network.bfloat16 import round_taps, round_unet
 from network.cpu.convolution import convolve
+from network.cpu.curve import decode
+from network.cpu.fused_ops import halve
 from network.cpu.input_packing import can_pack, packer
 from network.oidn_weights import load_oidn
 from network.robust_average import ChannelAverage
 from network.strips import in_strips
-from network.transfer import pu_forward, pu_inverse
+from network.transfer import pu_forward
 from network.unet import DECODERS, ENCODERS, OidnUNet, OidnUNetConfig, Stage, check_size
 from network.windows import PackedInputs, UNetWindow
 from nlm.pooling import RESIDUAL_LIMIT
@@ -217,7 +219,7 @@ class RobustUNet(nn.Module):
         x = convolve(frames, frame_weight, None, repeated, relu=False)
         if "0" in self.robust_average:
             x = self.robust_average["0"](x, count, last == 0)
-        return functional.max_pool2d(cast(Stage, self.backbone.encoder[0]).after_first(x), 2)
+        return halve(cast(Stage, self.backbone.encoder[0]).after_first(x))
 
     def decode(self, x: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:
         """Run all layers behind `encode_and_fuse`; the image and the share as of `forward`."""
@@ -245,7 +247,7 @@ class RobustUNet(nn.Module):
         x = self.backbone.encoder[scale](x)
         if str(scale) in self.robust_average:
             x = self.robust_average[str(scale)](x, self.frames, self._last_fused == scale)
-        return [x if scale == len(self.backbone.encoder) - 1 else functional.max_pool2d(x, 2)]
+        return [x if scale == len(self.backbone.encoder) - 1 else halve(x)]
 
 
 def denoise_window(
@@ -288,7 +290,7 @@ def denoise_window(
 
     def mix(encoded: Tensor, blend: Tensor, average: Tensor, modulation: Tensor) -> list[Tensor]:
         # Irradiance is blended: on the curve a mean of two images would be darker than they are.
-        light = pu_inverse(encoded.float().clamp_min(0)) / (modulation * window.gain.view(-1, 1, 1, 1))
+        light = decode(encoded.float()) / (modulation * window.gain.view(-1, 1, 1, 1))
         return [light + blend * (average.clamp_min(0) - light)]
 
     (irradiance,) = in_strips(mix, 0, encoded, blend, average, window.modulation)

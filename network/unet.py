@@ -16,10 +16,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from network.cpu.convolution import can_fuse, convolve
-from network.cpu.fused_ops import can_project, convolve_to_rgb
+from network.cpu.curve import decode, encode
+from network.cpu.fused_ops import can_project, convolve_to_rgb, halve, with_low_bits
 from network.cpu.upsample_conv import UpsampleTaps, can_upsample, convolve_upsampled, merge_taps
 from network.strips import in_strips
-from network.transfer import LARGEST, clip, pu_forward, pu_inverse, srgb_forward, srgb_inverse
+from network.transfer import LARGEST, clip, srgb_forward, srgb_inverse
 
 #: Channels of the convolutions at each scale of the encoder, finest first.
 ENCODERS: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -112,10 +113,9 @@ class OidnUNet(nn.Module):
 
     def _input_skip(self, x: Tensor) -> Tensor:
         """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
-        rounded = x.to(self.first.weight.dtype, memory_format=torch.channels_last)
-        if rounded.dtype != torch.bfloat16:
-            return rounded
-        return torch.cat([rounded, (x[:, :3] - rounded[:, :3]).to(rounded.dtype)], 1)
+        if self.first.weight.dtype == torch.bfloat16:
+            return with_low_bits(x.float(), 3)
+        return x.to(self.first.weight.dtype, memory_format=torch.channels_last)
 
     def project(self, x: Tensor) -> Tensor:
         """Last convolution, from finest features to ``(N, 3, H, W)``; not rounded by any autocast."""
@@ -175,7 +175,7 @@ class Stage(nn.Sequential):
 
 
 def _convolve_and_halve(stage: Stage, x: Tensor) -> list[Tensor]:
-    return [functional.max_pool2d(stage(x), 2)]
+    return [halve(stage(x))]
 
 
 def check_size(name: str, layer: Tensor, multiple: int) -> None:
@@ -195,12 +195,12 @@ def denoise_color(
     The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`). Raises
     ValueError if the inputs are not as many as the network's, or differ in shape.
     """
-    layers = [(color, lambda x: pu_forward(clip(x * exposure, 0, LARGEST)))]
+    layers = [(color, lambda x: encode(clip(x * exposure, 0, LARGEST)))]
     if albedo is not None:
         layers.append((albedo, lambda x: clip(x, 0, 1)))
     if normal is not None:
         layers.append((normal, normal_to_unit))
-    return _run(unet, layers, lambda x: pu_inverse(x.clamp_min(0)) / exposure)
+    return _run(unet, layers, lambda x: decode(x) / exposure)
 
 
 @torch.inference_mode()

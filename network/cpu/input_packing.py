@@ -8,8 +8,7 @@ where it lies, and each input of a convolution is written once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,20 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from loops.parallel import run_bands
-from network.transfer import PU_LINE, PU_LOG, PU_WHITE, pu_forward
+from network.cpu.curve import encoding_table, on_curve
 from network.windows import FRAME_CHANNELS, SHARED_CHANNELS, STATIC_CHANNELS, PackedInputs, UNetWindow
 from nlm.pooling import RESIDUAL_LIMIT
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
-
-# The transfer curve is evaluated 21 times for a pixel of five frames: a power or a logarithm takes 14 ns, linear
-# interpolation in a table 3 ns. The table has 512 entries for each power of two from 2^-20, below which the curve is a
-# line, to 2^16: as exact as the functions in float32. The upper bits of a float32 are the index of its entry.
-_LEAST, _GREATEST, _LOW_BITS = np.float32(2.0**-20), np.float32(2.0**16), np.uint32(14)
-_FIRST, _LAST = (int(value.view(np.uint32) >> _LOW_BITS) for value in (_LEAST, _GREATEST))
-_A, _WHITE = np.float32(PU_LINE), np.float32(PU_WHITE)
-_E, _F, _G = map(np.float32, PU_LOG)
 
 
 class _Source(NamedTuple):
@@ -79,7 +70,7 @@ def packer(window: UNetWindow, columns: Indices) -> Callable[[Indices], PackedIn
         for n in range(batch):
             source = _Source(*(layer[n] for layer in layers))
             target = _Target(frames[:, n], shared[n], static[n], average[n])
-            run_bands(_pack, size[0], source, scales[n], rows, columns, target, _curve())
+            run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table())
         flat = frames.reshape(count * batch, *size, FRAME_CHANNELS)
         return PackedInputs(
             *(torch.from_numpy(pixels).permute(0, 3, 1, 2) for pixels in (flat, shared, static, average))
@@ -91,27 +82,6 @@ def packer(window: UNetWindow, columns: Indices) -> Callable[[Indices], PackedIn
 def _pixels(layer: Tensor) -> Floats:
     """A layer with its channels last, copied only where they are not."""
     return layer.movedim(-3, -1).contiguous().numpy()
-
-
-@lru_cache(maxsize=1)
-def _curve() -> Floats:
-    """Table of the transfer curve: value at each entry, and difference to the next entry, (K, 2)."""
-    places = (np.arange(_FIRST, _LAST + 1, dtype=np.uint32) << _LOW_BITS).view(np.float32)
-    values = pu_forward(torch.from_numpy(places.astype(np.float64))).numpy()
-    return np.stack([values[:-1], np.diff(values)], axis=1).astype(np.float32)
-
-
-@njit(cache=True, nogil=True)
-def _on_curve(y: Any, curve: Any, value: Any, bits: Any) -> Any:
-    """Evaluate the transfer curve; `value` and `bits` are views of the same four bytes of scratch memory."""
-    if y < _LEAST:
-        return _A * y / _WHITE
-    if not y < _GREATEST:
-        return (_E * np.log(y + _F) + _G) / _WHITE
-    value[0] = y
-    entry = np.int64(bits[0] >> _LOW_BITS) - _FIRST
-    fraction = np.float32(np.int32(bits[0] & np.uint32(2**14 - 1))) * np.float32(2.0**-14)
-    return curve[entry, 0] + fraction * curve[entry, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -126,7 +96,7 @@ def _pack(
     centre = T // 2
     trust, share, held = np.empty(T, np.float32), np.empty(T, np.float32), np.empty((T, 3), np.float32)
     value = np.empty(1, np.float32)
-    bits = value.view(np.uint32)
+    bits = value.view(np.uint32)  # of the same four bytes
     for y in range(first, last):
         row = rows[y]
         for x in range(len(columns)):
@@ -165,15 +135,18 @@ def _pack(
                 centre_noise, mean = held[centre, c], zero
                 for t in range(T):
                     linear = max((light + centre_noise + trust[t] * (held[t, c] - centre_noise)) * scale, zero)
-                    encoded = _on_curve(linear, curve, value, bits)
+                    value[0] = linear
+                    encoded = on_curve(linear, bits[0], curve)
                     frames[t, y, x, c] = encoded
                     mean += encoded
-                pooled = _on_curve(max(noisy_light * scale, zero), curve, value, bits)
+                value[0] = max(noisy_light * scale, zero)
+                pooled = on_curve(value[0], bits[0], curve)
                 shift = pooled - mean / np.float32(T)
                 for t in range(T):
                     frames[t, y, x, c] += shift
                 static[y, x, c] = pooled
-                shared[y, x, 6 + c] = _on_curve(max(light * scale, zero), curve, value, bits)
+                value[0] = max(light * scale, zero)
+                shared[y, x, 6 + c] = on_curve(value[0], bits[0], curve)
             for c in range(6):
                 static[y, x, 3 + c] = guides[c]
             shared[y, x, 9] = samples

@@ -11,8 +11,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from network import robust_unet, transfer
-from network.cpu.input_packing import _curve, _on_curve, can_pack, packer
+from network import robust_unet
+from network.cpu.input_packing import can_pack, packer
 from network.robust_unet import RobustUNet, RobustUNetConfig, denoise_window, pack_inputs
 from network.windows import UNetWindow
 
@@ -113,15 +113,3 @@ def test_it_is_taken_where_it_can_be() -> None:
             assert not can_pack(double)
             denoise_window(model, double)
         assert taken.call_count == 1
-
-
-def test_the_curve_is_as_exact_as_float32() -> None:
-    """From nothing to beyond the sun; at the ends of the table, and where the pieces of the curve meet."""
-    ends = np.float32([2.0**-20, 2.0**16])
-    special = [0, *ends, *np.nextafter(ends, np.float32(0)), transfer._Y0, transfer._Y1, 1e9, 3e38]
-    light = np.concatenate([np.geomspace(1e-12, 1e12, 5000), special]).astype(np.float32)
-    value = np.empty(1, np.float32)
-    found = [_on_curve(y, _curve(), value, value.view(np.uint32)) for y in light]
-    exact = transfer.pu_forward(torch.from_numpy(light.astype(np.float64))).numpy()
-    # What is computed in float32 is as far away.
-    np.testing.assert_allclose(found, exact, rtol=3e-7, atol=1.5e-7)
