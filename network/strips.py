@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 #: Rows of the finest layer in a strip, even.
-ROWS = 64
+ROWS = 96
 
 
 def in_strips(
