@@ -87,7 +87,7 @@ class Patches:
         height, width = self.pictures[0].shape
         spacing = max(self.size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
         lit = np.logical_or(*self.shown)
-        known = lit & np.logical_or(*(np.any(layer != 0, axis=-1) for layer in layers))
+        known = lit & np.logical_or.reduce([plane != 0 for layer in layers for plane in np.moveaxis(layer, -1, 0)])
         rows, columns, kept = self._grid(spacing, known if known.any() else lit)
         if kept.any() and not kept.all():
             # As many patches as the kept part of the picture holds, so that an object of 1 % of it has enough.

@@ -60,9 +60,8 @@ def drift_weights(
         raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
     check_exposure(exposure)
     frames, height, width, _ = estimates.shape
-    weight = np.ones(confidence.shape, np.float32)
     if frames < 5:
-        return weight
+        return np.ones(confidence.shape, np.float32)
     offset = first_row % _CELL
     rows, columns = -(-(offset + height) // _CELL), -(-width // _CELL)
     sums = np.zeros((5, rows, columns), np.float32)
@@ -77,9 +76,11 @@ def drift_weights(
     error = np.maximum((differ - drift) / 2, np.float32(_ERROR) * differ)
     off = cv2.resize(ratio(drift, error), (columns * _CELL, rows * _CELL), interpolation=cv2.INTER_LINEAR)
     off = off[offset : offset + height, :width]
-    for t in range(frames):
-        if t != frames // 2:
-            np.divide(1, 1 + np.float32((t - frames // 2) ** 2) * off, out=weight[t])
+    weight = np.empty(confidence.shape, np.float32)
+    for t, plane in enumerate(weight):
+        np.multiply(off, np.float32((t - frames // 2) ** 2), out=plane)
+        plane += 1
+        np.divide(1, plane, out=plane)
     return weight
 
 

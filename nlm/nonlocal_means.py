@@ -15,7 +15,9 @@ Mask = NDArray[np.bool_]
 
 # The image is cut into tiles whose planes stay in the cache. Long rows, because every pass over a row
 # costs as much again before its first pixel (64 wide: 2.5 times slower than 512).
-_TILE_HEIGHT, _TILE_WIDTH = 32, 512
+BAND, _TILE_WIDTH = 32, 512
+# Columns beside those that are asked for, which are filtered too: the variance has been smoothed over as many.
+_PAD = 8
 # A relative difference of 1e-3 counts as noise: half floats are no finer (2^-11), and the colour distance stays finite
 # where the variance is 0. Relative, so that the filter stays scale equivariant.
 _RELATIVE_VARIANCE = 1e-6
@@ -79,7 +81,7 @@ def joint_nlm(
         In [0, 1]; default 1.
     radius, patch_radius : int, of the search and of the compared patches, pixels
     k : float, strength of the colour distance: more smooths more
-    where : (H, W) bool, optional, a tile without a True pixel is copied from the centre
+    where : (H, W) bool, optional, columns of a tile far from True pixels are copied from the centre
 
     Returns
     -------
@@ -132,7 +134,7 @@ def joint_nlm(
         np.ascontiguousarray(array, np.float32) for array in (variance, features, confidence)
     )
     out = np.empty(window.shape[1:], np.float32)
-    tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
+    tiles = -(-height // BAND) * -(-width // _TILE_WIDTH)
     given = _Inputs(window, variance, features, confidence, where)
     run_bands(_filter, tiles, given, radius, patch_radius, np.float32(k), out)
     return out
@@ -271,15 +273,21 @@ def _weigh(weight: Floats, column: Floats, feature: Floats, trust: Floats, patch
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _filter(first: int, last: int, given: _Inputs, radius: int, patch: int, k: np.float32, out: Floats) -> None:
     """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
-    H, W, _ = out.shape
-    columns = -(-W // _TILE_WIDTH)
+    H, W, channels = out.shape
+    columns, centre = -(-W // _TILE_WIDTH), given.window[len(given.window) // 2]
     for tile in range(first, last):
-        top, left = tile // columns * _TILE_HEIGHT, tile % columns * _TILE_WIDTH
-        rows, cols = slice(top, min(top + _TILE_HEIGHT, H)), slice(left, min(left + _TILE_WIDTH, W))
-        if given.where[rows, cols].any():
-            _filter_tile(given, radius, patch, k, (top, left), out[rows, cols])
-        else:
-            out[rows, cols] = given.window[len(given.window) // 2, rows, cols]
+        top, left = tile // columns * BAND, tile % columns * _TILE_WIDTH
+        bottom, right = min(top + BAND, H), min(left + _TILE_WIDTH, W)
+        begin, end = right, left
+        for y in range(top, bottom):
+            for x in range(left, right):
+                for c in range(channels):
+                    out[y, x, c] = centre[y, x, c]
+                if given.where[y, x]:
+                    begin, end = min(begin, x), max(end, x + 1)
+        if begin < end:
+            begin, end = max(begin - _PAD, left), min(end + _PAD, right)
+            _filter_tile(given, radius, patch, k, (top, begin), out[top:bottom, begin:end])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)

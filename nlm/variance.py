@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import cv2
 import numpy as np
 from numba import njit
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 
 from loops.parallel import run_bands
 from nlm.average import check_window
-from nlm.nonlocal_means import joint_nlm
+from nlm.nonlocal_means import BAND, joint_nlm
 
 Floats = NDArray[np.float32]
 
@@ -115,11 +117,31 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
     out.
     """
     guides, confidence = check_window(guides, confidence, "confidence")
-    temporal, trust = _temporal_variance(guides, confidence)
-    spatial = variance_from_residual(guides[guides.shape[0] // 2])
-    variance, noisy = np.empty_like(spatial), np.empty(trust.shape, np.bool_)
-    run_bands(_lesser_variance, len(trust), temporal, spatial, trust, variance, noisy)
-    return joint_nlm(guides, variance, confidence=confidence, radius=1, patch_radius=1, k=1.0, where=noisy)
+    return prefilter_noisy_rows(guides[len(guides) // 2], lambda rows: guides[:, rows], confidence)
+
+
+def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confidence: Floats) -> Floats:
+    """As `prefilter_guide`; `read` returns the window (T, h, W, F) of some rows, and is called for rows around noise.
+
+    The centre's guide (H, W, F) alone tells where noise may be, as the lesser variance counts.
+    """
+    spatial, filtered = variance_from_residual(centre), centre.copy()
+    for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):
+        guides, trusted = check_window(read(rows), confidence[:, rows], "confidence")
+        temporal, trust = _temporal_variance(guides, trusted)
+        variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
+        run_bands(_lesser_variance, len(trust), temporal, spatial[rows], trust, variance, noisy)
+        filtered[rows] = joint_nlm(guides, variance, confidence=trusted, radius=1, patch_radius=1, k=1.0, where=noisy)
+    return filtered
+
+
+def _around(rows: NDArray[np.bool_]) -> Iterator[slice]:
+    """Yield runs of bands that hold one of these rows (H,), with a band on each side: more than all filters reach."""
+    bands = np.logical_or.reduceat(rows, np.arange(0, len(rows), BAND))
+    wide = np.convolve(bands, np.ones(3), "same") > 0
+    edges = np.flatnonzero(np.diff(wide, prepend=False, append=False))
+    for first, last in edges.reshape(-1, 2):
+        yield slice(first * BAND, min(last * BAND, len(rows)))
 
 
 def gaussian_mean(image: Floats, sigma: float) -> Floats:

@@ -386,12 +386,9 @@ def _noise_free_share(small: SmallFrame) -> float:
     exposure = measure_exposure(small.light)
     removed = np.abs(compress(small.irradiance, exposure) - compress(small.light, exposure)).max(axis=-1)
     side = max(TILE // small.factor, 1)
-    tiles = [
-        removed[y : y + side, x : x + side].max() < NOISE_FREE
-        for y in range(0, removed.shape[0], side)
-        for x in range(0, removed.shape[1], side)
-    ]
-    return float(np.mean(tiles))
+    for axis, length in enumerate(removed.shape):
+        removed = np.maximum.reduceat(removed, np.arange(0, length, side), axis=axis)
+    return float(np.mean(removed < NOISE_FREE))
 
 
 def _middle(shape: tuple[int, int]) -> tuple[slice, slice]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.residual import warp_residual
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.samples import SampleMean
-from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
+from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -67,16 +67,21 @@ class WarpSources:
     first_pass: Sequence[Array | None]  # (H, W, 3): denoised radiance of each frame; empty without a first pass
     rows: slice  # of the centre
 
-    def warp(self, name: str, centre_layer: Array) -> Array:
-        """Warp "albedo", "normal" or "irradiance" of all frames, (T, h, W, 3); the centre's where there is no flow."""
-        window = np.empty((len(self.frames), *centre_layer.shape), np.float32)
+    def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
+        """Warp "albedo", "normal" or "irradiance" of all frames, (T, h, W, 3); the centre's where there is no flow.
+
+        `part` are rows of the centre's layer; all, if not given.
+        """
+        here = centre_layer[part]
+        first = self.rows.start + part.indices(len(centre_layer))[0]
+        window = np.empty((len(self.frames), *here.shape), np.float32)
         for frame, flow, out in zip(self.frames, self.flows, window, strict=True):
             if frame is None or flow is None:
-                out[...] = centre_layer
-            elif flow.any():
-                warp(getattr(frame, name), flow, first_row=self.rows.start, out=out)
+                out[...] = here
+            elif (vectors := flow[part]).any():
+                warp(getattr(frame, name), vectors, first_row=first, out=out)
             else:
-                out[...] = getattr(frame, name)[self.rows]
+                out[...] = getattr(frame, name)[first : first + len(here)]
         return window
 
     @cached_property
@@ -198,4 +203,7 @@ def clean_guide(
     name: str, guides: dict[str, Array], sources: WarpSources, trust: Array, stages: Collection[str]
 ) -> Array:
     """Average the centre's "albedo" or "normal" over the window with the stage "prefilter"; else return it."""
-    return prefilter_guide(sources.warp(name, guides[name]), trust) if "prefilter" in stages else guides[name]
+    guide = guides[name]
+    if "prefilter" not in stages:
+        return guide
+    return prefilter_noisy_rows(guide, partial(sources.warp, name, guide), trust)

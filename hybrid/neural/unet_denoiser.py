@@ -41,7 +41,7 @@ class UNetDenoiser(NetworkDenoiser):
             raise ValueError("estimate: expected those of the frames, as this network takes, got none")
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
-            black = measure_exposure(aligned.centre_first_pass) == 1 and aligned.centre_first_pass.max() < 1
+            black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
             nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, self._window(aligned), nothing, bool(black))
             limited = clamp_to_window(result.irradiance, aligned.first_pass, aligned.residual)

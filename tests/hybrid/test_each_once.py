@@ -7,7 +7,7 @@ import collections
 import pytest
 
 from hybrid import stabilize, stream
-from hybrid.alignment import align, flows
+from hybrid.alignment import align, flows, prepare
 from hybrid.files.shots import Shot, open_shot
 from hybrid.first_pass import PerFrame
 from hybrid.plan import Rules
@@ -29,7 +29,9 @@ EXPECTED = {
     "first pass": FRAMES,
     "compose_flow": 2 * SECOND,
     "align": FRAMES,
+    "clean_guide": FRAMES,
     "trust_geometry": NEXT + SECOND,
+    "measure_exposure": FRAMES,
     "denoise": FRAMES,
     "align_results": FRAMES,
     "find_bright": FRAMES,
@@ -58,6 +60,8 @@ def count(monkeypatch):
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):
         watch(stabilize, name)
     watch(align, "trust_geometry")
+    watch(align, "clean_guide")
+    watch(prepare, "measure_exposure")
     watch(flows, "compose_flow")
     watch(Shot, "read")
     return counts, counted

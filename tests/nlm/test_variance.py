@@ -5,6 +5,7 @@ import pytest
 
 from nlm.variance import (
     prefilter_guide,
+    prefilter_noisy_rows,
     smooth_variance,
     variance_from_halves,
     variance_from_residual,
@@ -104,6 +105,17 @@ def test_only_tiles_whose_guides_are_noisy_are_filtered(rng):
     result = prefilter_guide(guides, np.ones((5, 96, 40), np.float32))
     np.testing.assert_array_equal(result[:32], guides[2, :32])
     assert np.abs(result[70:] - clean[70:]).mean() < 0.5 * np.abs(guides[2, 70:] - clean[70:]).mean()
+
+
+def test_only_rows_around_noise_are_read(rng):
+    guides = np.full((3, 300, 24, 3), 0.5, np.float32)
+    guides[:, 100:110] += rng.normal(0, 0.05, (3, 10, 24, 3)).astype(np.float32)
+    guides[:, 299] += rng.normal(0, 0.05, (3, 24, 3)).astype(np.float32)
+    confidence, rows = np.ones(guides.shape[:3], np.float32), []
+    result = prefilter_noisy_rows(guides[1], lambda part: rows.append(part) or guides[:, part], confidence)
+    assert rows == [slice(64, 160), slice(256, 300)]
+    np.testing.assert_array_equal(result, prefilter_guide(guides, confidence))
+    assert np.abs(result[100:110] - 0.5).mean() < 0.8 * np.abs(guides[1, 100:110] - 0.5).mean()
 
 
 def test_shapes_are_checked():
