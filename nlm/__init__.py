@@ -9,7 +9,7 @@ T is even, or a parameter is out of its range.
 from nlm.average import average, reject_outliers, replace_nonfinite, robust_average
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.fireflies import Highlights, find_bright_samples, measure_highlights, replace_fireflies
-from nlm.gate import color_gate, color_gates
+from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.guided import guided_filter, measure_guide
 from nlm.moving_lights import confirmed_by_neighbour, find_bright
 from nlm.nonlocal_means import joint_nlm
@@ -20,10 +20,10 @@ from nlm.samples import SampleMean, average_neighbours, blend_samples, restore_m
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_halves, variance_from_window
 
 __all__ = [
-    "Highlights", "PooledSamples", "SampleMean", "average", "average_neighbours", "blend_samples", "clamp_to_window",
-    "color_gate", "color_gates", "confirmed_by_neighbour", "drift_weights", "filter_layers", "find_bright",
-    "find_bright_samples", "find_sums", "guided_filter", "joint_nlm", "measure_guide", "measure_highlights",
-    "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers", "relight", "replace_fireflies",
-    "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance", "split_light", "sums_to",
-    "variance_from_halves", "variance_from_window",
+    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours",
+    "blend_samples", "clamp_to_window", "color_gate", "color_gates", "confirmed_by_neighbour", "drift_weights",
+    "filter_layers", "find_bright", "find_bright_samples", "find_sums", "guided_filter", "joint_nlm",
+    "measure_guide", "measure_highlights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers",
+    "relight", "replace_fireflies", "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance",
+    "split_light", "sums_to", "variance_from_halves", "variance_from_window",
 ]  # fmt: skip

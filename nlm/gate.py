@@ -1,4 +1,4 @@
-"""Colour gate: weights of aligned frames by whether they show the same light as the centre."""
+"""Weights of aligned frames by whether they show the same light and the same detail as the centre."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_exposure
+from nlm.average import check_exposure, check_window
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -18,6 +18,16 @@ Mask = NDArray[np.bool_]
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)
 _AROUND_SIZE = (15, 15)
+_DETAIL_SIZE = (5, 5)
+# Boxes of the difference from the centre and of the scatter of the neighbours; Gaussians of the same deviations, 3 and
+# 6 pixels, are alike. 1.5 and 2 pixels for the first cost up to 0.25 dB on shots without misaligned detail.
+_EXCESS_SIZE, _SCATTER_SIZE = (11, 11), (21, 21)
+# The mean of so few correlated errors is uncertain: a fifth above their expected square is still noise.
+_SURE = np.float32(1.2)
+# Frames of less confidence do not count: their squares vanish in float32, and their inverse is infinite.
+_LEAST_WEIGHT = np.float32(1e-6)
+# Neighbours, of equal confidence, that there must be to know their scatter.
+_LEAST_COUNT = np.float32(1.5)
 # q = share · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is noise; 0.004,
 # one step of 8 bits, is the difference of the estimates without noise.
 SHARE, _FLOOR = 0.3, 0.004
@@ -28,7 +38,15 @@ def color_gate(estimates: Floats, noisy: Floats, exposure: float) -> Floats:
     return color_gates(estimates, noisy, exposure, (SHARE,))[0]
 
 
-def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Sequence[float]) -> list[Floats]:
+def color_gates(
+    estimates: Floats,
+    noisy: Floats,
+    exposure: float,
+    shares: Sequence[float],
+    *,
+    floor: float = _FLOOR,
+    detail: float | None = None,
+) -> list[Floats]:
     """Weigh aligned frames by how well their denoised colours agree with the centre's, for several strictnesses.
 
     Geometry does not show a moving shadow, highlight or reflection; the colour of a clean enough estimate does.
@@ -39,6 +57,10 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
     noisy : (H, W, 3) float32, the centre frame as rendered, in the same unit
     exposure : float
     shares : sequence of float, tolerated difference of two estimates as a share of the centre's noise, at least 0
+    floor : float
+        Tolerated difference without noise, in tone-mapped units.
+    detail : float, optional
+        By how many times more than their means single pixels may differ; without it by any amount.
 
     Returns
     -------
@@ -47,9 +69,9 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
 
     Notes
     -----
-    exp(−(m/q)²), q = share · s + 0.004. All in x / (x + exposure): m is the RMS over channels of the 9×9 mean of the
-    difference from the centre, or the 15×15 RMS of that, whichever is greater; s the 15×15 RMS of noisy − centre.
-    Non-finite values get weight 0 and do not spread.
+    exp(−(m/q)²), q = share · s + floor. All in x / (x + exposure): m is the greatest of the RMS over channels of the
+    9×9 mean of the difference from the centre, the 15×15 RMS of that, and the 5×5 RMS of the difference over `detail`;
+    s is the 15×15 RMS of noisy − centre. Non-finite values get weight 0 and do not spread.
 
     Between a shadow that has come and one that has gone lies a line of mean difference 0. Without the 15×15 RMS
     averages ran along such lines: 4 dB on a shot of moving shadows, nothing elsewhere.
@@ -70,17 +92,127 @@ def color_gates(estimates: Floats, noisy: Floats, exposure: float, shares: Seque
     run_bands(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
     noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
-    rates = [1 / np.square(np.float32(share) * noise + np.float32(_FLOOR)) for share in shares]
+    rates = [1 / np.square(np.float32(share) * noise + np.float32(floor)) for share in shares]
     weights = [np.ones(estimates.shape[:3], np.float32) for _ in shares]
     for t, estimate in enumerate(estimates):
         if t == centre_index:
             continue
         run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
+        if detail is not None:
+            energy = cv2.blur(_mean_square(difference), _DETAIL_SIZE) / np.float32(detail**2)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
         around = cv2.blur(mean, _AROUND_SIZE)
+        if detail is not None:
+            around = np.maximum(around, energy)
         for rate, weight in zip(rates, weights, strict=True):
             run_bands(_weigh, shape[0], mean, around, rate, both, weight[t])
     return weights
+
+
+def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, exposure: float) -> Floats:
+    """Weigh all neighbours of a frame by whether they differ from it by more than from each other.
+
+    Errors of the estimates differ between all frames. Misaligned or interpolated detail, and light that only the centre
+    shows, differ between the centre and the others alone, and their mean over 9×9 pixels is often 0: the gate does not
+    detect them.
+
+    Parameters
+    ----------
+    estimates : (T, H, W, 3) float32, denoised, aligned, at least 0
+    noisy : (H, W, 3) float32, the centre frame as rendered, in the same unit
+    confidence : (T, H, W) float32
+    exposure : float
+
+    Returns
+    -------
+    (H, W) float32
+        Factor in [0, 1] for the confidence of all frames but the centre; 1 where fewer than two neighbours are trusted.
+
+    Notes
+    -----
+    All in x / (x + exposure), squares in the mean over channels. With d_s the difference of a neighbour from the
+    centre, c its confidence, A = Σ c d / Σ c over the neighbours, N = B₂₁[Σ c] / B₂₁[Σ c² / Σ c], and B box means,
+
+        V = B₂₁[Σ c (d − A)²] / B₂₁[Σ c − Σ c² / Σ c],    E = B₁₁[Σ c · A²] / B₁₁[Σ c],
+
+    V is the variance of an estimate's error, and E should be V (1 + 1 / N). What exceeds that and the noise s² of the
+    samples (B₁₅ of noisy − centre, squared), which the error of an estimate does not exceed, is the square of an error
+    a that all neighbours share: a² = max(0, E − s² − 1.2 V (1 + 1 / N)). The average of least error of the centre and
+    its neighbours weighs these by V / (V + N a²).
+
+    Of ten shots at 8 to 512 samples, one with leaves gains 0.4 to 1.7 dB by it, and none loses 0.1 dB. Without V two
+    lose 0.2 dB, without s² 0.2 to 0.6.
+    """
+    estimates, confidence = check_window(estimates, confidence, "confidence")
+    if noisy.shape != estimates.shape[1:]:
+        raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
+    check_exposure(exposure)
+    sums = np.empty((5, *noisy.shape[:2]), np.float32)
+    noisy = np.ascontiguousarray(noisy, np.float32)
+    run_bands(_compare_neighbours, len(noisy), estimates, noisy, confidence, np.float32(exposure), sums)
+    spread, trust, repeat, excess, noise = sums
+    wide = (cv2.blur(plane, _SCATTER_SIZE) for plane in (spread, trust, repeat))
+    near = (cv2.blur(plane, _EXCESS_SIZE) for plane in (excess, trust))
+    weight = np.empty(noisy.shape[:2], np.float32)
+    run_bands(_weigh_neighbours, len(noisy), *wide, *near, cv2.blur(noise, _NOISE_SIZE), weight)
+    return weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compare_neighbours(
+    first: int, last: int, estimates: Floats, noisy: Floats, confidence: Floats, exposure: np.float32, sums: Floats
+) -> None:
+    """Write Σ c (d − A)², Σ c, Σ c² / Σ c, Σ c · A² and (noisy − centre)² of each pixel."""
+    frames, _, width, channels = estimates.shape
+    zero, share = np.float32(0), np.float32(1) / np.float32(channels)
+    centre, mean = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    for y in range(first, last):
+        for x in range(width):
+            total, squares, spread, level, noise = zero, zero, zero, zero, zero
+            for c in range(channels):
+                mean[c] = zero
+                centre[c] = exposure / (max(estimates[frames // 2, y, x, c], zero) + exposure)
+                d = centre[c] - exposure / (max(noisy[y, x, c], zero) + exposure)
+                noise += d * d
+            for t in range(frames):
+                weight = confidence[t, y, x]
+                if t == frames // 2 or not weight > _LEAST_WEIGHT:
+                    continue
+                square = zero
+                for c in range(channels):
+                    d = centre[c] - exposure / (max(estimates[t, y, x, c], zero) + exposure)
+                    mean[c] += weight * d
+                    square += d * d
+                total += weight
+                squares += weight * weight
+                spread += weight * square
+            rate = np.float32(1) / total if total > zero else zero
+            for c in range(channels):
+                level += mean[c] * mean[c] * rate
+            finite = np.isfinite(spread + noise)
+            sums[0, y, x] = max(spread - level, zero) * share if finite else zero
+            sums[1, y, x] = total if finite else zero
+            sums[2, y, x] = squares * rate if finite else zero
+            sums[3, y, x] = level * share if finite else zero
+            sums[4, y, x] = noise * share if finite else zero
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_neighbours(
+    first: int, last: int, spread: Floats, wide: Floats, repeat: Floats, excess: Floats, near: Floats, noise: Floats,
+    weight: Floats,
+) -> None:  # fmt: skip
+    """Write V / (V + N a²), and 1 where N is less than `_LEAST_COUNT`."""
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(first, last):
+        for x in range(spread.shape[1]):
+            weight[y, x] = one
+            if wide[y, x] > _LEAST_COUNT * repeat[y, x] and near[y, x] > zero:
+                count = wide[y, x] / repeat[y, x]
+                variance = max(spread[y, x], zero) / (wide[y, x] - repeat[y, x])
+                error = excess[y, x] / near[y, x] - noise[y, x] - _SURE * variance * (one + one / count)
+                if error > zero:
+                    weight[y, x] = variance / (variance + count * error)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from nlm.gate import SHARE, color_gate, color_gates
+from nlm.gate import SHARE, agreement_weight, color_gate, color_gates
 
 
 @pytest.fixture
@@ -98,3 +99,115 @@ def test_a_line_between_light_that_came_and_light_that_went_is_no_way_through() 
     assert weight[0][:, 8:-8].max() < 0.1
     assert (weight[1] == 1).all()
     np.testing.assert_allclose(weight[2], 1)
+
+
+def test_a_strict_gate_sees_detail_whose_mean_is_the_same(rng):
+    stripes = np.tile(np.float32([0.6, 0.45, 0.45]), 15)[None, :, None]  # with one mean in each nine columns
+    estimates = np.stack([np.broadcast_to(np.roll(stripes, shift, axis=1), (40, 45, 3)) for shift in (1, 0, 0)])
+    noisy = estimates[1] + rng.normal(0, 0.02, estimates.shape[1:]).astype(np.float32)
+    inside = np.s_[0, 12:-12, 12:-12]  # the ends of the pattern do not fit
+    assert color_gates(estimates, noisy, 0.5, (0.3,))[0][inside].min() > 0.95
+    (weight,) = color_gates(estimates, noisy, 0.5, (0.3,), detail=2.0)
+    assert weight[inside].max() < 1e-3
+    np.testing.assert_array_equal(weight[2], 1)
+
+
+def agreement_by_loops(estimates, noisy, confidence, exposure):
+    """`agreement_weight` in plain numpy."""
+    tone = lambda x: np.maximum(x, 0) / (np.maximum(x, 0) + exposure)  # noqa: E731
+    box = lambda x, size: cv2.blur(x, (size, size))  # noqa: E731
+    estimates, noisy, c = (x.astype(np.float64) for x in (estimates, noisy, confidence))
+    middle = len(estimates) // 2
+    others = [t for t in range(len(estimates)) if t != middle]
+    c, d = c[others, ..., None], tone(estimates[others]) - tone(estimates[middle])
+    total = c.sum(0)
+    mean = (c * d).sum(0) / total
+    repeat = ((c**2).sum(0) / total)[..., 0]
+    total = total[..., 0]
+    spread = (c * (d - mean) ** 2).sum(0).mean(-1)
+    variance = box(spread, 21) / (box(total, 21) - box(repeat, 21))
+    count = box(total, 21) / box(repeat, 21)
+    square = box(total * (mean**2).mean(-1), 11) / box(total, 11)
+    noise = box(((tone(noisy) - tone(estimates[middle])) ** 2).mean(-1), 15)
+    error = np.maximum(square - noise - 1.2 * variance * (1 + 1 / count), 0)
+    return variance / (variance + count * error)
+
+
+@pytest.fixture
+def leaves(rng) -> tuple[np.ndarray, np.ndarray]:
+    """Five estimates with errors of their own; the others lack detail that the centre shows. And the noisy centre."""
+    centre = rng.uniform(0.2, 0.8, (64, 64, 3)).astype(np.float32)
+    estimates = np.stack([cv2.blur(centre, (3, 3))] * 5)
+    estimates[2] = centre
+    estimates[:, :, 40:] = 0.5
+    estimates += rng.normal(0, 0.004, estimates.shape).astype(np.float32)
+    return estimates, estimates[2] + rng.normal(0, 0.02, centre.shape).astype(np.float32)
+
+
+def test_agreement_matches_plain_numpy(rng, leaves):
+    estimates, noisy = leaves
+    confidence = rng.uniform(0.2, 1, estimates.shape[:3]).astype(np.float32)
+    weight = agreement_weight(estimates, noisy, confidence, 0.5)
+    # The sum of squares and the square of the sum cancel to 1e-4 of themselves in float32.
+    np.testing.assert_allclose(weight, agreement_by_loops(estimates, noisy, confidence, 0.5), rtol=2e-2, atol=1e-3)
+
+
+def test_what_all_neighbours_lack_is_seen_and_errors_are_not(leaves):
+    estimates, noisy = leaves
+    weight = agreement_weight(estimates, noisy, np.ones(estimates.shape[:3], np.float32), 0.5)
+    assert weight[:, :24].max() < 0.05
+    assert weight[:, 52:].min() == 1
+
+
+def test_a_difference_below_the_noise_of_the_samples_is_the_centres_own(leaves):
+    estimates, _ = leaves
+    noisy = estimates[2] + np.where(np.indices(estimates.shape[1:]).sum(0) % 2, 0.4, -0.4).astype(np.float32)
+    assert agreement_weight(estimates, noisy, np.ones(estimates.shape[:3], np.float32), 0.5).min() == 1
+
+
+def test_agreement_needs_two_neighbours(leaves):
+    estimates, noisy = leaves
+    confidence = np.zeros(estimates.shape[:3], np.float32)
+    confidence[2:4] = 1
+    assert agreement_weight(estimates, noisy, confidence, 0.5).min() == 1
+    confidence[:] = 0
+    assert agreement_weight(estimates, noisy, confidence, 0.5).min() == 1
+
+
+def test_agreement_does_not_depend_on_the_exposure(leaves):
+    estimates, noisy = leaves
+    confidence = np.ones(estimates.shape[:3], np.float32)
+    np.testing.assert_allclose(
+        agreement_weight(estimates * 512, noisy * 512, confidence, 256.0),
+        agreement_weight(estimates, noisy, confidence, 0.5),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+def test_a_pixel_that_is_not_finite_changes_only_what_is_near(leaves, value):
+    """A running sum would carry it through the rest of the picture."""
+    estimates, noisy = leaves
+    confidence = np.ones(estimates.shape[:3], np.float32)
+    clean = agreement_weight(estimates, noisy, confidence, 0.5)
+    estimates[0, 4, 4] = value
+    estimates[2, 4, 4] = value
+    confidence[:, 4, 8] = 1e-41  # as a product of gates may be
+    weight = agreement_weight(estimates, noisy, confidence, 0.5)
+    assert np.isfinite(weight).all()
+    assert 0 <= weight.min() <= weight.max() <= 1
+    np.testing.assert_allclose(weight[:, 20:], clean[:, 20:], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noisy": np.zeros((3, 4, 3))}, "noisy: expected shape"),
+        ({"confidence": np.zeros((3, 2, 4))}, "confidence: expected shape"),
+        ({"exposure": 0.0}, "exposure: expected a positive number"),
+    ],
+)
+def test_agreement_refuses_what_does_not_fit(change, message):
+    given = {"estimates": np.zeros((3, 4, 4, 3)), "noisy": np.zeros((4, 4, 3)), "confidence": np.zeros((3, 4, 4))}
+    with pytest.raises(ValueError, match=message):
+        agreement_weight(**{**given, "exposure": 1.0, **change})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hybrid.alignment.transfer import ALBEDO_FLOOR
@@ -54,3 +56,30 @@ def test_frames_that_are_missing_have_no_confidence(tmp_path):
     assert not aligned.confidence[3:].any()
     np.testing.assert_array_equal(aligned.color[3], aligned.color[2])
     assert aligned.confidence[1].mean() > 0.5
+
+
+def test_detail_that_all_neighbours_lack_takes_their_confidence(tmp_path):
+    """Means over 9×9 pixels are alike: the color gate lets them pass."""
+    scene = replace(SCENE, step=(0, 0), noise=0.02)
+
+    def checkered(color):
+        y, x = np.indices(color.shape[:2])
+        color[:, :24] *= np.where((x + y) % 2, 0.9, 1.1).astype(np.float32)[:, :24, None]
+
+    def edit(index, layers):
+        if index == MIDDLE - scene.first:
+            checkered(layers["ViewLayer.Combined"])
+
+    def estimate(frame):
+        errors = np.random.default_rng(frame.number).normal(1, 0.004, frame.color.shape).astype(np.float32)
+        clean = scene.clean(frame.number - scene.first)["ViewLayer.Combined"] * errors
+        if frame.number == MIDDLE:
+            checkered(clean)
+        return clean
+
+    shot = open_shot(scene.write(tmp_path, edit=edit))
+    aligned = FrameStream(shot, only({"warp", "gate"}), first_pass=PerFrame(estimate)).align(MIDDLE)
+    neighbours = aligned.confidence[[0, 1, 3, 4]]
+    assert neighbours[..., :16].max() < 0.1
+    assert neighbours[..., 44:].min() > 0.5
+    assert aligned.confidence[2].min() == 1
