@@ -25,7 +25,7 @@ class Place(NamedTuple):
     fy: np.float32
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
     """Find the four pixels around a position, from the centre of the first pixel; outside the frame those of its edge.
 
@@ -44,7 +44,7 @@ def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
     return Place(inside, x0, y0, x1, y1, fx, fy)
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Bilinear weights of the four pixels around a position, row by row."""
     one = np.float32(1)
@@ -52,7 +52,7 @@ def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]
     return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def interpolate(
     image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
 ) -> np.float32:
@@ -96,7 +96,7 @@ def _nearest(
                 out[y, x, c] = image[row, column, c]
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Weights of the samples at -1, 0, 1, 2 for a position t in [0, 1); they sum to 1."""
     half = np.float32(0.5)
@@ -110,7 +110,7 @@ def _catmull_rom(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.
     )
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, wx: Four, wy: Four) -> np.float32:
     """Weigh sixteen values of a flat image, clamped to the range of the four central ones."""
     x0, x1, x2, x3 = columns

@@ -28,15 +28,18 @@ from numba.core.caching import Cache, UserWideCacheLocator
 
 LOG = logging.getLogger("ravg")
 
-# Non-local means take a third of the compilation time of a first run, and are needed last.
-_LONGEST = "nlm.nonlocal_means"
+# Loops that a first run needs late → the program that compiles them in a process of its own: non-local means are a
+# fifth of the compilation time, those of the network, if torch has been imported, another.
+_PROGRAMS = {"nlm.nonlocal_means": "hybrid.runtime.compiled", "network.cpu": "network.cpu.first_run"}
 
 
 class _FirstRun(event.Listener):
-    """Logs that loops are compiled, and starts a helper process that compiles the slowest one."""
+    """Logs that loops are compiled, and starts helper processes that compile those needed late."""
 
     begun = False
-    helper: subprocess.Popen[bytes] | None = None
+
+    def __init__(self) -> None:
+        self.helpers: dict[str, subprocess.Popen[bytes]] = {}
 
     def on_start(self, event: Any) -> None:
         if self.begun:
@@ -48,18 +51,21 @@ class _FirstRun(event.Listener):
             options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
             if sys.platform == "win32":  # no console window if this process has none
                 options["creationflags"] = subprocess.CREATE_NO_WINDOW
-            with suppress(OSError):
-                self.helper = subprocess.Popen([sys.executable, "-m", "hybrid.runtime.compiled"], **options)
+            for loops, program in _PROGRAMS.items():
+                if loops != "network.cpu" or "torch" in sys.modules:
+                    with suppress(OSError):
+                        self.helpers[loops] = subprocess.Popen([sys.executable, "-m", program], **options)
 
     def on_end(self, event: Any) -> None:
         pass
 
     def waited_for(self, loop: Any) -> bool:
-        """Whether the helper process compiles a loop; wait for its end."""
-        if self.helper is None or loop.__module__ != _LONGEST:
+        """Whether a helper process compiles a loop; wait for its end."""
+        helper = next((one for loops, one in self.helpers.items() if loop.__module__.startswith(loops)), None)
+        if helper is None:
             return False
         with suppress(subprocess.TimeoutExpired):
-            self.helper.wait(60)
+            helper.wait(60)
         return True
 
 

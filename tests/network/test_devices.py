@@ -58,3 +58,12 @@ def test_every_name_is_a_name_of_oidns_too():
 
     assert set(DEVICES) == {"auto", *THEIRS}
     assert set(devices._accelerators()) <= set(THEIRS)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_where_onednn_is_held_to_fewer_instructions_there_is_no_bfloat16(monkeypatch, held):
+    """ONEDNN_MAX_CPU_ISA=AVX2 took ten times as long."""
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: not held)
+    assert devices.has_bfloat16(torch.device("cpu")) is not held

@@ -1,0 +1,36 @@
+"""What is compiled beside a first run is all of this package that the run needs."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba.core import event
+
+torch = pytest.importorskip("torch")
+
+from hybrid.files.shots import open_shot
+from hybrid.first_pass import Classical
+from hybrid.neural import open_network, shipped_weights
+from hybrid.neural.oidn_networks import denoise_bundled
+from hybrid.pseudo_reference import DRAFT
+from hybrid.stream import FrameStream
+from network.cpu.first_run import compile_loops
+from tests.scenes import Scene, only
+
+pytestmark = pytest.mark.neural
+
+
+def test_a_run_compiles_nothing_more(tmp_path) -> None:
+    """Loops for other types would be compiled in vain."""
+    compile_loops()
+    scene = Scene(height=40, width=48, frames=5)
+    denoiser = open_network(shipped_weights("fast"))
+    stream = FrameStream(open_shot(scene.write(tmp_path)), only({"warp"}), first_pass=Classical(DRAFT))
+    window = stream.align(scene.first + 2)
+    with event.install_recorder("numba:compile") as compiled:
+        denoise_bundled(*(np.full((40, 48, 3), 0.5, np.float32),) * 3, quality="fast")
+        denoiser(window)
+    loops = (each.data["dispatcher"].py_func for _, each in compiled.buffer)
+    assert [loop.__qualname__ for loop in loops if loop.__module__.startswith("network")] == []
