@@ -15,32 +15,24 @@ import numpy as np
 from hybrid.alignment.measure import FIXED_NOISE_ABOVE, FrameFacts, PairFacts
 from hybrid.files.sequences import format_frames
 
-#: Stages that run where a figure calls for them.
-MEASURED = {
+#: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.
+STAGES = {
+    "fireflies": "remove single bright samples of a frame before anything spreads them",
+    "demodulate": "divide by the albedo and filter the light alone",
     "outliers": "reject samples far above the aligned window",
     "warp": "warp neighbouring frames along the motion",
     "dense-flow": "estimate the motion from the pictures by TV-L1",
     "refine": "correct the renderer's vectors by TV-L1",
     "gate": "do not average over time where the light itself changes",
+    "drift": "average less of denoised frames whose light drifts, as far as samples show",
     "fixed-noise": "do not average noise that stands still on the screen",
     "prefilter": "filter noisy albedo and normals before they guide anything",
-}
-#: Stages that run wherever their input is there, unless they are switched off.
-SWITCHES = {
-    "fireflies": "remove single bright samples of a frame before anything spreads them",
-    "demodulate": "divide by the albedo and filter the light alone",
-    "drift": "average less of denoised frames whose light drifts, as far as samples show",
     "stabilize": "average each result with those of the neighbouring frames",
     "restore-mean": "restore the local means of the samples, fireflies included, as far as these are certain",
     "blend-samples": "blend samples into results where their noise is small against the difference",
     "alpha": "filter the alpha channel with the network's kernels",
     "skip": "leave tiles without noise out of the network",
 }
-_ORDER = (
-    "fireflies demodulate outliers warp dense-flow refine gate drift fixed-noise prefilter stabilize restore-mean "
-    "blend-samples alpha"
-)
-STAGES = {name: {**MEASURED, **SWITCHES}[name] for name in (*_ORDER.split(), "skip")}
 #: Old names of stages, accepted for one release.
 OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 #: Stages of networks alone.

@@ -22,7 +22,7 @@ from flow.patches import FramePair, Patches
 from hybrid.files.frame import Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
-from hybrid.files.profile import ROLES
+from hybrid.files.profile import ROLE_FACTS, ROLES
 from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
@@ -336,9 +336,8 @@ class _Checks:
         return grade.factors, [Finding("estimate", words, left_out=False)]
 
     def _leave_out(self, role: str, words: str) -> Finding:
-        return Finding(
-            role, f"{self._name(role)} {words}: left out, {_LOSSES[role]}; check the pass, or --layer {role}=NAME"
-        )
+        loss = ROLE_FACTS[role]["left_out"]
+        return Finding(role, f"{self._name(role)} {words}: left out, {loss}; check the pass, or --layer {role}=NAME")
 
     def _name(self, role: str) -> str:
         return f"{role} ({getattr(self.layers, role) or 'of two halves'})"
@@ -476,16 +475,6 @@ def _equal_share(a: Array, b: Array, same: Mask) -> float:
     lit = lit.any(axis=-1) if lit.ndim == 3 else lit
     return float(np.mean(same[lit])) if lit.any() else 0.0
 
-
-# Role → loss where its layer is left out.
-_LOSSES = {
-    "albedo": "textures may blur",
-    "normal": "edges may blur",
-    "depth": "motion is followed less exactly",
-    "variance": "the noise is measured from the frames",
-    "alpha": "alpha is kept as rendered",
-    "estimate": "another first pass is made",
-}
 
 # Role → check of its layer and the color; returns what is wrong, or None.
 _CHECKS: dict[str, Callable[[Array, Array], str | None]] = {

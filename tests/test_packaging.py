@@ -75,7 +75,7 @@ def test_the_wheel_holds_the_packages_and_runs_from_a_file(wheel, tree, tmp_path
     for name in OURS:
         assert f"{name}/py.typed" in names
     some = {"network/weights/fast.safetensors", "hybrid/files/profiles/cycles.toml", "hybrid/viewer/page.html"}
-    some.add("hybrid/simulate/shots/lens.toml")
+    some |= {"hybrid/simulate/shots/lens.toml", "hybrid/files/roles.toml"}
     assert some <= names
     assert run(tmp_path, "-m", "ravg", "--version", path=place) == f"ravg {VERSION}\n"
     where = run(tmp_path, "-c", "import ravg; print(ravg.open_shot.__code__.co_filename)", path=place)

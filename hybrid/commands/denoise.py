@@ -32,6 +32,7 @@ from hybrid.commands.shots import (
     views_of,
 )
 from hybrid.files.layers import summarize_layers
+from hybrid.files.profile import ROLE_FACTS
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.first_pass import SPECS
@@ -44,22 +45,6 @@ from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 from hybrid.runtime.system import peak_memory
 from hybrid.runtime.timing import Timings
 from hybrid.validation import Finding
-
-# Roles of layers as users name them, and the loss where a layer is missing.
-ROLES_IN_WORDS = {
-    "color": "color",
-    "albedo": "albedo",
-    "normal": "normal",
-    "depth": "depth",
-    "motion": "motion vectors",
-    "variance": "variance",
-    "half_a": "half buffers",
-}
-LOSSES = {
-    "albedo": "textures blur",
-    "normal": "edges rely on color",
-    "motion": "motion is estimated: slower and less exact",
-}
 
 
 @dataclass(frozen=True)
@@ -246,9 +231,13 @@ def _summarize_input(request: Request, job: Job) -> None:
     numbers = f"{format_frames(view.numbers)} ({len(view.numbers)})"
     facts = [f"frames {numbers}", f"{width}×{height}", layers.profile, *samples]
     summarize("Input", f"{request.shot.shot}, {', '.join(facts)}")
-    found = {words: layer for role, words in ROLES_IN_WORDS.items() if (layer := getattr(layers, role)) is not None}
-    used = [f"{words} ({layer.file})" if layer.file else words for words, layer in found.items()]
-    missing = [f"{ROLES_IN_WORDS[role]} ({loss})" for role, loss in LOSSES.items() if getattr(layers, role) is None]
+    used, missing = [], []
+    for role, words in ROLE_FACTS.items():
+        name, layer = words.get("summary"), getattr(layers, role)
+        if name and layer is not None:
+            used.append(f"{name} ({layer.file})" if layer.file else name)
+        elif "without" in words and layer is None:
+            missing.append(f"{name} ({words['without']})")
     summarize("Passes", "; without ".join([", ".join(used), *filter(None, [", ".join(missing)])]))
     later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
     summarize("First pass", f"{source.name} ({source.reason}){later}")

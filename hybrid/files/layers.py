@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
-from hybrid.files.profile import ROLES, Profile, find_profile, plain_name
+from hybrid.files.profile import ROLE_FACTS, ROLES, Profile, find_profile, plain_name
 
 # Blender's name for its compositor's result: graded, blurred, glowing.
 COMPOSITE = "Composite"
@@ -180,7 +180,7 @@ def _fit_overrides(image: ExrImage, overrides: Mapping[str, str | Layer]) -> dic
         layer = image.layer(name) if isinstance(name, str) else image.again(name)
         fitted = _fit(image, role, layer, named=True) or (_as_gray(layer) if role == "color" else None)
         if fitted is None:
-            raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {_NEEDS[role]}")
+            raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {ROLE_FACTS[role]['needs']}")
         found[role] = fitted
     return found
 
@@ -219,7 +219,7 @@ def fit_sidecar(image: ExrImage, role: str, name: str | None, profile: Profile) 
     named = [fitted for layer, fitted in fitting.items() if set(profile.names(role)) & {*_tails(image, layer)} - {""}]
     candidates = named or [*fitting.values()]
     if not candidates:
-        raise ExrError(f"{image.path}: no layer for {role}: {_NEEDS[role]}; {image.listing()}")
+        raise ExrError(f"{image.path}: no layer for {role}: {ROLE_FACTS[role]['needs']}; {image.listing()}")
     return _only(image, role, candidates)
 
 
@@ -426,36 +426,6 @@ def _as_gray(layer: Layer) -> Layer | None:
     return replace(layer, channels=(alone,) * 3) if gray and alone is not None else None
 
 
-_NEEDS = {
-    "color": "it needs channels R, G and B, or one channel",
-    "albedo": "it needs channels R, G and B, or one channel",
-    "estimate": "it needs channels R, G and B, or one channel",
-    "normal": "it needs channels X, Y and Z, or R, G and B",
-    "depth": "it needs one channel, or Z",
-    "motion": "it needs channels X and Y, U and V, or R and G, or X, Y, Z and W",
-    "motion_next": "it needs channels X and Y, U and V, or R and G",
-    "variance": "it needs channels R, G and B, or one channel",
-    "half_a": "it needs channels R, G and B",
-    "half_b": "it needs channels R, G and B",
-    "alpha": "it needs one channel, or A",
-}
-
-
-_COMPONENTS = {
-    "color": ["RGB"],
-    "albedo": ["RGB"],
-    "estimate": ["RGB"],
-    "normal": ["XYZ", "RGB"],
-    "depth": ["Z"],
-    "motion": ["XYZW", "XYZ", "XY", "UV", "RGB", "RG"],
-    "motion_next": ["XYZ", "XY", "UV", "RGB", "RG"],
-    "variance": ["RGB"],
-    "half_a": ["RGB"],
-    "half_b": ["RGB"],
-    "alpha": ["A"],
-}
-
-
 def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | None:
     """The layer with only the channels of the role; None if it lacks them.
 
@@ -463,7 +433,7 @@ def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | No
     """
     by_component: dict[str, str] = {}
     twice = {component_of(c) for c in layer.channels if by_component.setdefault(component_of(c), c) != c}
-    for components in _COMPONENTS[role]:
+    for components in ROLE_FACTS[role]["components"]:
         if all(c in by_component for c in components):
             if named and twice & set(components):  # R beside r or red
                 raise ExrError(f"{image.path}: layer {layer} has two channels for {min(twice & set(components))}")
@@ -499,18 +469,6 @@ def _tails(image: ExrImage, layer: Layer) -> list[str]:
     return [plain_name(path.rpartition(".")[2]) for path in _paths(image, layer)]
 
 
-# Consequence of a missing role.
-_LACK = {
-    "albedo": "textures are filtered together with the light: blur, about 2 dB",
-    "normal": "edges between surfaces of one color are held by color alone",
-    "depth": "where vectors lead backward only, the nearer of two surfaces is chosen by speed",
-    "motion": "flow is estimated from the picture: slower, and less exact",
-    "variance": "noise is estimated from half buffers where there are two, else from the window",
-    "alpha": "nothing, if the picture has no transparent parts",
-    "estimate": "single frames are denoised by OIDN, or by our own filters",
-}
-
-
 def summarize_layers(layers: Layers) -> str:
     """Return the layers of all roles in one line."""
     words = [f"{role} {getattr(layers, role)}" for role in ROLES if getattr(layers, role) is not None]
@@ -528,10 +486,10 @@ def describe_layers(layers: Layers) -> list[tuple[str, str, str]]:
     rows = []
     for role in ROLES:
         layer = getattr(layers, role)
-        if layer is None and role in ("half_a", "half_b", "motion_next"):
+        if layer is None and "lack" not in ROLE_FACTS[role]:
             continue  # rarely written
         if layer is None:
-            rows.append((role, "missing", _LACK[role]))
+            rows.append((role, "missing", ROLE_FACTS[role]["lack"]))
         else:
             notes = [f"convention: {layers.motion_convention}"] if role == "motion" else []
             note = "; ".join(layers.notes if role == "color" else notes)

@@ -7,7 +7,7 @@ configuration folder, or given with `--profile`. docs/renderers.md explains how 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
@@ -18,25 +18,22 @@ from typing import Any
 from flow.motion import CYCLES, DIRECTIONS, ENCODINGS, UNITS, VERTICAL, MotionConvention
 from hybrid.files.exr import ExrImage
 
-# Roles of layers.
-ROLES = (
-    "color",
-    "albedo",
-    "normal",
-    "depth",
-    "motion",
-    "motion_next",
-    "variance",
-    "half_a",
-    "half_b",
-    "alpha",
-    "estimate",
-)
+# Roles of layers, with what is said of them (`roles.toml`).
+ROLE_FACTS: dict[str, dict[str, Any]] = tomllib.loads((Path(__file__).parent / "roles.toml").read_text("utf-8"))
+ROLES = tuple(ROLE_FACTS)
 _SHIPPED = Path(__file__).parent / "profiles"
 # Names of layers if no profile is found, and after a profile's own names.
 COMMON = "common"
 _PARTS = tuple(part.name for part in fields(MotionConvention))
 _MEANINGS = ("mean", "sample")
+# Tables of a profile, with their keys.
+_KEYS: dict[str, tuple[str, ...]] = {
+    "found": ("attributes", "layers"),
+    "layers": ("affixes", *ROLES),
+    "files": ROLES,
+    "motion": ("assumed", *_PARTS),
+    "variance": ("of", "samples"),
+}
 
 
 @dataclass(frozen=True)
@@ -138,54 +135,40 @@ def read_profile(path: str | Path) -> Profile:
 
 
 def _profile(stem: str, table: dict[str, Any]) -> Profile:
-    name = table.pop("name", stem)
-    found, layers, files, motion, variance = (
-        _table(table, key) for key in ("found", "layers", "files", "motion", "variance")
-    )
-    _refuse_rest(table, "profile", ("name", "found", "layers", "files", "motion", "variance"))
-    attributes, known = _texts(found, "attributes"), _texts(found, "layers")
-    _refuse_rest(found, "[found]", ("attributes", "layers"))
-    affixes = _texts(layers, "affixes")
-    _refuse_rest(dict.fromkeys(set(layers) - set(ROLES)), "[layers]", ("affixes", *ROLES))
-    _refuse_rest(dict.fromkeys(set(files) - set(ROLES)), "[files]", ROLES)
-    assumed = _table(motion, "assumed")
-    for part in (motion, assumed):
-        _refuse_rest(dict.fromkeys(set(part) - set(_PARTS)), "[motion]", ("assumed", *_PARTS))
-    of, samples = variance.pop("of", None), variance.pop("samples", None)
-    _refuse_rest(variance, "[variance]", ("of", "samples"))
-    if of is not None and of not in _MEANINGS:
+    parts: dict[str, dict[str, Any]] = {key: table.get(key, {}) for key in _KEYS}
+    parts["motion.assumed"] = assumed = parts["motion"].pop("assumed", {}) if isinstance(parts["motion"], dict) else {}
+    _refuse_others(table, "profile", ("name", *_KEYS))
+    for key, part in parts.items():
+        if not isinstance(part, dict):
+            raise ValueError(f"{key} is {part!r}, expected a table, [{key}]")
+        _refuse_others(part, f"[{key}]", _KEYS[key.partition(".")[0]])
+    found, layers, motion, variance = (parts[key] for key in ("found", "layers", "motion", "variance"))
+    if (of := variance.get("of")) not in (None, *_MEANINGS):
         raise ValueError(f"variance is of {of!r}, expected one of {', '.join(_MEANINGS)}")
     MotionConvention(**{**assumed, **motion})  # refuses invalid conventions
     return Profile(
-        name=str(name),
-        attributes=attributes,
-        known_layers=known,
-        layers={role: _texts(layers, role) for role in list(layers)},
-        affixes=affixes,
-        files={role: str(pattern) for role, pattern in files.items()},
+        name=str(table.get("name", stem)),
+        attributes=_texts(found, "attributes"),
+        known_layers=_texts(found, "layers"),
+        layers={role: _texts(layers, role) for role in layers if role in ROLES},
+        affixes=_texts(layers, "affixes"),
+        files={role: str(pattern) for role, pattern in parts["files"].items()},
         motion=motion,
         motion_assumed=assumed,
         variance=of,
-        samples=None if samples is None else str(samples),
+        samples=str(variance["samples"]) if "samples" in variance else None,
     )
 
 
-def _table(table: dict[str, Any], key: str) -> dict[str, Any]:
-    value = table.pop(key, {})
-    if not isinstance(value, dict):
-        raise ValueError(f"{key} is {value!r}, expected a table, [{key}]")
-    return value
-
-
 def _texts(table: dict[str, Any], key: str) -> tuple[str, ...]:
-    value = table.pop(key, [])
+    value = table.get(key, [])
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         raise ValueError(f"{key} is {value!r}, expected a list of names")
     return tuple(value)
 
 
-def _refuse_rest(table: Mapping[str, Any], where: str, known: Iterable[str]) -> None:
-    for key in sorted(table):
+def _refuse_others(table: Mapping[str, Any], where: str, known: Sequence[str]) -> None:
+    for key in sorted(table.keys() - {*known}):
         raise ValueError(f"{where} has {key!r}, expected some of {', '.join(known)}")
 
 
