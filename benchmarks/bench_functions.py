@@ -1,16 +1,17 @@
-"""Measure what the functions of `flow`, `nlm` and `network` cost on synthetic frames; JSON on standard output.
+"""Measure what functions of `flow`, `nlm` and `network`, and OIDN, cost on synthetic frames; JSON on standard output.
 
     OMP_WAIT_POLICY=PASSIVE python benchmarks/bench_functions.py --only flow nlm --size 1920x1080 --threads 1
 
 CPU seconds of the process, after a warm-up: median, least and greatest of the repeats. Beside `nlm` stand functions of
-OpenCV and scikit-image. Parts of networks are measured in inference at the size of its tiles, and in training at the
-size of its crops.
+OpenCV and scikit-image, beside OIDN its networks in torch, in float32 and bfloat16. Parts of networks are measured in
+inference at the size of its tiles, and in training at the size of its crops.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -37,7 +38,10 @@ from flow.motion import CYCLES, compose_flow, forward_backward_error, invert_flo
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
+from hybrid.oidn import denoise_oidn
 from hybrid.runtime.allocator import reuse_freed_memory
+from network.bfloat16 import round_unet
+from network.oidn_weights import load_oidn
 from network.paper.blocks import RobustAverage
 from network.paper.kernels import apply_kernels, predict_kernel, threshold_kernel
 from network.paper.models import for_inference as prepare_kernels
@@ -48,6 +52,7 @@ from network.training.clips import Sample
 from network.training.config import TrainConfig
 from network.training.loop import batch_loss, predict
 from network.training.losses import relmse
+from network.unet import denoise_color
 from nlm.average import average, reject_outliers, robust_average
 from nlm.gate import color_gate
 from nlm.guided import guided_filter
@@ -56,6 +61,13 @@ from nlm.variance import prefilter_guide, variance_from_window
 
 PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch")
 FRAMES, FEATURES = 5, 7
+#: Networks of OIDN, with its quality, and whether guides are declared clean.
+OIDN = {
+    "rt_hdr_alb_nrm_small": ("fast", False),
+    "rt_hdr_alb_nrm": ("high", False),
+    "rt_hdr_calb_cnrm": ("balanced", True),
+    "rt_hdr_calb_cnrm_large": ("high", True),
+}
 Calls = Iterator[tuple[str, Callable[[], object]]]
 
 
@@ -126,6 +138,18 @@ def nlm_calls(options: argparse.Namespace) -> Calls:
     yield "skimage.denoise_nl_means fast 7/10", partial(denoise_nl_means, noisy, **settings)
 
 
+def oidn_calls(options: argparse.Namespace) -> Calls:
+    """Yield OIDN's modes, by itself and by its networks in torch."""
+    rng, shape = np.random.default_rng(0), (*options.shape, 3)
+    images = [rng.random(shape, np.float32) for _ in range(3)]
+    layers = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in images]
+    for name, (quality, clean) in OIDN.items():
+        exact = load_oidn(name)
+        yield f"{name}, OIDN", partial(denoise_oidn, *images, quality=quality, clean=clean)
+        yield f"{name}, float32", partial(denoise_color, exact, *layers, exposure=1.0)
+        yield f"{name}, bfloat16", partial(denoise_color, round_unet(exact), *layers, exposure=1.0)
+
+
 def training(function: Callable[[Tensor], Tensor | tuple[Tensor, ...]], x: Tensor) -> None:
     y = function(x.detach().requires_grad_())
     (y if isinstance(y, Tensor) else y[0]).sum().backward()
@@ -172,13 +196,13 @@ def measure(function: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
 
 
-PARTS = {"flow": flow_calls, "nlm": nlm_calls, "network": network_calls}
+PARTS = {"flow": flow_calls, "nlm": nlm_calls, "oidn": oidn_calls, "network": network_calls}
 
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=[*PARTS])
-    parser.add_argument("--size", default="1920x1080", help="WIDTHxHEIGHT of a frame, for flow and nlm")
+    parser.add_argument("--size", default="1920x1080", help="WIDTHxHEIGHT of a frame, for flow, nlm and oidn")
     parser.add_argument("--tile", type=int, default=256, help="pixels on a side of networks' tiles")
     parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["fast"], help="paper takes a minute")
     parser.add_argument("--threads", type=int, default=1)
@@ -189,6 +213,7 @@ def main(argv: list[str]) -> int:
     facts["commit"] = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
     options.shape = tuple(map(int, options.size.split("x")))[::-1]
     reuse_freed_memory()  # as the commands do
+    os.environ["OIDN_NUM_THREADS"] = str(options.threads)
     cv2.setNumThreads(options.threads)
     torch.set_num_threads(options.threads)
     numba.set_num_threads(min(options.threads, numba.get_num_threads()))

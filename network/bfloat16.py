@@ -21,7 +21,7 @@ def round_unet(unet: OidnUNet) -> OidnUNet:
     rounding errors of the nine taps between two channels cancel; the color that enters the last scale of the decoder
     has its low bits in three further channels with the weights of the color; and the last convolution stays in float32.
     Each network is then 63 to 66 dB from its float32 picture on the bundled shot, with a mean within 0.3 %; with plain
-    casts it is 58 to 59 dB, and up to 1.3 % too dark (`benchmarks/bench_trunk.py`).
+    casts it is 58 to 59 dB, and up to 1.3 % too dark.
     """
     rounded = copy.deepcopy(unet)
     finest = cast(nn.Conv2d, cast(nn.Sequential, rounded.decoder[-1])[0])
