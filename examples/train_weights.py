@@ -26,6 +26,7 @@ from network.robust_unet import start_from_oidn
 #: Hard 6315 is left out: its smoke takes as long as ten others.
 SHOTS = [("random", 5300, 70), ("hard", 6300, 15), ("hard", 6316, 31)]
 RENDER = ["--frames", "1-7", "--size", "128x80", "--spp", "8-24", "--levels", "target=32,a=n"]
+CLIPS = "--target target --tile 0 --first-pass oidn-fast --frames 2-6 --window 7"
 #: Of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
     "fast": ["--window", 5, "--steps", 2500],
@@ -57,22 +58,7 @@ def main() -> int:
         drawn = ["--seed", seed, "--shots", count, "--python", options.blender_python]
         ravg("simulate", kind, "-o", shots, *RENDER, *drawn)
     # Whole frames, of which training takes crops.
-    ravg(
-        "make-clips",
-        *sorted(shots.iterdir()),
-        "-o",
-        clips,
-        "--target",
-        "target",
-        "--tile",
-        0,
-        "--first-pass",
-        "oidn-fast",
-        "--frames",
-        "2-6",
-        "--window",
-        7,
-    )
+    ravg("make-clips", *sorted(shots.iterdir()), "-o", clips, *CLIPS.split())
     for preset, schedule in SCHEDULES.items():
         weights = options.out / f"{preset}.safetensors"
         begun = ["--resume"] if weights.with_name(f"{weights.name}.state").exists() else []

@@ -181,9 +181,7 @@ class _Trials:
         return bool(difference.mean() > CLEARLY * difference.std() / np.sqrt(len(difference)))
 
     def overrules(self, other: MotionConvention, stated: MotionConvention) -> bool:
-        """Whether another convention leaves half of what the stated one does, or that explains half of what this one
-        does.
-        """
+        """Whether another convention leaves half of what the stated one does, which else explains half as much."""
         clearly = self.clearly_better(other, stated) and self.clearly_better(other, None)
         gain, stated_gain = (self.left(None) - self.left(reading) for reading in (other, stated))
         return clearly and (self.left(other) <= OVERRULES * self.left(stated) or stated_gain <= OVERRULES * gain)

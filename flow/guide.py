@@ -21,9 +21,7 @@ def _luminance(image: np.ndarray) -> np.ndarray:
 
 
 def median_luminance(color: np.ndarray) -> float:
-    """Median of the positive luminances of linear radiance (H, W, 3); 1 without any. NaN counts as 0, Inf as very
-    bright.
-    """
+    """Median of the positive luminances of linear radiance (H, W, 3); 1 without any. NaN is 0, Inf very bright."""
     luminance = _luminance(color)
     positive = luminance[luminance > 0]
     return float(np.median(positive)) if positive.size else 1.0

@@ -85,12 +85,10 @@ class MotionConvention:
         """Format in the words of `--motion`, without default values."""
         said = [self.direction, self.unit, f"y-{self.y}"]
         said += [] if self.encoding == "plain" else [self.encoding]
-        said += [f"{name}={getattr(self, name):.6g}" for name in ("scale", "offset") if self._differs(name)]
+        numbers = {"scale": self.scale, "offset": self.offset}
+        said += [f"{f.name}={numbers[f.name]:.6g}" for f in fields(self) if numbers.get(f.name, f.default) != f.default]
         said += ["premultiplied"] if self.premultiplied else []
         return ",".join(said)
-
-    def _differs(self, name: str) -> bool:
-        return any(f.name == name and f.default != getattr(self, name) for f in fields(self))
 
 
 # Blender's Vector: the previous frame is sampled at (x + X, y - Y), the next one at (x - Z, y + W), y pointing down.
@@ -243,11 +241,8 @@ def _compose(
 def _splat(
     flow: np.ndarray, valid: np.ndarray, depth: np.ndarray, nearest: np.ndarray, out: np.ndarray, weight: np.ndarray
 ) -> None:
-    """Splat the reversed vectors: first the nearest depth of each pixel, then the mean of the vectors at about that
-    depth.
-    """
+    """Splat the reversed vectors: first the nearest depth of each pixel, then the mean of vectors at about it."""
     height, width = valid.shape
-    # First the nearest depth that reaches each pixel, then the mean of what lies at about that depth.
     for accumulate in (False, True):
         for y in range(height):
             for x in range(width):

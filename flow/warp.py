@@ -205,7 +205,9 @@ def warp(
         raise ValueError(f"interpolation is {interpolation!r}, expected one of {', '.join(_KERNELS)}")
     if image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"image has shape {image.shape}, expected a non-empty (H, W) or (H, W, C)")
-    _check_rows(flow, image.shape[:2], first_row)
+    (height, width), rows = image.shape[:2], image.shape[0] - first_row
+    if flow.ndim != 3 or flow.shape[1:] != (width, 2) or not 0 < flow.shape[0] <= rows <= height:
+        raise ValueError(f"flow has shape {flow.shape}, expected {(rows, width, 2)}")
     source = np.ascontiguousarray(image, np.float32).reshape(*image.shape[:2], -1)
     shape = flow.shape[:2]
     whole = *shape, *image.shape[2:]
@@ -217,10 +219,3 @@ def warp(
     vectors = np.ascontiguousarray(flow, np.float32)
     run_bands(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
     return result, inside
-
-
-def _check_rows(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> None:
-    """Raise ValueError unless `flow` has the width of a frame of this shape, and rows that the frame has too."""
-    rows = shape[0] - first_row
-    if flow.ndim != 3 or flow.shape[1:] != (shape[1], 2) or not 0 < flow.shape[0] <= rows <= shape[0]:
-        raise ValueError(f"flow has shape {flow.shape}, expected {(rows, shape[1], 2)}")

@@ -370,8 +370,7 @@ def check_paths(
 
 
 def validate_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
-    """Return the views of a shot without layers that make no sense, and the findings; `strict` raises these as
-    ValueError.
+    """Return the views of a shot without layers that make no sense, and the findings; ValueError if `strict`.
 
     Pairs of the shot's frames are read.
     """

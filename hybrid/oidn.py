@@ -35,8 +35,7 @@ def denoise_oidn(
     scale: float | None = None,
     device: str = "cpu",
 ) -> NDArray[np.float32]:
-    """Denoise one frame (H, W, 3) with OIDN's ray-tracing filter in HDR mode (Áfra 2025,
-    https://www.openimagedenoise.org).
+    """Denoise one frame (H, W, 3) with OIDN's ray-tracing filter in HDR mode (https://www.openimagedenoise.org).
 
     The color is linear radiance, finite; OIDN counts negative values as 0. Albedo is in [0, 1], normals in [−1, 1], in
     any fixed space; OIDN takes these only beside an albedo.

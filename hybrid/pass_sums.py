@@ -37,8 +37,7 @@ def sample_rows(frame: Frame) -> Frame:
 
 
 def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
-    """Classify the AOVs of a shot by some of its frames, from `sample_rows`; with words on how each is denoised, and
-    why.
+    """Classify the AOVs of a shot by some frames, from `sample_rows`; with words on how each is denoised, and why.
 
     Parts are found by adding up noisy pixels (`nlm.parts.find_sums`), not by names: sets of AOVs that add up to the
     beauty, and sets of others that add up to one of those. If no set is complete, an AOV is a part if it is nowhere

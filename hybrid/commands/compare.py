@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 FRAMES = "frames"  # folder next to the page
 
 
+@opt.with_fields(opt.ReadOptions, title="Input")
 def compare(
     shot: Annotated[
         str | None, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")
@@ -98,11 +99,7 @@ def compare(
     keep_frames: Annotated[
         bool, opt.of_output("also write the frames of each method as EXR, next to the page", "--keep-frames")
     ] = False,
-    frames: opt.FramesOption = None,
-    layer: opt.LayerOption = None,
-    profile: opt.ProfileOption = None,
-    motion: opt.MotionOption = None,
-    strict: opt.StrictOption = False,
+    **how: Any,
 ) -> None:
     """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.
 
@@ -128,14 +125,14 @@ def compare(
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
     if ladder and not level:
         raise typer.BadParameter("--ladder runs the methods on levels, expected --level with it")
-    read = ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion)
+    read, strict = ShotInput(shot=shot, **how), how["strict"]
     alike, findings = validate_renders({"shot": read.open()}, strict=strict)
     noisy = alike["shot"]
-    clean = [_open_matching(spec, noisy, frames) for spec in reference]
+    clean = [_open_matching(spec, noisy, read.frames) for spec in reference]
     levels = list(_open_levels(level, read))
     if ladder:
         levels = [(validate_renders({"level": found}, strict=strict)[0]["level"], count) for found, count in levels]
-    chosen = _methods(methods, external, _seconds(external_seconds), noisy, frames)
+    chosen = _methods(methods, external, _seconds(external_seconds), noisy, read.frames)
     plan = cache(partial(run_in_process, plan_shot, noisy))
     if sweep:
         LOG.info("plan the shot")

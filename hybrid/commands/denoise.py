@@ -72,16 +72,11 @@ class Request:
         return Paths({"profile": self.shot.profile}, writes)
 
 
-@opt.with_fields(DenoiseOptions, title="Method")
+@opt.with_fields(opt.ReadOptions, DenoiseOptions, title="Method")
 def denoise(
     context: typer.Context,
     shot: opt.ShotArgument,
     output: opt.OutputOption,
-    frames: opt.FramesOption = None,
-    layer: opt.LayerOption = None,
-    profile: opt.ProfileOption = None,
-    motion: opt.MotionOption = None,
-    strict: opt.StrictOption = False,
     aov: opt.AovOption = None,
     preview: opt.PreviewOption = None,
     fps: opt.RateOption = 24,
@@ -108,17 +103,18 @@ def denoise(
 
     ravg denoise "shot.####.exr" -o out --aov all --aov-sum beauty
     """
+    how = opt.take(opt.ReadOptions, settings)
     with opt.usage():
         options = DenoiseOptions(
             **settings,
             stages=split_stages(stages),
             no_stages=split_stages(no_stages),
             device=device,
-            strict=strict,
+            strict=how["strict"],
         )
         if scheduler is not None and (options.budget is not None or options.breakdown is not None):
             raise ValueError("--budget and --breakdown are of one machine, expected no --scheduler with them")
-    read = ShotInput(shot, frames, tuple(layer or ()), tuple(aov or ()), profile, motion, max_pixels)
+    read = ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **how)
     request = Request(read, output, options, preview, contact_sheet, fps)
     if options.method == "network":
         import_neural()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -22,17 +22,14 @@ from hybrid.plan import STAGES, Decision, Plan, Rules
 from hybrid.stream import plan_shot
 
 
+@opt.with_fields(opt.ReadOptions, title="Input")
 def inspect(
     shot: opt.ShotArgument,
-    frames: opt.FramesOption = None,
-    layer: opt.LayerOption = None,
-    profile: opt.ProfileOption = None,
-    motion: opt.MotionOption = None,
-    strict: opt.StrictOption = False,
     stages: opt.OnOption = None,
     no_stages: opt.OffOption = None,
     as_json: Annotated[bool, opt.of_output("print one JSON object", "--json")] = False,
     max_pixels: opt.PixelsOption = None,
+    **how: Any,
 ) -> None:
     """Check a shot before denoising: its layers, motion vectors, and the stages that it needs.
 
@@ -42,7 +39,7 @@ def inspect(
 
     ravg inspect "shot.####.exr" --json > shot.json
     """
-    read = ShotInput(shot, frames, tuple(layer or ()), profile=profile, motion=motion, max_pixels=max_pixels)
+    read = ShotInput(shot=shot, max_pixels=max_pixels, **how)
     with opt.usage():
         rules = Rules(frozenset(split_stages(stages)), frozenset(split_stages(no_stages)))
     views = views_of(shot)
@@ -50,20 +47,20 @@ def inspect(
     for view in views:
         if view:
             LOG.info(f"view {view}")
-        _inspect(in_view(read, view), rules, strict=strict, as_json=as_json)
+        _inspect(in_view(read, view), rules, as_json=as_json)
 
 
-def _inspect(read: ShotInput, rules: Rules, *, strict: bool, as_json: bool) -> None:
+def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
     """Print layers, findings and plan of a shot."""
     shot = read.open()
-    views, report = validate_views(shot, strict=strict)
+    views, report = validate_views(shot, strict=read.strict)
     log_findings(report, views)
     height, width = shot.shape
     progress = Progress("measuring frames", len(shot) * len(views))
     plans, findings = [], list(report.findings)
     for view in views:
         plans.append(plan_shot(view, rules, advance=progress.advance))
-        findings += log_cuts(plans[-1], findings, strict=strict)
+        findings += log_cuts(plans[-1], findings, strict=read.strict)
     layers = [view.layers(view.numbers[0]) for view in views]
     if as_json:
         first, *others = (_as_json(found, plan) for found, plan in zip(layers, plans, strict=True))

@@ -16,13 +16,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hybrid.commands.options import panel
+from hybrid.commands.options import take, with_fields
 from hybrid.runtime.streams import open_standard_streams
 
 if TYPE_CHECKING:
@@ -33,55 +34,48 @@ LOG = logging.getLogger("ravg")
 LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
-message_option = panel("Logging")
 LABEL_WIDTH = 12
 RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
 
 
+@dataclass(frozen=True)
+class LogOptions:
+    """Options of the log that every command has."""
+
+    log_format: Annotated[
+        LogFormat,
+        "text; json: an object per line; openjd: text that workers of Open Job Description read",
+        {"envvar": "RAVG_LOG_FORMAT"},
+    ] = "text"
+    log_file: Annotated[
+        Path | None, "also append messages to this file", {"envvar": "RAVG_LOG_FILE", "metavar": "FILE"}
+    ] = None
+    quiet: Annotated[bool, "only warnings and errors", {"names": ("-q", "--quiet")}] = False
+    verbose: Annotated[bool, "also details: layers, plan, cost of each stage", {"names": ("-v", "--verbose")}] = False
+
+
 def logged(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of verbosity, format and file of messages to a command."""
-
+    """Add `LogOptions` to a command."""
     signature = inspect.signature(command, eval_str=True)
+    has_context = "context" in signature.parameters
 
+    @with_fields(LogOptions, title="Logging")
     @wraps(command)
-    def run(
-        *,
-        context: typer.Context,
-        log_format: LogFormat,
-        log_file: Path | None,
-        quiet: bool,
-        verbose: bool,
-        **arguments: Any,
-    ) -> None:
-        if quiet and verbose:
+    def run(context: typer.Context, **arguments: Any) -> None:
+        options = LogOptions(**take(LogOptions, arguments))
+        if options.quiet and options.verbose:
             raise typer.BadParameter("expected --quiet or --verbose, got both")
-        start_log(log_format, log_file, quiet=quiet, verbose=verbose)
+        start_log(options.log_format, options.log_file, quiet=options.quiet, verbose=options.verbose)
         for line in context.meta.get(RENAMED, ()):
             LOG.warning(line)
-        command(**arguments, **({"context": context} if "context" in signature.parameters else {}))
+        command(**arguments, **({"context": context} if has_context else {}))
 
-    form = message_option(
-        "text; json: an object per line; openjd: text that workers of Open Job Description read",
-        "--log-format",
-        envvar="RAVG_LOG_FORMAT",
-    )
-    file = message_option("also append messages to this file", "--log-file", envvar="RAVG_LOG_FILE", metavar="FILE")
-    options = {
-        "log_format": (Annotated[LogFormat, form], "text"),
-        "log_file": (Annotated[Path | None, file], None),
-        "quiet": (Annotated[bool, message_option("only warnings and errors", "-q", "--quiet")], False),
-        "verbose": (
-            Annotated[bool, message_option("also details: layers, plan, cost of each stage", "-v", "--verbose")],
-            False,
-        ),
-    }
-    parameter, keyword = inspect.Parameter, inspect.Parameter.KEYWORD_ONLY
-    added = [parameter(name, keyword, annotation=kind, default=value) for name, (kind, value) in options.items()]
-    if "context" not in signature.parameters:
-        added.append(parameter("context", keyword, annotation=typer.Context))
-    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
+    if not has_context:
+        added = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        signature = inspect.signature(run)
+        run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
     return run
 
 

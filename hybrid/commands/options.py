@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
@@ -32,7 +32,8 @@ of_output, of_resources = panel("Output"), panel("Resources")
 def with_fields(*configs: type, title: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command an option for each field of dataclasses that has a help text; it gets their values by keyword.
 
-    Such a field is ``Annotated[type, help, {…}]``: the panel if not `title`, names if not the field's, other settings.
+    Such a field is ``Annotated[type, help, {…}]``: the panel if not `title`, names if not the field's, other settings;
+    or it has an option as its type.
     """
 
     def add(command: Callable[..., None]) -> Callable[..., None]:
@@ -44,16 +45,23 @@ def with_fields(*configs: type, title: str) -> Callable[[Callable[..., None]], C
                 text, *rest = getattr(hints[item.name], "__metadata__", (None,))
                 if text is None:
                     continue
-                settings = dict(*rest)
-                names = settings.pop("names", (f"--{item.name.replace('_', '-')}",))
-                option = panel(settings.pop("panel", title))(text, *names, show_default=item.default != "", **settings)
-                annotation = Annotated[hints[item.name].__origin__, option]  # type: ignore[valid-type]
+                annotation = hints[item.name]
+                if isinstance(text, str):
+                    settings = {"show_default": item.default != "", **dict(*rest)}
+                    names = settings.pop("names", (f"--{item.name.replace('_', '-')}",))
+                    option = panel(settings.pop("panel", title))(text, *names, **settings)
+                    annotation = Annotated[annotation.__origin__, option]
                 kind = inspect.Parameter.KEYWORD_ONLY
                 parameters.append(inspect.Parameter(item.name, kind, default=item.default, annotation=annotation))
         command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         return command
 
     return add
+
+
+def take(config: type, settings: dict[str, Any]) -> dict[str, Any]:
+    """Remove the values of a dataclass's fields from a command's settings, and return them."""
+    return {item.name: settings.pop(item.name) for item in fields(config) if item.name in settings}
 
 
 # Stages in the order of `hybrid.plan.STAGES`, which this module cannot import: a test compares them.
@@ -136,6 +144,20 @@ StrictOption = Annotated[
     bool,
     of_input("stop at implausible layers and at cuts (default: warn, and leave such layers out)", "--strict"),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """The options that say how a shot is read."""
+
+    frames: FramesOption = None
+    layer: LayerOption = None
+    profile: ProfileOption = None
+    motion: MotionOption = None
+    strict: StrictOption = False
+
+
+AS_IT_IS = ReadOptions()
 PreviewOption = Annotated[
     Path | None,
     of_output("noisy against denoised: a .png of the middle frame, or a .mp4 or .webp of all frames", metavar="FILE"),

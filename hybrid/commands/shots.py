@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import typer
 
 from hybrid.commands.log import LOG, printable
-from hybrid.commands.options import usage
+from hybrid.commands.options import ReadOptions, usage
 from hybrid.files.exr import MAX_PIXELS
 from hybrid.files.profile import ROLES, Profile, open_profile, parse_motion
 from hybrid.files.sequences import find_views, name_view, parse_frames
@@ -39,16 +39,12 @@ def import_neural() -> ModuleType:
     return neural
 
 
-@dataclass(frozen=True)
-class ShotInput:
+@dataclass(frozen=True, kw_only=True)
+class ShotInput(ReadOptions):
     """The options that say which shot is read, and how; bad usage raises BadParameter before a file is opened."""
 
     shot: str
-    frames: str | None = None
-    layer: Sequence[str] = ()
     aovs: Sequence[str] = ()
-    profile: str | None = None
-    motion: str | None = None
     max_pixels: int | None = None
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ import typer
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import of_input, of_method, of_output, of_resources, usage, with_fields
-from hybrid.simulate.run import parse_center, parse_numbers, parse_size, read_meta, samples_left, shots_of
+from hybrid.simulate.run import parse_center, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
 
@@ -73,7 +73,7 @@ def simulate(
             frames=tuple(parse_frames(frames)),
             size=parse_size(size, "size"),
             levels=parse_levels(levels, parse_samples(spp, seed)),
-            reference_frames=parse_numbers(reference_frames) if reference_frames else None,
+            reference_frames=tuple(parse_frames(reference_frames)) if reference_frames else None,
             film=parse_size(film, "film") if film else None,
             center=parse_center(center) if center else None,
             **fields,

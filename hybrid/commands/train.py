@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -15,7 +14,6 @@ from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.comparison.samples import samples_of
-from hybrid.files.profile import Profile
 from hybrid.files.replace import check_outputs
 from hybrid.files.shots import Shot, open_shot
 from hybrid.plan import Context
@@ -37,15 +35,7 @@ class Levels(NamedTuple):
         return next(iter(self.shots.values()))
 
 
-def open_levels(
-    spec: str,
-    samples: dict[str, float] | None = None,
-    *,
-    frames: str | None = None,
-    layers: dict[str, str] | None = None,
-    profile: Profile | None = None,
-    motion: str | None = None,
-) -> Levels:
+def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.ReadOptions = opt.AS_IT_IS) -> Levels:
     """Find the noise levels of a shot.
 
     `spec` is a folder of one shot, with ``LEVEL.####.exr`` for each independent render of it (names that begin with
@@ -53,7 +43,7 @@ def open_levels(
     default all levels, as the headers of Cycles have them. Raises FileNotFoundError if there is no such folder,
     sequence or level, and ValueError if there are several levels and no samples of one of them.
     """
-    path = Path(spec)
+    path, roles, profile = Path(spec), parse_layers(read.layer), parse_input(read.profile, read.motion)
     if path.is_dir():
         found = sorted({item.name.partition(".")[0] for item in path.glob("*.exr") if not item.name.startswith(".")})
         names = [name for name in found if not name.startswith("reference")] if samples is None else list(samples)
@@ -65,7 +55,7 @@ def open_levels(
         path = path.parent
         specs = {Path(spec).name.partition(".")[0]: spec}
     levels = {
-        name: open_shot(item, frames=frames, layers=layers or {}, profile=profile, motion=motion, keep=1)
+        name: open_shot(item, frames=read.frames, layers=roles, profile=profile, motion=read.motion, keep=1)
         for name, item in specs.items()
     }
     counts = []
@@ -77,6 +67,7 @@ def open_levels(
     return Levels(path.resolve().name, levels, counts)
 
 
+@opt.with_fields(opt.ReadOptions, title="Input")
 def make_clips(
     context: typer.Context,
     shots: Annotated[
@@ -104,12 +95,8 @@ def make_clips(
         ),
     ] = None,
     seed: Annotated[int, opt.of_method("seed of the random positions of clips")] = 0,
-    frames: opt.FramesOption = None,
-    layer: opt.LayerOption = None,
-    profile: opt.ProfileOption = None,
-    motion: opt.MotionOption = None,
-    strict: opt.StrictOption = False,
     scheduler: SchedulerOption = None,
+    **how: Any,
 ) -> None:
     """Make training clips of shots at several noise levels.
 
@@ -131,8 +118,8 @@ def make_clips(
     neural = import_neural()
     with opt.usage():
         samples = None if levels is None else parse_samples(levels)
-    roles, chosen = parse_layers(layer), parse_input(profile, motion)
-    opened = [open_levels(spec, samples, frames=frames, layers=roles, profile=chosen, motion=motion) for spec in shots]
+    read = opt.ReadOptions(**how)
+    opened = [open_levels(spec, samples, read) for spec in shots]
     _check_levels(opened, target)
     if scheduler is not None:
         chunks = {
@@ -148,10 +135,10 @@ def make_clips(
         if any(output.glob(f"{glob.escape(each.name)}.[0-9][0-9][0-9][0-9].safetensors")):
             bar.advance(len(each.first), f"{each.name} has clips already")
             continue
-        inputs, _ = validate_renders(each.shots, strict=strict)
+        inputs, _ = validate_renders(each.shots, strict=read.strict)
         render = None if target is None else inputs.pop(target)
         plan = plan_shot(next(iter(inputs.values())), context=Context(True, window // 2))
-        log_cuts(plan, (), strict=strict, name=each.name if len(opened) > 1 else "")
+        log_cuts(plan, (), strict=read.strict, name=each.name if len(opened) > 1 else "")
         clean = each.first.path(each.first.numbers[0]).with_name("reference.####.exr")
         source = neural.ClipSource(
             each.name,
@@ -236,8 +223,8 @@ def train(
         known = ", ".join(neural.TRAINING_PRESETS)
         raise typer.BadParameter(f"--preset is {preset!r}, expected one of {known}")
     with opt.usage():
-        of_sampler = {item.name: settings.pop(item.name) for item in fields(SamplerConfig) if item.name in settings}
-        config = TrainConfig(**settings, device=device, sampler=SamplerConfig(**of_sampler))
+        sampler = SamplerConfig(**opt.take(SamplerConfig, settings))
+        config = TrainConfig(**settings, device=device, sampler=sampler)
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
     read += [
         (what, Path(path)) for what, path in (("init", init), ("vgg", config.vgg)) if path and Path(path).is_file()

@@ -234,8 +234,7 @@ def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list
 def find_static_pixels(
     store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
 ) -> NDArray[np.bool_]:
-    """Find pixels (H, W) without motion and without a change of the reference's light, from the first frame to the
-    last.
+    """Find pixels (H, W) without motion and without a change of the reference's light in any frame.
 
     Unless all neighbouring frames have a flow (`store_flows`), no pixel counts as static.
     """

@@ -178,8 +178,7 @@ def aligned_robust_average(aligned: AlignedWindow) -> Array:
 
 
 def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Array]:
-    """Map (H, W), in [0, 1], the confidence in the neighbours of a window, and their contribution to a denoiser's
-    result.
+    """Map (H, W), in [0, 1], the confidence in the neighbours of a window, and their contribution to a result.
 
     "Confidence" is the mean over the neighbours; "Temporal contribution" the fraction of the result that comes from the
     neighbours: the relative change of the result for a relative change of the neighbours' light. For a

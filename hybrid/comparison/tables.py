@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -179,10 +178,6 @@ def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
 
 
 def markdown_rows(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows of cells as Markdown; a table's second row is its rule."""
-    return "".join(f"| {' | '.join(_markdown_cell(c) for c in row)} |\n" for row in rows)
-
-
-def _markdown_cell(text: str) -> str:
-    """Text without line breaks, characters with a meaning in Markdown escaped."""
-    return re.sub(r"\s+", " ", text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+    """Return rows of cells as Markdown, without line breaks, escaped; a table's second row is its rule."""
+    escapes = str.maketrans({"\\": "\\\\", "|": "\\|", "<": "&lt;"})
+    return "".join(f"| {' | '.join(' '.join(c.split()).translate(escapes) for c in row)} |\n" for row in rows)

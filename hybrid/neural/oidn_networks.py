@@ -90,9 +90,7 @@ def bundled_preset(quality: Quality) -> str:
 def denoise_bundled(
     color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
-    """Denoise one frame with the backbone of a preset, which needs only torch; the quality chooses the
-    `bundled_preset`.
-    """
+    """Denoise one frame with the backbone of the `bundled_preset` of a quality, which needs only torch."""
     # Missing guides are 0.5 to a backbone, as in `network.robust_unet.pack_inputs`; a normal of 0 is 0.5 to it.
     albedo = np.full_like(color, 0.5) if albedo is None else albedo
     normal = np.zeros_like(color) if normal is None else normal

@@ -47,23 +47,9 @@ if sys.platform == "win32":
         )
 
     _KERNEL.CreateFileW.restype = wintypes.HANDLE
-    _KERNEL.CreateFileW.argtypes = (
-        wintypes.LPCWSTR,
-        wintypes.DWORD,
-        wintypes.DWORD,
-        ctypes.c_void_p,
-        wintypes.DWORD,
-        wintypes.DWORD,
-        wintypes.HANDLE,
-    )
-    _KERNEL.LockFileEx.argtypes = (
-        wintypes.HANDLE,
-        wintypes.DWORD,
-        wintypes.DWORD,
-        wintypes.DWORD,
-        wintypes.DWORD,
-        ctypes.POINTER(_Overlapped),
-    )
+    _DWORD = wintypes.DWORD
+    _KERNEL.CreateFileW.argtypes = (wintypes.LPCWSTR, _DWORD, _DWORD, ctypes.c_void_p, _DWORD, _DWORD, wintypes.HANDLE)
+    _KERNEL.LockFileEx.argtypes = (wintypes.HANDLE, _DWORD, _DWORD, _DWORD, _DWORD, ctypes.POINTER(_Overlapped))
 
     # Constants of the Windows API.
     _GENERIC_READ_WRITE = 0xC0000000

@@ -223,10 +223,3 @@ def parse_center(text: str) -> tuple[float, float]:
     if match is None or max(where := (float(match[1]), float(match[2]))) > 1:
         raise ValueError(f"center: got {text!r}, expected X,Y, both from 0 to 1")
     return where
-
-
-def parse_numbers(text: str) -> tuple[int, ...]:
-    """Parse frame numbers such as `1,4,7`."""
-    if re.fullmatch(r"\d+(,\d+)*", text) is None:
-        raise ValueError(f"reference frames: got {text!r}, expected numbers with commas between")
-    return tuple(map(int, text.split(",")))

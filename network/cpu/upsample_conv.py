@@ -44,9 +44,7 @@ def can_upsample(*layers: Tensor) -> bool:
 
 
 def convolve_upsampled(x: Tensor, skip: Tensor, taps: UpsampleTaps, bias: Tensor) -> Tensor:
-    """Upsample ``(N, C, H, W)``, concatenate the skip ``(N, D, 2·H, 2·W)``, convolve, apply a ReLU: ``(N, O, 2·H,
-    2·W)``.
-    """
+    """Upsample ``(N, C, H, W)``, concatenate the skip ``(N, D, 2·H, 2·W)``, convolve to O channels, apply a ReLU."""
     count, channels, (height, width) = len(x), len(bias), x.shape[2:]
     parts = functional.conv2d(x, taps.coarse, padding=1).permute(0, 2, 3, 1).contiguous()
     upsampled = parts.new_empty(count, 2 * height, 2 * width, channels)

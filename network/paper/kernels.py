@@ -35,8 +35,7 @@ def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *
 
 
 def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
-    """Kernel of raw weights on any scale, ``η_t(η_0(w))``: normalised, thresholded, normalised again; float32 or
-    float64.
+    """Kernel of raw weights on any scale, ``η_t(η_0(w))``: normalised, thresholded, normalised; float32 or float64.
 
     Without the first normalisation t would be compared with numbers whose scale the network chooses, and the same t
     would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first normalisation needs only its sum.
@@ -59,8 +58,7 @@ def _at_least_float32(weights: Tensor) -> Tensor:
 
 
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply kernels ``(N, T·K·K, H, W)``, K odd, to their frames ``(N, T, C, H, W)`` of any linear quantity, frame by
-    frame.
+    """Apply kernels ``(N, T·K·K, H, W)``, K odd, each frame's to its frame, ``(N, T, C, H, W)``, any linear quantity.
 
     Returns numerators ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``, and denominators ``(N, T, 1,
     H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)``, both over the taps inside the image, so that dividing renormalises the rest of

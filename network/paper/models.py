@@ -143,8 +143,7 @@ class KernelHead(nn.Module):
             cast(Tensor, self.window.bias).zero_()
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
-        """Predict kernels ``(N, taps, H, W)`` from features ``(T·N, C, H, W)``, time first, and confidence ``(N, T, 1,
-        H, W)``.
+        """Predict kernels ``(N, taps, H, W)``: features ``(T·N, C, H, W)``, time first, confidence ``(N, T, 1, H, W)``.
 
         The threshold is t·K in [0, 1); by default the one that the model was trained with.
         """

@@ -72,31 +72,25 @@ class Clip:
     finite, or there is no target.
     """
 
-    color: Annotated[
-        Tensor, Layout("irradiance", window=True)
-    ]  # aligned, side frames mixed with the centre where not trusted
+    # aligned, side frames mixed with the centre where not trusted
+    color: Annotated[Tensor, Layout("irradiance", window=True)]
     albedo: Annotated[Tensor, Layout("color", window=True)]  # aligned likewise; zeros where the renderer gave none
     normal: Annotated[Tensor, Layout("normal", window=True)]
-    estimate: Annotated[
-        Tensor, Layout("irradiance", window=True)
-    ]  # first passes of the frames, made from these noisy frames
-    residual: Annotated[
-        Tensor, Layout("irradiance", window=True)
-    ]  # noisy frames minus their first passes (`nlm.pooling`)
+    # first passes of the frames, made from these noisy frames
+    estimate: Annotated[Tensor, Layout("irradiance", window=True)]
+    # noisy frames minus their first passes (`nlm.pooling`)
+    residual: Annotated[Tensor, Layout("irradiance", window=True)]
     confidence: Annotated[Tensor, Layout("share", 1, window=True)]  # in [0, 1]
     modulation: Annotated[Tensor, Layout("color")]  # radiance is irradiance times modulation
     clean_albedo: Annotated[Tensor, Layout("color")]  # without noise: for networks that rely on their guides
     clean_normal: Annotated[Tensor, Layout("normal")]
     noisy: Annotated[Tensor, Layout("radiance")]  # as rendered
-    exposure: Annotated[
-        Tensor, Layout("exposure", 0)
-    ]  # of the windows of whole frames, as given to the network when it runs
-    gain: Annotated[
-        Tensor, Layout("gain", 0)
-    ]  # OIDN's exposure of the whole image (`hybrid.alignment.transfer.measure_gain`)
-    to_next: Annotated[
-        Tensor, Layout("motion", 2)
-    ]  # pixels, from each pixel to its place in the next frame; 0 where unknown
+    # of the windows of whole frames, as given to the network when it runs
+    exposure: Annotated[Tensor, Layout("exposure", 0)]
+    # OIDN's exposure of the whole image (`hybrid.alignment.transfer.measure_gain`)
+    gain: Annotated[Tensor, Layout("gain", 0)]
+    # pixels, from each pixel to its place in the next frame; 0 where unknown
+    to_next: Annotated[Tensor, Layout("motion", 2)]
     linked: Annotated[Tensor, Layout("flag", 0)]  # 1 where the next clip is the same place of the next frame, else 0
     pseudo_reference: Annotated[Tensor | None, Layout("radiance")] = None  # estimated from the level's own window
     reference: Annotated[Tensor | None, Layout("radiance")] = None  # clean: the target wherever there is one
@@ -318,9 +312,7 @@ class Clips:
         return Clips(found, self.frames if found else None)
 
     def pairs(self, index: int) -> list[list[tuple[int, str]]]:
-        """Possible targets, (level, kind), of each noise level: the reference and a render beside it, else
-        `noise_pairs`.
-        """
+        """Possible targets, (level, kind), of each level: reference and render beside it, else `noise_pairs`."""
         shard = self._find(index)[0]
         if shard.targets:
             return [[(level, kind) for kind in shard.targets] for level in range(len(shard.samples))]

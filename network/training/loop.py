@@ -87,8 +87,7 @@ def batch_loss(
     loss: losses.ImageLoss,
     run: Callable[..., Any] | None = None,
 ) -> Tensor:
-    """Training loss of a batch: mean of log(1 + the temporal loss of each crop, relative to that of its clip's best
-    input).
+    """Training loss of a batch: mean of log(1 + loss of each crop, relative to that of its clip's best input).
 
     Possible gains differ by orders of magnitude between shots, and the targets' noise adds a floor. Each crop's loss is
     divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the centre's first

@@ -116,8 +116,7 @@ def power_terms(frames: int) -> list[Term]:
 
 
 def asymmetry(prediction: Tensor, target: Tensor, noisy: Tensor, slope: float) -> Tensor:
-    """Weights that punish errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1; c the noisy
-    centre.
+    """Weights of errors on the far side of the target: λ where ``(d − r)(r − c) > 0``, else 1; c the noisy centre.
 
     The greater the slope λ ≥ 1, the more the network prefers noise to lost detail. For clean targets: where the
     target's noise is independent of the input's, that noise decides on which side the prediction is. Vogels et al.

@@ -22,9 +22,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGG19(nn.Module):
-    """Convolutions of VGG19 (arXiv:1409.1556): images to the features of two layers. Parameters have torchvision's
-    names.
-    """
+    """Convolutions of VGG19 (arXiv:1409.1556): images to features of two layers; parameters named as torchvision's."""
 
     mean: Tensor
     std: Tensor

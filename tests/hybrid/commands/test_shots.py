@@ -28,14 +28,14 @@ def test_without_a_place_for_views_there_is_one():
 
 
 def test_views_share_folders_alone_and_only_of_different_files():
-    views, apart, alike = ["left", "right"], ShotInput("shot_%V.####.exr"), ShotInput("%V/shot.####.exr")
+    views, apart, alike = ["left", "right"], ShotInput(shot="shot_%V.####.exr"), ShotInput(shot="%V/shot.####.exr")
     expect_views_apart(views, apart, {"output": "out"}, {"preview": "x_%V.png"})
     expect_views_apart([""], alike, {"output": "out"}, {"preview": "x.png"})
     for shot, folders, files in (
         (alike, {"output": "out"}, {}),
         (apart, {"output": "out.####.exr"}, {}),
         (apart, {}, {"preview": Path("x.png")}),
-        (ShotInput("%V/shot.####.exr", layer=("albedo=a/a.####.exr",)), {}, {}),
+        (ShotInput(shot="%V/shot.####.exr", layer=("albedo=a/a.####.exr",)), {}, {}),
     ):
         with pytest.raises(typer.BadParameter, match="expected %V or %v in it"):
             expect_views_apart(views, shot, folders, files)

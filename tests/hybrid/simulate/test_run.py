@@ -13,7 +13,6 @@ from hybrid.simulate.run import (
     SimulationError,
     check_blender,
     parse_center,
-    parse_numbers,
     parse_size,
     read_meta,
     samples_left,
@@ -96,10 +95,6 @@ def test_seeds_differ_between_frames_levels_and_shots():
 
 def test_frames_and_sizes():
     assert parse_size("320x180", "size") == (320, 180)
-    assert parse_numbers("4") == (4,)
-    assert parse_numbers("1,4,7") == (1, 4, 7)
-    with pytest.raises(ValueError, match="reference frames: got '1-4'"):
-        parse_numbers("1-4")
     with pytest.raises(ValueError, match="film: got '320'"):
         parse_size("320", "film")
     assert parse_center("0.25,1") == (0.25, 1)
