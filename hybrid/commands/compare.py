@@ -23,7 +23,6 @@ from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
 from hybrid.comparison.results import Comparison, Cost, join, read_comparison
 from hybrid.comparison.running import run_in_process
-from hybrid.comparison.samples import samples_of
 from hybrid.comparison.store import FrameStore
 from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 from hybrid.comparison.tables import ladder_rows, ladder_table, markdown_rows, markdown_table, result_table
@@ -141,8 +140,8 @@ def compare(
         title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
         exposure=exposure,
         rounds=rounds,
-        samples=samples or samples_of(noisy),
-        reference_samples=samples_of(clean[0]),
+        samples=samples or noisy.samples,
+        reference_samples=clean[0].samples,
         levels=levels,
         ladder=ladder,
         findings=findings,
@@ -301,6 +300,6 @@ def _open_levels(levels: Sequence[str] | None, read: ShotInput) -> Iterator[tupl
         if not pattern or ("=" in item and stated is None):
             raise typer.BadParameter(f"--level is {item!r}, expected PATTERN=SPP, more than 0 samples per pixel")
         level = replace(read, shot=pattern).open()
-        if (samples := stated or samples_of(level)) is None:
+        if (samples := stated or level.samples) is None:
             raise ValueError(f"{pattern} does not state its samples per pixel, expected --level PATTERN=SPP")
         yield level, samples

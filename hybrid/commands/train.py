@@ -13,7 +13,6 @@ from hybrid.commands import options as opt
 from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
-from hybrid.comparison.samples import samples_of
 from hybrid.files.replace import check_outputs
 from hybrid.files.shots import Shot, open_shot
 from hybrid.plan import Context
@@ -60,7 +59,7 @@ def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.Re
     }
     counts = []
     for name, shot in levels.items():
-        count = (samples or {}).get(name) or samples_of(shot)
+        count = (samples or {}).get(name) or shot.samples
         if count is None and len(levels) > 1:
             raise ValueError(f"levels: no samples in the header of {name}; expected --levels {name}=SAMPLES,…")
         counts.append(float(count or 1))

@@ -9,9 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybrid.files.exr import read_exr
-from hybrid.files.shots import Shot
-
 
 def decibels(error: float | np.floating) -> str:
     """Format a mean squared error as PSNR; ∞ for zero, and for negative unbiased estimates."""
@@ -80,12 +77,3 @@ def fit_floor(levels: Sequence[tuple[float, float]]) -> float:
     matrix = np.stack([1 / n, np.ones_like(n)], axis=1) / e[:, None]
     _, b = np.linalg.lstsq(matrix, np.ones_like(n), rcond=None)[0]
     return float(np.clip(b, 0, 0.99 * e.min()))
-
-
-def samples_of(shot: Shot) -> int | None:
-    """Samples per pixel from the header of the first frame, where Cycles wrote them."""
-    for part in read_exr(shot.path(shot.numbers[0]), pixels=False).parts:
-        for name, value in part.header.items():
-            if name.startswith("cycles.") and name.endswith(".samples") and str(value).isdigit():
-                return int(value)
-    return None

@@ -93,6 +93,11 @@ class Shot:
         """The renderer's names and conventions."""
         return self.reader.headers.profile
 
+    @property
+    def samples(self) -> float | None:
+        """Samples per pixel, from the header of the first frame, where its renderer states them."""
+        return self.reader.first_layers.samples
+
     def has(self, number: int) -> bool:
         """Whether this frame has a file, asked for or not."""
         return number in self.files

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor, samples_of
+from hybrid.comparison.samples import NoiseLaw, fit_floor, reference_floor
 from hybrid.files.shots import open_shot
 from tests.exr_files import write_layers
 from tests.scenes import Scene
@@ -64,7 +64,7 @@ def test_the_floor_is_found_from_levels_or_from_the_references_samples() -> None
 def test_samples_come_from_the_header(tmp_path: Path) -> None:
     path = tmp_path / "a.0001.exr"
     write_layers(path, Scene().clean(0))
-    assert samples_of(open_shot(path)) is None
+    assert open_shot(path).samples is None
     bundled = Path(__file__).parents[3] / "examples" / "shot"
-    assert samples_of(open_shot(bundled / "noisy.####.exr")) == 24
-    assert samples_of(open_shot(bundled / "reference.####.exr")) == 512
+    assert open_shot(bundled / "noisy.####.exr").samples == 24
+    assert open_shot(bundled / "reference.####.exr").samples == 512
