@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.png import encode_srgb, write_png
+from hybrid.files.png import encode_srgb, fit, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import average, replace_nonfinite
 
@@ -108,10 +107,6 @@ def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:
         [encode_srgb(denoised.aovs[name] / exposure) for name in kinds[0]],
         [np.repeat(np.clip(denoised.aovs[name], 0, 1), 3, axis=-1) for name in kinds[1]],
     ]
-    height, width = noisy.shape[:2]
-    shrink = min(1.0, PICTURE_SIDE / max(height, width))
-    size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    columns = max(len(row) for row in rows)
-    white = np.ones((size[1], size[0], 3), np.float32)
-    small = [[cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in row] for row in rows]
+    small = [[fit(image, PICTURE_SIDE) for image in row] for row in rows]
+    columns, white = max(map(len, rows)), np.ones_like(small[0][0])
     return np.vstack([np.hstack(row + [white] * (columns - len(row))) for row in small])

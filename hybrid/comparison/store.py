@@ -5,6 +5,7 @@ The frames of a long shot do not fit into the memory of the comparing process.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,6 @@ from numpy.typing import NDArray
 from hybrid.comparison.metrics import Reference
 
 Array = NDArray[np.float32]
-
-_PLAIN = b"abcdefghijklmnopqrstuvwxyz0123456789-"
 
 REFERENCE = "reference"
 HALVES = ("half a", "half b")  # of a reference that is given in halves
@@ -53,10 +52,6 @@ class FrameStore:
         return self.load(REFERENCE, number, HALVES[0]), self.load(REFERENCE, number, HALVES[1])
 
     def _path(self, owner: str, number: int, title: str) -> Path:
-        return self.folder / _folder_name(owner) / _folder_name(title) / f"{number}.npy"
-
-
-def _folder_name(name: str) -> str:
-    """A folder name that differs for each name, also where case and a final space are ignored (Windows, macOS)."""
-    # The prefix prevents device names of Windows, such as "con".
-    return "_" + "".join(chr(byte) if byte in _PLAIN else f"%{byte:02X}" for byte in name.encode())
+        # Names of methods may hold any character, and differ in case alone.
+        folders = (hashlib.sha256(name.encode()).hexdigest()[:16] for name in (owner, title))
+        return self.folder.joinpath(*folders, f"{number}.npy")

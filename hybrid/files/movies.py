@@ -8,11 +8,11 @@ from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from hybrid.files.png import fit
 from hybrid.files.replace import replace_file
 
 Picture = NDArray[np.uint8]
@@ -38,21 +38,12 @@ def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
     check_movie(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
-    fitted = (_fit(picture, LARGEST[suffix]) for picture in pictures)
+    fitted = (fit(picture, LARGEST[suffix]) for picture in pictures)
     with replace_file(path) as temporary:
         if suffix == ".mp4":
             _write_mp4(temporary, fitted, rate)
         else:
             _write_webp(temporary, fitted, rate)
-
-
-def _fit(picture: Picture, largest: int) -> Picture:
-    height, width = picture.shape[:2]
-    scale = min(1.0, largest / max(height, width))
-    if scale == 1:
-        return picture
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
 def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:

@@ -32,6 +32,14 @@ def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(_CODES[scaled.astype(np.uint16)])
 
 
+def fit(picture: NDArray[Any], side: int) -> NDArray[Any]:
+    """Reduce a picture (H, W, C) to at most `side` pixels of its longer side."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return picture if scale == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
 def write_png(path: Path, picture: NDArray[Any]) -> None:
     """Write a picture (H, W, 3), encoded, in [0, 1], with 8 bits, and make its folder."""
     _, data = cv2.imencode(".png", np.round(picture[..., ::-1] * 255).astype(np.uint8))

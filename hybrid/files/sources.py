@@ -128,7 +128,7 @@ def why_stale(path: Path, attributes: Mapping[str, str], *, whole: bool = True) 
     for name, value in attributes.items():
         if name != MADE_FROM and header.get(name) != value:
             return _difference(name.rpartition("/")[2], header.get(name), value)
-    old, new = _parse(header.get(MADE_FROM)), _parse(attributes.get(MADE_FROM))
+    old, new = parse_object(header.get(MADE_FROM)), parse_object(attributes.get(MADE_FROM))
     for name in sorted((old.keys() | new.keys()) - {"files"}):
         if old.get(name) != new.get(name):
             return _difference(name, old.get(name), new.get(name))
@@ -149,14 +149,14 @@ def sources_in(path: Path) -> dict[str, Any]:
         header = read_exr(path, pixels=False).parts[0].header
     except (OSError, ExrError):
         return {}
-    return _parse(header.get(MADE_FROM))
+    return parse_object(header.get(MADE_FROM))
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
     """Say how a fact differs; for several facts in one JSON string, the first that does."""
     if old is None:
         return f"nothing says of which {name} it is"
-    before, now = _parse(old), _parse(new)
+    before, now = parse_object(old), parse_object(new)
     for key in sorted(before.keys() | now.keys()):
         if before.get(key) != now.get(key):
             return f"{key} was {_short(before.get(key))}, is {_short(now.get(key))}"
@@ -168,8 +168,8 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 
-def _parse(text: object) -> dict[str, Any]:
-    """The object in a JSON string; {} if it holds none."""
+def parse_object(text: object) -> dict[str, Any]:
+    """Return the object in a JSON string; {} if it holds none."""
     try:
         document = json.loads(text) if isinstance(text, str) else text
     except (ValueError, RecursionError):

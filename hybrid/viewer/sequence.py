@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from hybrid.files.layers import Layers, find_colors, find_layers
 from hybrid.files.png import encode_srgb
 from hybrid.files.profile import find_profile
 from hybrid.files.sequences import find_files, parse_frames
-from hybrid.files.sources import MADE_FROM
+from hybrid.files.sources import MADE_FROM, parse_object
 from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
 
@@ -198,21 +196,16 @@ class Sequence:
 
 def _in_words(made: Mapping[str, str]) -> dict[str, str]:
     """The facts of a header that say how a frame was made, by names that are read."""
-    found: dict[str, Any] = dict(made)
-    for key in ("settings", "versions"):  # attributes that hold JSON; others wrote what is none
-        with suppress(ValueError, AttributeError, RecursionError):
-            found[key] = dict(json.loads(made.get(key, "{}")).items())
-    settings = found["settings"] if isinstance(found.get("settings"), dict) else {}
-    versions = found["versions"] if isinstance(found.get("versions"), dict) else {}
+    settings, versions = (parse_object(made.get(key)) for key in ("settings", "versions"))
     device, aovs = settings.get("device"), settings.get("aovs")
     facts = {
         "method": settings.get("method"),
-        "preset": found.get("preset"),
-        "first pass": found.get("first-pass"),
+        "preset": made.get("preset"),
+        "first pass": made.get("first-pass"),
         "passes": None if settings.get("passes") == 1 else settings.get("passes"),
         "light passes": ", ".join(map(str, aovs)) if isinstance(aovs, list) else None,
-        "forced stages": found.get("forced"),
-        "averaged with": found.get("beside"),
+        "forced stages": made.get("forced"),
+        "averaged with": made.get("beside"),
         "computed on": ", ".join(dict.fromkeys(map(str, device.values()))) if isinstance(device, dict) else None,
         "precision": settings.get("precision"),
         "ravg": versions.get("ravg"),
