@@ -37,7 +37,86 @@ if TYPE_CHECKING:
 FRAMES = "frames"  # folder next to the page
 
 
-@opt.with_fields(opt.ReadOptions, title="Input")
+@dataclass(frozen=True)
+class _Report:
+    """Options of what is written and printed."""
+
+    output: Annotated[
+        Path | None, "folder for a page with chart and pictures", {"names": ("-o", "--output"), "metavar": "REPORT"}
+    ] = None
+    clock: Annotated[Literal["wall", "cpu"], "time in chart.png and in the Markdown table"] = "wall"
+    markdown: Annotated[bool, "print the table as Markdown", {"names": ("--markdown",)}] = False
+    with_report: Annotated[
+        list[Path] | None,
+        "folder of a finished comparison of another shot, to include; may be repeated",
+        {"panel": "Input", "metavar": "REPORT"},
+    ] = None
+    fps: opt.RateOption = 24
+    movies: Annotated[
+        bool, "also write a movie of each method in full size, next to the page", {"names": ("--movies",)}
+    ] = False
+    keep_frames: Annotated[
+        bool, "also write the frames of each method as EXR, next to the page", {"names": ("--keep-frames",)}
+    ] = False
+
+    @property
+    def cost(self) -> Cost:
+        """The time that is drawn and printed."""
+        return "seconds_per_megapixel" if self.clock == "wall" else "cpu_seconds_per_megapixel"
+
+    def check(self) -> None:
+        """Raise an error for a report that cannot be written, before any method runs."""
+        if self.output is not None:
+            if missing := [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]:
+                packages = " ".join(f'"{name}"' for name in missing)
+                words = f"expected: pip install {packages} (the table alone needs neither)"
+                raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
+            from hybrid.comparison.report import check_report
+
+            check_report(self.output, [folder / "results.json" for folder in self.with_report or ()])
+        if self.output is None and (self.movies or self.keep_frames):
+            option = "--movies" if self.movies else "--keep-frames"
+            raise typer.BadParameter(f"{option} writes next to a page, expected --output with it")
+        if self.output is not None and self.movies:
+            check_movie(self.output / "movie.mp4")
+        self.read_others()
+
+    def read_others(self) -> list[Comparison]:
+        """Read the finished comparisons."""
+        return [read_comparison(folder / "results.json") for folder in self.with_report or ()]
+
+    def show_joined(self) -> None:
+        """Join finished comparisons, without running a method."""
+        others = self.read_others()
+        joined = Comparison(
+            " + ".join(c.shot for c in others), tuple(join(others)), {}, join_ladders([c.ladder for c in others])
+        )
+        if self.output is not None:
+            self.write(joined, None)
+        self.show(others, joined)
+
+    def write(self, comparison: Comparison, images: ShotImages | None) -> None:
+        """Write the page and its files."""
+        from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
+
+        assert self.output is not None
+        report = Report(comparison, images, self.read_others(), self.cost, self.fps, self.movies)
+        LOG.info(f"wrote {write_report(self.output, report)}")
+
+    def show(self, comparisons: Sequence[Comparison], shown: Comparison) -> None:
+        """Print results and ladder as Markdown, or as tables for a terminal."""
+        rows = ladder_rows(shown.ladder)
+        if self.markdown:
+            typer.echo(markdown_table(comparisons, self.cost), nl=False)
+            if rows:
+                typer.echo("\n" + markdown_rows([rows[0], ["---"] * len(rows[0]), *rows[1:]]), nl=False)
+        else:
+            Console().print(result_table(shown.results))
+            if rows:
+                Console().print("", ladder_table(rows))
+
+
+@opt.with_fields(opt.ReadOptions, _Report, title="Output")
 def compare(
     shot: Annotated[
         str | None, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")
@@ -48,9 +127,6 @@ def compare(
             "the same frames at many samples; given twice: two independent halves, whose noise cancels",
             metavar="PATTERN",
         ),
-    ] = None,
-    output: Annotated[
-        Path | None, opt.of_output("folder for a page with chart and pictures", "-o", "--output", metavar="REPORT")
     ] = None,
     methods: Annotated[
         str | None, opt.of_method("methods to run, with commas between (default: all)", metavar="NAMES")
@@ -82,22 +158,9 @@ def compare(
         bool, opt.of_method("also run the methods on every --level: error against samples", "--ladder")
     ] = False,
     exposure: Annotated[float, opt.of_method("factor on radiance before the tone curve of the measures")] = 1.0,
-    clock: Annotated[Literal["wall", "cpu"], opt.of_output("time in chart.png and in the Markdown table")] = "wall",
-    markdown: Annotated[bool, opt.of_output("print the table as Markdown", "--markdown")] = False,
     name: Annotated[
         str | None, opt.of_output("name of the shot in tables and on the page (default: its folder's name)")
     ] = None,
-    with_report: Annotated[
-        list[Path] | None,
-        opt.of_input("folder of a finished comparison of another shot, to include; may be repeated", metavar="REPORT"),
-    ] = None,
-    fps: opt.RateOption = 24,
-    movies: Annotated[
-        bool, opt.of_output("also write a movie of each method in full size, next to the page", "--movies")
-    ] = False,
-    keep_frames: Annotated[
-        bool, opt.of_output("also write the frames of each method as EXR, next to the page", "--keep-frames")
-    ] = False,
     **how: Any,
 ) -> None:
     """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.
@@ -112,11 +175,10 @@ def compare(
 
     ravg compare --with-report one --with-report two -o both   (join finished reports)
     """
-    cost: Cost = "seconds_per_megapixel" if clock == "wall" else "cpu_seconds_per_megapixel"
-    report = _Report(output, cost, fps, movies, keep_frames, markdown, with_report or [])
+    report = _Report(**opt.take(_Report, how))
     report.check()
     if shot is None or not reference:
-        if shot is not None or reference or not with_report:
+        if shot is not None or reference or not report.with_report:
             raise typer.BadParameter("expected SHOT and --reference, or --with-report with finished comparisons")
         report.show_joined()
         return
@@ -146,21 +208,21 @@ def compare(
         ladder=ladder,
         findings=findings,
         check_shot=lambda: [finding.message for finding in log_cuts(plan(), (), strict=strict)],
-        maps=output is not None,
+        maps=report.output is not None,
     )
     reuse_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         halves = clean[0] if len(clean) == 1 else (clean[0], clean[1])
         comparison = compare_shot(noisy, halves, chosen, options, folder=Path(folder), on_step=_ProgressBar().show)
-        if output is not None:
+        if report.output is not None:
             from hybrid.comparison.report import report_images
 
             LOG.info("page: encode the pictures")
             numbers = [n for n in noisy.numbers if all(n in half.numbers for half in clean)]
             images = report_images(FrameStore(Path(folder)), comparison, numbers, exposure)
             report.write(comparison, images)
-            if keep_frames:
-                _write_frames(output / FRAMES, noisy, images)
+            if report.keep_frames:
+                _write_frames(report.output / FRAMES, noisy, images)
     report.show([comparison, *report.read_others()], comparison)
 
 
@@ -176,70 +238,6 @@ class _ProgressBar:
             self._bar = Progress(what, total, "steps")
         else:
             self._bar.advance(done - self._bar.done, what)
-
-
-@dataclass(frozen=True)
-class _Report:
-    """Options of what is written and printed; `folders` are those of finished comparisons to include."""
-
-    output: Path | None
-    cost: Cost
-    rate: float
-    movies: bool
-    keep_frames: bool
-    markdown: bool
-    folders: Sequence[Path]
-
-    def check(self) -> None:
-        """Raise an error for a report that cannot be written, before any method runs."""
-        if self.output is not None:
-            if missing := [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]:
-                packages = " ".join(f'"{name}"' for name in missing)
-                words = f"expected: pip install {packages} (the table alone needs neither)"
-                raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
-            from hybrid.comparison.report import check_report
-
-            check_report(self.output, [folder / "results.json" for folder in self.folders])
-        if self.output is None and (self.movies or self.keep_frames):
-            option = "--movies" if self.movies else "--keep-frames"
-            raise typer.BadParameter(f"{option} writes next to a page, expected --output with it")
-        if self.output is not None and self.movies:
-            check_movie(self.output / "movie.mp4")
-        self.read_others()
-
-    def read_others(self) -> list[Comparison]:
-        """Read the finished comparisons."""
-        return [read_comparison(folder / "results.json") for folder in self.folders]
-
-    def show_joined(self) -> None:
-        """Join finished comparisons, without running a method."""
-        others = self.read_others()
-        joined = Comparison(
-            " + ".join(c.shot for c in others), tuple(join(others)), {}, join_ladders([c.ladder for c in others])
-        )
-        if self.output is not None:
-            self.write(joined, None)
-        self.show(others, joined)
-
-    def write(self, comparison: Comparison, images: ShotImages | None) -> None:
-        """Write the page and its files."""
-        from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
-
-        assert self.output is not None
-        report = Report(comparison, images, self.read_others(), self.cost, self.rate, self.movies)
-        LOG.info(f"wrote {write_report(self.output, report)}")
-
-    def show(self, comparisons: Sequence[Comparison], shown: Comparison) -> None:
-        """Print results and ladder as Markdown, or as tables for a terminal."""
-        rows = ladder_rows(shown.ladder)
-        if self.markdown:
-            typer.echo(markdown_table(comparisons, self.cost), nl=False)
-            if rows:
-                typer.echo("\n" + markdown_rows([rows[0], ["---"] * len(rows[0]), *rows[1:]]), nl=False)
-        else:
-            Console().print(result_table(shown.results))
-            if rows:
-                Console().print("", ladder_table(rows))
 
 
 def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
