@@ -105,7 +105,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/alignment/prepare.py",
     "hybrid/breakdown.py",
     "hybrid/commands/inspect.py",
-    "hybrid/commands/options.py",
     "hybrid/commands/simulate.py",
     "hybrid/commands/status.py",
     "hybrid/memory.py",
