@@ -183,13 +183,17 @@ def _blend(
     low = np.uint32(32 - 8 * source.itemsize)
     bits = np.zeros((T, len(share)), np.uint32)
     state = bits.view(np.float32)
+    others = np.empty((T, T - 1), np.intp)
+    for t in range(T):
+        for n in range(T - 1):
+            others[t, n] = n + (n >= t)
     for y in range(first, stop):
         for start in range(0, row, len(share)):
             part = slice(start, min(start + len(share), row))
             for t in range(T):
                 _widen(bits[t], source[t, y][part], low)
             for i in order:
-                o = np.array([t for t in range(T) if t != i])
+                o = others[i]
                 if T == 3:
                     _blend_two(state[i], state[o[0]], state[o[1]], share)
                 elif T == 5:
