@@ -140,8 +140,8 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     a that all neighbours share: a² = max(0, E − s² − 1.2 V (1 + 1 / N)). The average of least error of the centre and
     its neighbours weighs these by V / (V + N a²).
 
-    Of ten shots at 8 to 512 samples, one with leaves gains 0.4 to 1.7 dB by it, and none loses 0.1 dB. Without V two
-    lose 0.2 dB, without s² 0.2 to 0.6.
+    Of ten shots at 8 to 512 samples, one of sharp outlines gains 0.4 to 1.7 dB by it, and none loses more than 0.1 dB.
+    Without V two lose 0.2 dB, without s² 0.2 to 0.6.
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
     if noisy.shape != estimates.shape[1:]:

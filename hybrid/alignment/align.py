@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 # alone is steadier by 0.2 dB, and averages moving shadows: 2.7 dB of such a shot.
 FINISHED = 0.1, 0.5
 # The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
-# a shot with leaves loses 1 dB at 128 and 512 samples, and half of it with 3; 1 costs still shots up to 8 dB in time.
+# a shot of sharp outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
 FINISHED_FLOOR, FINISHED_DETAIL = 0.001, 2.0
 # How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
 # 100 differ by 0.05 dB, and by 0.25 dB where shadows move.

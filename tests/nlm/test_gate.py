@@ -134,7 +134,7 @@ def agreement_by_loops(estimates, noisy, confidence, exposure):
 
 
 @pytest.fixture
-def leaves(rng) -> tuple[np.ndarray, np.ndarray]:
+def outlines(rng) -> tuple[np.ndarray, np.ndarray]:
     """Five estimates with errors of their own; the others lack detail that the centre shows. And the noisy centre."""
     centre = rng.uniform(0.2, 0.8, (64, 64, 3)).astype(np.float32)
     estimates = np.stack([cv2.blur(centre, (3, 3))] * 5)
@@ -144,29 +144,29 @@ def leaves(rng) -> tuple[np.ndarray, np.ndarray]:
     return estimates, estimates[2] + rng.normal(0, 0.02, centre.shape).astype(np.float32)
 
 
-def test_agreement_matches_plain_numpy(rng, leaves):
-    estimates, noisy = leaves
+def test_agreement_matches_plain_numpy(rng, outlines):
+    estimates, noisy = outlines
     confidence = rng.uniform(0.2, 1, estimates.shape[:3]).astype(np.float32)
     weight = agreement_weight(estimates, noisy, confidence, 0.5)
     # The sum of squares and the square of the sum cancel to 1e-4 of themselves in float32.
     np.testing.assert_allclose(weight, agreement_by_loops(estimates, noisy, confidence, 0.5), rtol=2e-2, atol=1e-3)
 
 
-def test_what_all_neighbours_lack_is_seen_and_errors_are_not(leaves):
-    estimates, noisy = leaves
+def test_what_all_neighbours_lack_is_seen_and_errors_are_not(outlines):
+    estimates, noisy = outlines
     weight = agreement_weight(estimates, noisy, np.ones(estimates.shape[:3], np.float32), 0.5)
     assert weight[:, :24].max() < 0.05
     assert weight[:, 52:].min() == 1
 
 
-def test_a_difference_below_the_noise_of_the_samples_is_the_centres_own(leaves):
-    estimates, _ = leaves
+def test_a_difference_below_the_noise_of_the_samples_is_the_centres_own(outlines):
+    estimates, _ = outlines
     noisy = estimates[2] + np.where(np.indices(estimates.shape[1:]).sum(0) % 2, 0.4, -0.4).astype(np.float32)
     assert agreement_weight(estimates, noisy, np.ones(estimates.shape[:3], np.float32), 0.5).min() == 1
 
 
-def test_agreement_needs_two_neighbours(leaves):
-    estimates, noisy = leaves
+def test_agreement_needs_two_neighbours(outlines):
+    estimates, noisy = outlines
     confidence = np.zeros(estimates.shape[:3], np.float32)
     confidence[2:4] = 1
     assert agreement_weight(estimates, noisy, confidence, 0.5).min() == 1
@@ -174,8 +174,8 @@ def test_agreement_needs_two_neighbours(leaves):
     assert agreement_weight(estimates, noisy, confidence, 0.5).min() == 1
 
 
-def test_agreement_does_not_depend_on_the_exposure(leaves):
-    estimates, noisy = leaves
+def test_agreement_does_not_depend_on_the_exposure(outlines):
+    estimates, noisy = outlines
     confidence = np.ones(estimates.shape[:3], np.float32)
     np.testing.assert_allclose(
         agreement_weight(estimates * 512, noisy * 512, confidence, 256.0),
@@ -185,9 +185,9 @@ def test_agreement_does_not_depend_on_the_exposure(leaves):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
-def test_a_pixel_that_is_not_finite_changes_only_what_is_near(leaves, value):
+def test_a_pixel_that_is_not_finite_changes_only_what_is_near(outlines, value):
     """A running sum would carry it through the rest of the picture."""
-    estimates, noisy = leaves
+    estimates, noisy = outlines
     confidence = np.ones(estimates.shape[:3], np.float32)
     clean = agreement_weight(estimates, noisy, confidence, 0.5)
     estimates[0, 4, 4] = value
