@@ -25,6 +25,9 @@ Array = NDArray[np.floating]
 Reference = Array | tuple[Array, Array]
 
 EPSILON = 1e-2  # prevents division by zero at black; assumes radiance around 1 after the exposure
+# A half of more than ten times the other is a firefly: the bias is a second-order term of little noise, and would put
+# such a pixel's whole light into the errors of 200 pixels around it.
+BIAS_RATIO = 10.0
 BIAS_SIGMA = 2.0  # pixels: deviation of the Gaussian that averages the bias of noisy halves
 LEVEL = 0.95  # coverage of bootstrap intervals
 RESAMPLES = 2000
@@ -211,7 +214,8 @@ def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[ND
 
     T is concave: halves with noise of variance v give tone-mapped images that are T'' v / 2 too dark, which would
     favor dark images. The curve of the halves' mean has half of that bias, so twice the difference is all of it
-    (Quenouille 1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over `BIAS_SIGMA` pixels against variance.
+    (Quenouille 1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over `BIAS_SIGMA` pixels against variance,
+    without pixels whose halves differ by more than `BIAS_RATIO`.
     """
     x, a, b = _checked(image, reference)
     tone = tone_map(x, exposure)
@@ -219,6 +223,7 @@ def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[ND
         return [tone - tone_map(a, exposure)]
     halves = [tone_map(half, exposure) for half in (a, b)]
     difference = 2 * tone_map((a + b) / 2, exposure) - halves[0] - halves[1]
+    difference[np.maximum(a, b) > BIAS_RATIO * np.minimum(a, b)] = 0
     bias = np.asarray(cv2.GaussianBlur(difference, (0, 0), BIAS_SIGMA), np.float64)
     return [tone - half - bias for half in halves]
 

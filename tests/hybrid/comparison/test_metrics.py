@@ -338,3 +338,11 @@ def test_bootstrap_over_shots_is_as_wide_as_they_differ(rng: np.random.Generator
     assert high == pytest.approx(6.0, abs=0.05)
     narrow = bootstrap_interval(values)
     assert narrow[1] - narrow[0] < 0.5  # frames alone would claim to know it
+
+
+def test_a_firefly_in_one_of_two_references_adds_no_error_around_it(rng):
+    """Without `BIAS_RATIO` the exact image scores 48 dB."""
+    truth = rng.uniform(0.2, 0.8, (40, 40, 3))
+    halves = [truth * rng.normal(1, 0.001, truth.shape) for _ in range(2)]
+    halves[0][20, 20] = 50
+    assert psnr(truth, (halves[0], halves[1])) > 65
