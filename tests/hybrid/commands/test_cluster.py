@@ -91,6 +91,7 @@ def test_options_are_passed_on_as_they_were_given():
         layer: Annotated[list[str] | None, typer.Option()] = None,
         resume: Annotated[bool, typer.Option("--resume")] = False,
         scheduler: Annotated[str | None, typer.Option()] = None,
+        method: Annotated[str, typer.Option()] = "",
     ) -> None:
         seen.append(arguments_of(context, {"resume": True}))
 

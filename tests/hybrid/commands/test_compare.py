@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from hybrid.cli import main
+from hybrid.commands.compare import _open_levels, _seconds
+from hybrid.commands.shots import ShotInput
 from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
 from hybrid.comparison.results import Comparison, read_comparison
-from hybrid.files.shots import open_shot
+from hybrid.files.shots import open_matching_sequence, open_shot
 from tests.scenes import Scene, grained
 
 SMALL = Scene(height=24, width=32, frames=2)
@@ -222,3 +224,42 @@ def test_frames_are_kept_and_the_time_of_others_is_theirs_to_state(tmp_path: Pat
     for wrong in ("mine", "mine=0", "mine=-1", "other=2", "=3"):
         assert main([*words, "--external-seconds", wrong]) == 2
     assert main([*words[:-2], "--keep-frames"]) == 2
+
+
+def test_levels_have_the_samples_that_are_stated_or_those_of_their_files() -> None:
+    pattern = "examples/shot/noisy.####.exr"
+    levels = _open_levels([f"{pattern}=8", pattern], ShotInput(shot="other.####.exr", frames="8"))
+    assert [(shot.numbers, samples) for shot, samples in levels] == [((8,), 8), ((8,), 24)]
+
+
+def test_seconds_are_those_of_their_method() -> None:
+    assert _seconds(["mine=2.5", "a=b=3"]) == {"mine": 2.5, "a=b": 3}
+
+
+def test_references_have_the_frames_and_levels_of_a_ladder_are_validated(
+    shots: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noisy, clean = map(str, shots)
+    frames, validated = [], []
+
+    def note_frames(*args: object, **options: object) -> object:
+        frames.append(options["frames"])
+        return open_matching_sequence(*args, **options)
+
+    def note_names(renders: dict[str, object], *, strict: bool) -> tuple[dict[str, object], list[str]]:
+        validated.append((*renders, strict))
+        return renders, []
+
+    def compare_shot(*args: object, **options: object) -> Comparison:
+        raise OSError("enough")
+
+    monkeypatch.setattr("hybrid.commands.compare.open_matching_sequence", note_frames)
+    monkeypatch.setattr("hybrid.commands.compare.validate_renders", note_names)
+    monkeypatch.setattr("hybrid.commands.compare.compare_shot", compare_shot)
+    first = str(open_shot(noisy).numbers[0])
+    words = ["compare", noisy, "--reference", clean, "--frames", first, "--level", f"{noisy}=8", "--strict"]
+    for ladder, expected in (([], [("shot", True)]), (["--ladder"], [("shot", True), ("level", True)])):
+        validated.clear()
+        assert main([*words, *ladder, "--methods", "noisy", "--samples", "4"]) == 1
+        assert validated == expected
+    assert frames == [first, first]

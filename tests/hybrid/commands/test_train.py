@@ -18,8 +18,10 @@ from tests.scenes import Scene
 torch = pytest.importorskip("torch")
 
 from hybrid.cli import main  # noqa: E402
+from hybrid.commands.options import ReadOptions  # noqa: E402
 from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
 from hybrid.files.exr import read_exr  # noqa: E402
+from hybrid.files.profile import open_profile  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.files.sources import MADE_FROM  # noqa: E402
 from hybrid.neural import TrainInputs  # noqa: E402
@@ -154,6 +156,16 @@ def test_levels_of_a_shot_are_found_without_its_references(shot):
     assert (name, list(levels), samples) == ("wall", ["a"], [1])
     with pytest.raises(FileNotFoundError, match=r"levels: expected a, d in .*, got a, b, c, reference"):
         open_levels(str(shot), {"a": 24, "d": 8})
+
+
+def test_levels_are_read_as_the_options_say(shot):
+    albedo = "ViewLayer.Denoising Albedo"
+    read = ReadOptions(frames=str(SCENE.first), layer=[f"albedo={albedo}"], profile="arnold", motion="none")
+    level = open_levels(str(shot), {"a": 24}, read).first
+    assert level.numbers == (SCENE.first,)
+    assert level.profile.name == open_profile("arnold").name
+    assert level.reader.files.layers == {"albedo": albedo}
+    assert "motion" in level.reader.interpretation.left_out
 
 
 def test_samples_are_read_from_cycles_headers():
