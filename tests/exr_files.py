@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -56,3 +57,15 @@ def save_frames(
         layers = {"color": flat_image(number, size=size), "motion": flat_image(-number, 2, size)}
         write_layers(folder / name.format(number), layers)
     return folder
+
+
+def exchange(path: Path) -> None:
+    """Put another file of the same size and time in a file's place; an unused header value differs."""
+    before = path.stat()
+    spare = path.with_name("spare")
+    content = bytearray(path.read_bytes())
+    name = b"screenWindowWidth\0float\0\4\0\0\0"
+    content[content.index(name) + len(name)] ^= 1
+    spare.write_bytes(content)
+    os.utime(spare, ns=(before.st_atime_ns, before.st_mtime_ns))
+    spare.replace(path)

@@ -66,8 +66,12 @@ class ReadSources:
         if (source := self._sources.get(path)) is None:
             return
         status = path.stat()
-        now = status.st_size, _modified(status.st_mtime_ns), status.st_ino
-        if now != (source.size, source.modified, source.inode):
+        changed = (status.st_size, _modified(status.st_mtime_ns)) != (source.size, source.modified)
+        # Some network drives change the inodes of files that nobody has written: then the content decides.
+        if not changed and status.st_ino != source.inode:
+            self._sources[path] = now = identify(path)
+            changed = now != source
+        if changed:
             raise OSError(f"{path} has changed since it was read; --resume makes again what was made from it")
 
 

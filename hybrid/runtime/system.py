@@ -165,8 +165,13 @@ def expand_home(words: Sequence[str]) -> list[str]:
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:
-    """Return whether two statuses are of one file; True if the file system has no inodes, as some network drives."""
-    return not (one.st_ino and other.st_ino) or os.path.samestat(one, other)
+    """Return whether two statuses are of one file.
+
+    Some network drives have no inodes: True. Others change them: size and time decide.
+    """
+    if not (one.st_ino and other.st_ino) or os.path.samestat(one, other):
+        return True
+    return (one.st_size, one.st_mtime_ns) == (other.st_size, other.st_mtime_ns)
 
 
 def process_lives(number: int) -> bool:

@@ -12,7 +12,7 @@ import pytest
 from hybrid.files import reader as reader_module
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.shots import open_shot
-from tests.exr_files import SIZE, flat_image, save_frames
+from tests.exr_files import SIZE, exchange, flat_image, save_frames
 from tests.renderers import layer
 from tests.renderers import save as save_file
 
@@ -77,9 +77,20 @@ def test_a_file_that_was_exchanged_is_seen_whatever_its_time_and_size(tmp_path):
     shot = open_shot(save_frames(tmp_path, [1, 2]))
     shot.read(1)
     shot.reader.check_unchanged([1, 2])
-    Path(shutil.copy2(shot.path(1), tmp_path / "spare")).replace(shot.path(1))
+    exchange(shot.path(1))
     with pytest.raises(OSError, match=r"shot\.0001\.exr has changed since it was read"):
         shot.reader.check_unchanged([1, 2])
+
+
+def test_another_inode_of_the_same_content_is_no_change(tmp_path):
+    """Some network drives change the inodes of files."""
+    shot = open_shot(save_frames(tmp_path, [1]))
+    shot.read(1)
+    Path(shutil.copy2(shot.path(1), tmp_path / "spare")).replace(shot.path(1))
+    shot.reader.check_unchanged([1])
+    exchange(shot.path(1))
+    with pytest.raises(OSError, match="has changed since it was read"):
+        shot.reader.check_unchanged([1])
 
 
 def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):

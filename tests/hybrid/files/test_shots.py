@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot, open_shot, output_path
 from hybrid.plan import Rules
 from hybrid.stream import FrameStream
-from tests.exr_files import SIZE, flat_image, save_frames, write_layers
+from tests.exr_files import SIZE, exchange, flat_image, save_frames, write_layers
 from tests.renderers import layer
 
 
@@ -264,11 +263,6 @@ def test_output_of_several_frames_needs_a_placeholder_and_may_not_be_the_input(t
 
 
 # --- shots made from a shot
-
-
-def exchange(path: Path) -> None:
-    """Put a copy of a file in its place."""
-    Path(shutil.copy2(path, path.with_name("spare"))).replace(path)
 
 
 def test_a_file_that_changes_after_validation_is_seen(tmp_path):

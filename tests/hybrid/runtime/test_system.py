@@ -123,15 +123,18 @@ def test_a_read_only_file_is_called_so(tmp_path, monkeypatch):
         replace_path(tmp_path / "a", tmp_path / "b")
 
 
-def test_files_without_numbers_are_taken_for_the_same(tmp_path):
-    """Some network drives of Windows number no files."""
+def test_files_without_inodes_or_with_other_ones_are_taken_for_the_same(tmp_path):
+    """Some network drives of Windows have no inodes, and some change them."""
     for name in "ab":
-        (tmp_path / name).touch()
+        (tmp_path / name).write_text(name)
+    os.utime(tmp_path / "a", ns=(1, 1))
     one, other = (tmp_path / "a").stat(), (tmp_path / "b").stat()
     assert same_file(one, one)
     assert not same_file(one, other)
     unnumbered = os.stat_result([0 if n == 1 else value for n, value in enumerate(other)])
     assert same_file(one, unnumbered)
+    os.utime(tmp_path / "b", ns=(1, 1))
+    assert same_file(one, (tmp_path / "b").stat())
 
 
 def test_a_process_is_asked_about_without_a_signal():
