@@ -217,7 +217,7 @@ def ravg_problem(*, wait: bool) -> str:
 def _redraw_when_known() -> float | None:
     if _version is not None and not _version.known:
         return INTERVAL
-    _redraw()
+    redraw()
     return None
 
 
@@ -225,13 +225,12 @@ def follow() -> float | None:
     """Update the current job; the function of a timer."""
     if current is None:
         return None
-    _redraw()
+    redraw()
     current.advance()
     if not current.ended:
         return INTERVAL
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.ravg.conclude("INVOKE_DEFAULT")
-    _redraw()
     return None
 
 
@@ -323,7 +322,7 @@ def protected(scene: bpy.types.Scene, *_: Any) -> None:
         scenes.restore(scene)
 
 
-def _redraw() -> None:
+def redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PROPERTIES":

@@ -105,7 +105,7 @@ class Install(_WhenIdle, bpy.types.Operator):
         self.wait = bpy.app.background
         if self.wait:
             return self.execute(context)
-        return context.window_manager.invoke_props_dialog(self, title="Install ravg", confirm_text="Install")
+        return context.window_manager.invoke_props_dialog(self, title="Install ravg", confirm_text="Install", width=480)
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column()
@@ -140,6 +140,19 @@ class Conclude(bpy.types.Operator):
     bl_idname = "ravg.conclude"
     bl_label = "Conclude"
     bl_options = {"INTERNAL"}  # noqa: RUF012
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Conclude at the next event: Blender shows no reports of an operator that Python has called."""
+        if bpy.app.background:
+            return self.execute(context)
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(0.01, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.event_timer_remove(self._timer)
+        return self.execute(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return conclude(self, context)
@@ -189,6 +202,7 @@ def _follow(operator: bpy.types.Operator, context: bpy.types.Context, begin: Cal
 def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
     """Report the result of the job, keep its log as a text, and show its frames if all are made."""
     job, jobs.current = jobs.current, None
+    jobs.redraw()
     if job.run is not None:
         text = bpy.data.texts.get(jobs.LOG) or bpy.data.texts.new(jobs.LOG)
         text.from_string(job.run.log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from pathlib import Path
 
 import bpy
 
@@ -36,23 +37,30 @@ class OutputPanel(bpy.types.Panel):
         column = layout.column()
         column.prop(scene.ravg, "preset")
         column.prop(scene.ravg, "light_passes")
-        column.prop(scene.ravg, "noisy", placeholder=scenes.noisy_pattern(scene))
-        column.prop(scene.ravg, "folder", placeholder=str(scenes.output_folder(scene)))
+        # Names and buttons have lines of their own: side by side, Blender cuts them off at the panel's usual width.
+        for name, default in (("noisy", scenes.noisy_pattern(scene)), ("folder", str(scenes.output_folder(scene)))):
+            column.label(text=scene.ravg.bl_rna.properties[name].name)
+            column.prop(scene.ravg, name, text="", placeholder=_shorten(default))
         column.prop(scene.ravg, "resume")
+        column = layout.column(align=True)
         if job is not None:
-            row = layout.row(align=True)
-            row.progress(text=job.text, factor=job.factor)
-            row.operator("ravg.cancel", icon="X")
+            column.progress(text=job.text, factor=job.factor)
+            column.operator("ravg.cancel", icon="X")
             return
-        row = layout.row(align=True)
-        row.operator("ravg.denoise", text="Render and Denoise", icon="RENDER_ANIMATION").render = True
-        row.operator("ravg.denoise", icon="SHADERFX")
-        column = layout.column()
+        column.operator("ravg.denoise", text="Render and Denoise", icon="RENDER_ANIMATION").render = True
+        column.operator("ravg.denoise", icon="SHADERFX")
         there, total = len(scenes.rendered_files(scene)), len(scenes.frame_numbers(scene))
-        column.label(text=f"{there} of {total} noisy frames are there", icon="FILE_IMAGE")
-        row = layout.row(align=True)
-        row.operator("ravg.show", icon="IMAGE_DATA")
-        row.operator("ravg.add_to_compositor", icon="NODE_COMPOSITING")
+        layout.label(text=f"{there} of {total} noisy frames are there", icon="FILE_IMAGE")
+        column = layout.column(align=True)
+        column.operator("ravg.show", icon="IMAGE_DATA")
+        column.operator("ravg.add_to_compositor", icon="NODE_COMPOSITING")
+
+
+def _shorten(path: str) -> str:
+    """Write a path below the file's folder as Blender does, ``//ravg/shot/noisy/Scene_####.exr``."""
+    folder = Path(bpy.data.filepath).parent
+    below = bpy.data.filepath and Path(path).is_relative_to(folder)
+    return f"//{Path(path).relative_to(folder).as_posix()}" if below else path
 
 
 def _warn(context: bpy.types.Context, column: bpy.types.UILayout, text: str) -> None:
@@ -61,5 +69,5 @@ def _warn(context: bpy.types.Context, column: bpy.types.UILayout, text: str) -> 
     width = 200
     if context.region is not None:
         width = max(20, int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6)
-    for index, line in enumerate(textwrap.wrap(text, width)):
+    for index, line in enumerate(textwrap.wrap(text, width, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if index else "ERROR")

@@ -13,6 +13,11 @@ import bpy
 
 from . import frames
 
+try:
+    from _cycles import with_openimagedenoise as with_denoiser  # False in Debian's Blender
+except ImportError:
+    with_denoiser = True
+
 NO_LIGHT_PASSES = "Without Network does not denoise them, choose another preset or switch Light Passes off"
 # Seen with Blender 5.0.1: the left view of a multi-view OpenEXR image in all views.
 STEREO = "Blender's compositor shows the left eye's image in both: composite the frames in another program"
@@ -69,8 +74,11 @@ def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
         found.append(Problem("Vector pass is off: motion has to be found in the pictures", True))
     if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
         found.append(Problem("Seed is constant: noise that stands still cannot be averaged away", True))
-    if scene.ravg.preset == "fast" and not scene.cycles.use_denoising:
-        found.append(Problem("Render > Denoise is off: Fast is more accurate with Blender's own denoised frames", True))
+    if _wrong_denoise(scene):
+        text = "Render > Denoise is off: Fast is more accurate with Blender's own denoised frames"
+        if scene.cycles.use_denoising:
+            text = "Render > Denoise is on, but this Blender has no denoiser: the render would fail"
+        found.append(Problem(text, True))
     if scene.ravg.light_passes and scene.ravg.preset == "average":
         found.append(Problem(f"Light Passes: {NO_LIGHT_PASSES}", False))
     elif scene.ravg.light_passes and not any(_light_passes(layer) for layer in layers):
@@ -96,10 +104,17 @@ def set_up(scene: bpy.types.Scene) -> list[str]:
     if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
         scene.cycles.use_animated_seed = True
         changed.append("Animate Seed")
-    if scene.ravg.preset == "fast" and not scene.cycles.use_denoising:
-        scene.cycles.use_denoising = True
-        changed.append("Denoise")
+    if _wrong_denoise(scene):
+        scene.cycles.use_denoising = not scene.cycles.use_denoising
+        changed.append("Denoise" if scene.cycles.use_denoising else "no Denoise")
     return changed
+
+
+def _wrong_denoise(scene: bpy.types.Scene) -> bool:
+    """Whether Render > Denoise is on where Blender was built without a denoiser, or off for Fast where it has one."""
+    if not with_denoiser:
+        return scene.cycles.use_denoising
+    return scene.ravg.preset == "fast" and not scene.cycles.use_denoising
 
 
 def frame_numbers(scene: bpy.types.Scene) -> range:

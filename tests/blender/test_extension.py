@@ -248,6 +248,8 @@ def test_a_new_scene_is_told_what_it_lacks_and_set_up(blender, blend):
         ("scene.view_layers.new('second')", ["Denoising Data", "Vector pass"]),
         ("scene.view_layers.new('second').use = False", []),
         ("scene.render.engine = ENGINE", ["Engine"]),
+        ("scenes.with_denoiser, scene.cycles.use_denoising = False, True", ["Render > Denoise"]),
+        ("scenes.with_denoiser, scene.cycles.use_denoising = False, True; scenes.set_up(scene)", []),
     ],
 )
 def test_what_spoils_the_result_is_warned_of(blender, rendered, change, warned):
@@ -387,6 +389,28 @@ def test_a_timer_follows_it_to_its_end(blender, shot):
     assert any(text.startswith("Denoising: 0 of 3 frames") for text in seen)
     assert last == "Denoising: 3 of 3 frames, 0 s left"
     assert (over, free, status, finished) == (True, True, 0, 3)
+
+
+def test_with_a_window_the_result_is_reported_by_a_modal_operator(blender):
+    """Blender shows no reports of an operator that Python has called, and raises errors into the timer."""
+    code = """
+    from types import SimpleNamespace
+    from bl_ext.user_default.ravg import operators
+    operators.bpy = SimpleNamespace(app=SimpleNamespace(background=False))
+    called = []
+    manager = SimpleNamespace(
+        event_timer_add=lambda step, window: called.append("timer"),
+        event_timer_remove=lambda timer: called.append("no timer"),
+        modal_handler_add=lambda operator: called.append("modal"),
+    )
+    context = SimpleNamespace(window_manager=manager, window=None)
+    operator = SimpleNamespace(execute=lambda context: called.append("concluded") or {"FINISHED"})
+    results = [f(operator, context, None) for f in (operators.Conclude.invoke, operators.Conclude.modal)]
+    answer = [called, [list(result) for result in results]]
+    """
+    called, results = blender.run(code)
+    assert called == ["timer", "modal", "no timer", "concluded"]
+    assert results == [["RUNNING_MODAL"], ["FINISHED"]]
 
 
 @needs_ravg
@@ -1042,8 +1066,9 @@ drawn = []
 class Layout:
     def row(self, **how): return self
     box = column = row
-    def label(self, text, icon): drawn.append(text); assert icon in icons
-    def prop(self, data, name, **how): drawn.append(data.bl_rna.properties[name].name)
+    def label(self, text, icon="NONE"): drawn.append(text); assert icon in icons
+    def prop(self, data, name, text=None, placeholder=""):
+        if text is None: drawn.append(data.bl_rna.properties[name].name)
     def progress(self, text, factor): drawn.append(text); assert 0 <= factor <= 1
     def operator(self, name, text=None, icon="NONE"):
         kind = getattr(bpy.types, "RAVG_OT_" + name.partition(".")[2])
