@@ -5,12 +5,11 @@ from __future__ import annotations
 import glob
 import os
 import re
-import sys
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
@@ -122,7 +121,9 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
             if files := bare.files():
                 return files, match[2]
         raise FileNotFoundError(f"{spec}: no frame matches; {_listing(path.parent)}")
-    matching = [name for name in _names(path.parent) if fnmatch(name.name, path.name)]
+    names = _names(path.parent)
+    fold = _fold if _ignores_case(names) else str
+    matching = [name for name in names if fnmatchcase(fold(name.name), fold(path.name))]
     if matching:
         # All files of the sequence: neighbours need not match.
         pattern = _only(_patterns(matching), spec, path.parent)
@@ -149,6 +150,12 @@ def _fold(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
+def _ignores_case(names: list[Path]) -> bool:
+    """Whether the file system finds existing files by names in another case, as on Windows and macOS."""
+    swapped = [name.with_name(name.name.swapcase()) for name in names[:1]]
+    return any(path.name not in {name.name for name in names} and path.exists() for path in swapped)
+
+
 def _names(folder: Path) -> list[Path]:
     """The EXR files of a folder."""
     if not folder.is_dir():
@@ -171,15 +178,32 @@ def find_views(spec: str) -> list[str]:
     expression = expression.replace("%V", "(?P=long)").replace("%v", "(?P=short)")
     expression += (rf"{_sign(pattern.before)}\d+" if pattern.digits else "") + re.escape(pattern.after)
     loose = glob.escape(called).replace("%V", "*").replace("%v", "?")
-    paths = glob.glob(loose + ("*" if pattern.digits else "") + glob.escape(pattern.after))
-    case = re.IGNORECASE if sys.platform == "win32" else re.NOFLAG
-    matches = [match for path in paths if (match := re.fullmatch(expression, path, case))]
-    views = {match.groupdict().get("long") or match.groupdict()["short"] for match in matches}
+    loose += ("*" if pattern.digits else "") + glob.escape(pattern.after)
+    found = [match for path in glob.glob(loose) if (match := re.fullmatch(expression, path))]
+    if not found:
+        # Where the file system ignores case, files in another case are those of the pattern.
+        drive, rest = os.path.splitdrive(loose)
+        rest = re.sub("[A-Za-z]", lambda letter: f"[{letter[0].lower()}{letter[0].upper()}]", rest)
+        paths = glob.glob(drive + rest)
+        found = [match for path in paths if (match := re.fullmatch(expression, path, re.IGNORECASE))]
+        found = [match for match in found if Path(_respell(match, called, pattern.after)).exists()]
+    views = {_view(match) for match in found}
     if not views:
         raise FileNotFoundError(
             f"{spec}: no view is there, expected files with left and right, or l and r, for %V or %v"
         )
     return sorted(views)
+
+
+def _view(match: re.Match[str]) -> str:
+    """The name of the view in a match of `find_views`, or its first letter."""
+    return match.groupdict().get("long") or match.groupdict()["short"]
+
+
+def _respell(match: re.Match[str], before: str, after: str) -> str:
+    """The path of a match of `find_views` as the pattern spells it."""
+    before = name_view(before, _view(match))
+    return before + match[0][len(before) : len(match[0]) - len(after)] + after
 
 
 def name_view(text: str, view: str) -> str:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.files.sequences import find_files, name_holes, parse_frames, parse_pattern
+from hybrid.files.sequences import find_files, find_views, name_holes, parse_frames, parse_pattern
 from hybrid.files.shots import open_shot
 
 NOT_ON_WINDOWS = [pytest.param(name, marks=pytest.mark.posix) for name in ("back\\slash", "new\nline")]
@@ -233,3 +233,20 @@ def test_names_that_the_file_system_takes_for_the_same_are_one_sequence(tmp_path
     files, _ = find_files(str(tmp_path / asked))
     assert list(files) == [8, 9]
     assert files[9].name == asked.replace("####", "0009")
+
+
+def test_globs_and_views_ignore_case_where_the_file_system_does(tmp_path, monkeypatch):
+    """macOS ignores case, but its patterns with * and %V did not."""
+    for view in ("left", "right"):
+        (tmp_path / f"Shot_{view}.0008.exr").touch()
+    glob, views = str(tmp_path / "SHOT_l*.EXR"), str(tmp_path / "SHOT_%V.####.EXR")
+    if not (tmp_path / "SHOT_LEFT.0008.EXR").exists():
+        with pytest.raises(FileNotFoundError, match="no such file"):
+            find_files(glob)
+        with pytest.raises(FileNotFoundError, match="no view is there"):
+            find_views(views)
+        exists = Path.exists
+        known = {str(path).lower() for path in tmp_path.iterdir()}
+        monkeypatch.setattr(Path, "exists", lambda path: str(path).lower() in known or exists(path))
+    assert list(find_files(glob)[0]) == [8]
+    assert find_views(views) == ["left", "right"]
