@@ -5,6 +5,7 @@ A timer follows the job, not a modal operator, which would block Blender's autom
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from . import command, frames, install, scenes, settings
 
 INTERVAL = 0.25  # seconds between two updates
 LOG = "ravg.log"  # the text block that holds ravg's output
+WIDTH = 160  # letters of an error: Blender shows one line, cut off at its window
 
 
 class Job:
@@ -118,7 +120,8 @@ class Job:
             report({"WARNING"}, f"Stopped: {self.run.finished} of {self.run.total} frames are finished")
             return False
         if self.run.code != 0:
-            report({"ERROR"}, f"{self.run.error} (all of it in the text {LOG})")
+            why = textwrap.shorten(self.run.error, WIDTH, placeholder="…")
+            report({"ERROR"}, f"{why} (all of it in the text {LOG})")
             return False
         report({"INFO"}, f"Denoised {self.run.total} frames into {self._folder}")
         return True
@@ -192,6 +195,7 @@ class Install:
             report({"WARNING"}, "Stopped: ravg is not installed")
         else:
             why = self._error or install.explain(self.run.log, online=self._online)
+            why = textwrap.shorten(why, WIDTH, placeholder="…")
             report({"ERROR"}, f"ravg is not installed: {why} (all of it in the text {LOG})")
         return False
 

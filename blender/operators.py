@@ -62,11 +62,13 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         self.wait = bpy.app.background
         if self.render and not self.wait and scenes.rendered_files(context.scene):
             self.existing = "KEEP"
-            return context.window_manager.invoke_props_dialog(self, title="Noisy frames are there already")
+            title = "Noisy frames are there already"
+            return context.window_manager.invoke_props_dialog(self, title=title, confirm_text="Render and Denoise")
         return self.execute(context)
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.props_enum(self, "existing")
+        for value, *_ in EXISTING[1:]:  # "Ask" is no answer
+            self.layout.prop_enum(self, "existing", value)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Denoise; with `wait`, as in scripts and without a window, until the end."""
@@ -178,7 +180,10 @@ class AddToCompositor(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
-        return _load(self, scene, lambda image, count: compositor.add(scene, image, count))
+        done = _load(self, scene, lambda image, count: compositor.add(scene, image, count))
+        if done == {"FINISHED"}:
+            self.report({"INFO"}, "The compositor reads the denoised frames, and Render Animation writes its output")
+        return done
 
 
 def _follow(operator: bpy.types.Operator, context: bpy.types.Context, begin: Callable[[], Any]) -> set[str]:

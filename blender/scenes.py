@@ -51,7 +51,7 @@ def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
     if scene.render.use_sequencer and scene.sequence_editor is not None and _strips(scene):
         remedy = "switch Post Processing > Sequencer off for the movie"
         found.append(Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False))
-    if would_be_written_over(scene):
+    if not scene.ravg.lent and would_be_written_over(scene):  # `override` sets this path for ravg's own render
         found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
     if nodes := file_outputs(scene):
         text = f"{', '.join(nodes)}: the folder is that of ravg's frames, and nothing is written, name another"

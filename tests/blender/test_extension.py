@@ -1095,6 +1095,7 @@ def test_an_output_path_that_blender_cannot_read_leaves_the_panel_whole(blender,
 
 
 def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, stub, rendered):
-    code = DRAWN + "jobs.begin(scene); answer = draw()"
+    begin = "from bl_ext.user_default.ravg import scenes; jobs.begin(scene); scenes.override(scene, replace=True)"
+    code = f"{DRAWN}{begin}; answer = draw()"
     drawn = blender.run(code, blend=rendered, command=stub)
     assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Resume", "Rendering", "Stop"]
