@@ -168,7 +168,8 @@ class Show(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
-        return _load(self, scene, lambda image, count: show(context, scene, image, count))
+        here = [context.window] if context.window else []  # an editor in another window may be hidden by this one
+        return _load(self, scene, lambda image, count: show(here, scene, image, count))
 
 
 class AddToCompositor(bpy.types.Operator):
@@ -215,18 +216,19 @@ def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[st
         return {"CANCELLED"}
     if job.scene is None:  # nothing to show: ravg was installed, or the scene was removed
         return {"FINISHED"}
-    return _load(operator, job.scene, lambda image, count: show(context, job.scene, image, count))
+    windows = [*context.window_manager.windows]
+    return _load(operator, job.scene, lambda image, count: show(windows, job.scene, image, count))
 
 
-def show(context: bpy.types.Context, scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
-    """Show a sequence in an open image editor, else in a new window."""
-    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
+def show(windows: list[bpy.types.Window], scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
+    """Show a sequence in an image editor of these windows, else in a new window."""
+    areas = [area for window in windows for area in window.screen.areas]
     editor = next((area for area in areas if area.type == "IMAGE_EDITOR"), None)
     if editor is None:
         if bpy.app.background:
             return
         bpy.ops.wm.window_new()
-        editor = context.window_manager.windows[-1].screen.areas[0]
+        editor = bpy.context.window_manager.windows[-1].screen.areas[0]
         editor.type = "IMAGE_EDITOR"
     editor.spaces.active.image = image
     scenes.show_from(editor.spaces.active.image_user, scene, count)
