@@ -75,6 +75,14 @@ def test_page_and_picture_show_a_ladder(tmp_path: Path) -> None:
     assert not (tmp_path / "b" / "ladder.png").exists()
 
 
+def test_the_page_leads_to_the_movies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hybrid.comparison.report.write_movies", lambda folder, images, rate: {"ours": f"{rate}.mp4"})
+    images = ShotImages([MethodImages(RESULTS[0].name, scene(0.4))], scene(0.5), (1, 2, 3))
+    write_report(tmp_path, Report(Comparison("shot", RESULTS), images, rate=25, movies=True))
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert '<a href="movies/25.mp4">ours</a>' in page
+
+
 def test_what_does_not_fit_together_is_refused(tmp_path: Path) -> None:
     def images(name: str, shape: tuple[int, int] = (18, 32), frames: Sequence[int] = (8,)) -> ShotImages:
         return ShotImages([MethodImages(name, scene(1.0))], scene(1.0, shape), frames)

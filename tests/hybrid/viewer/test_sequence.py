@@ -108,10 +108,13 @@ def test_another_data_window_lies_where_it_belongs(tmp_path):
     header = {"dataWindow": ((2, 1), (5, 3)), "displayWindow": ((0, 0), (3, 3)), "compression": OpenEXR.ZIP_COMPRESSION}
     ramp = np.arange(12, dtype=np.float32).reshape(3, 4) / 12
     OpenEXR.File(header, {"R": ramp, "G": ramp, "B": ramp}).write(str(tmp_path / "a.1.exr"))
-    shown = Sequence(str(tmp_path), finished=False).picture(1, "RGBA", 1, 0)[..., 0]
+    sequence = Sequence(str(tmp_path), finished=False)
+    shown = sequence.picture(1, "RGBA", 1, 0)[..., 0]
     expected = np.zeros((4, 4))
     expected[1:, 2:] = ramp[:, :2]
     np.testing.assert_allclose(shown, level(expected), atol=1)
+    assert sequence.values(1, "RGBA", 3, 2)["R"] == ramp[1, 1]
+    assert sequence.values(1, "RGBA", 1, 2) == {}
 
 
 def test_around_the_data_is_black_whatever_zero_is_shown_as(tmp_path):
