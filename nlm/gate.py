@@ -98,12 +98,11 @@ def color_gates(
         if t == centre_index:
             continue
         run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
-        if detail is not None:
-            energy = cv2.blur(_mean_square(difference), _DETAIL_SIZE) / np.float32(detail**2)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
         around = cv2.blur(mean, _AROUND_SIZE)
         if detail is not None:
-            around = np.maximum(around, energy)
+            energy = cv2.blur(_mean_square(difference), _DETAIL_SIZE)
+            around = np.maximum(around, energy / np.float32(detail**2))
         for rate, weight in zip(rates, weights, strict=True):
             run_bands(_weigh, shape[0], mean, around, rate, both, weight[t])
     return weights
@@ -140,7 +139,7 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     a that all neighbours share: a² = max(0, E − s² − 1.2 V (1 + 1 / N)). The average of least error of the centre and
     its neighbours weighs these by V / (V + N a²).
 
-    Of ten shots at 8 to 512 samples, one of sharp outlines gains 0.4 to 1.7 dB by it, and none loses more than 0.1 dB.
+    On ten shots at 8 to 512 samples, one of sharp outlines gains 0.4 to 1.7 dB by it, and none loses more than 0.1 dB.
     Without V two lose 0.2 dB, without s² 0.2 to 0.6.
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")

@@ -123,7 +123,7 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
 def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confidence: Floats) -> Floats:
     """As `prefilter_guide`; `read` returns the window (T, h, W, F) of some rows, and is called for rows around noise.
 
-    The centre's guide (H, W, F) alone tells where noise may be, as the lesser variance counts.
+    The centre's guide (H, W, F) alone shows where noise may be, as the lesser variance counts.
     """
     spatial, filtered = variance_from_residual(centre), centre.copy()
     for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):

@@ -86,9 +86,9 @@ def find_region(color: Array) -> Region | None:
 
     None if the whole frame is lit, or if the lit area is no rectangle.
     """
-    # Closed: noise leaves single pixels of lit surfaces black.
     # Channel by channel: numpy takes long over the short axis.
     some = np.logical_or.reduce([plane != 0 for plane in np.moveaxis(color, -1, 0)])
+    # Closed: noise leaves single pixels of lit surfaces black.
     lit = cv2.morphologyEx(some.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     shown = [np.flatnonzero(lit.any(axis=1 - axis)) for axis in (0, 1)]
     if not shown[0].size:

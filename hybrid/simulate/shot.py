@@ -32,7 +32,7 @@ class ShotSettings:
     frames: tuple[int, ...]
     size: tuple[int, int]
     levels: dict[str, int]  # name → samples per pixel
-    # Of both halves together.
+    # For both halves together.
     reference: Annotated[int, "samples per pixel of a reference; 0: none", {"metavar": "SPP"}] = 0
     reference_frames: tuple[int, ...] | None = None  # None: all
     film: tuple[int, int] | None = None

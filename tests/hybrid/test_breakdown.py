@@ -26,9 +26,8 @@ def align(folder, frames: int = 3) -> AlignedWindow:
     scene = Scene(frames=frames, step=(0, 0), height=48, width=64, noise=1e-3)
     shot = open_shot(scene.write(folder, edit=brighter))
     stages = {"gate", "demodulate"}
-    return FrameStream(shot, only(stages), radius=1, first_pass=PerFrame(lambda frame: frame.color)).align(
-        shot.numbers[frames // 2]
-    )
+    first_pass = PerFrame(lambda frame: cv2.blur(frame.color, (3, 3)))
+    return FrameStream(shot, only(stages), radius=1, first_pass=first_pass).align(shot.numbers[frames // 2])
 
 
 def test_the_maps_show_where_geometry_trusts_light_differs_and_the_network_has_changed_something(tmp_path):
@@ -38,8 +37,7 @@ def test_the_maps_show_where_geometry_trusts_light_differs_and_the_network_has_c
     maps = stage_layers(window, result)
     assert maps["stage.align"].min() > 0.99  # nothing moves
     assert maps["stage.gate"][:12, :8].max() < 0.1
-    # Two neighbours know their scatter to a tenth: where it is small by chance, their agreement is doubted.
-    assert maps["stage.gate"][30:, 30:].mean() > 0.95
+    assert maps["stage.gate"][30:, 30:].min() > 0.9
     changed = maps["stage.network"] > 0
     assert changed[30:40, 50:60].all()
     assert changed.sum() == 100

@@ -26,7 +26,7 @@ MIDDLE = MOVING.first + 3
 ALONE = Rules(off=frozenset({"stabilize", "restore-mean", "blend-samples"}))
 # The average of pictures by itself: samples correct nothing.
 STEADY = Rules(off=frozenset({"restore-mean", "blend-samples"}))
-# Of a denoiser: far below what the gate lets pass (0.004 of the tone curve), far above rounding.
+# Error of a denoiser: below what the gate lets pass (0.001 of the tone curve and a tenth of the noise), above rounding.
 ERROR = 0.003
 
 

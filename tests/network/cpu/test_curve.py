@@ -30,7 +30,7 @@ def test_the_curve_is_as_exact_as_float32() -> None:
         assert can_tabulate(light)
         found = encode(light).permute(0, 2, 3, 1).numpy().ravel()
     exact = transfer.pu_forward(torch.from_numpy(exact)).numpy()
-    # What is computed in float32 is as far away.
+    # Plain float32 arithmetic is as far away.
     np.testing.assert_allclose(found, exact, rtol=3e-7, atol=1.5e-7)
 
 
