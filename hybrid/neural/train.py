@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -56,6 +57,7 @@ def train_network(
         return train(training, validation, model, config, output, resume=resume, log=log)
     finally:
         if together:
+            gc.collect()  # references in cycles keep the group's threads, which abort a process that ends under them
             torch.distributed.destroy_process_group()
 
 

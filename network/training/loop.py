@@ -246,6 +246,8 @@ def train(
             validate_average()
         write_weights()
         state_path.unlink(missing_ok=True)
+    if world > 1:
+        torch.distributed.barrier()  # a process that fails while it ends would stop the first one before it has written
     return values
 
 
