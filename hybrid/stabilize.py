@@ -29,6 +29,7 @@ from nlm.parts import limit_change
 from nlm.samples import SampleMean, blend_samples, restore_mean
 
 Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 # By how much a pixel may change at most where results are averaged; and where samples correct a pixel that has parts,
 # which change with it, so that the color is the same with and without them but where it was next to nothing.
@@ -66,7 +67,7 @@ class Excess(NamedTuple):
     """
 
     relative: Array
-    bright: NDArray[np.bool_]
+    bright: Mask
 
 
 @dataclass(frozen=True)
@@ -151,9 +152,8 @@ class FrameDenoiser:
         frame = self.stream.frame(number)
         if frame is not None:
             self._check_light(denoised.color, frame, result.brightest)
-            denoised = self._correct(denoised, frame, result)
-            if "blend-samples" in result.plan.stages:
-                denoised = self._with_moving_lights(denoised, frame)
+            lights = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
+            denoised = self._correct(denoised, frame, result, lights)
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
@@ -243,30 +243,36 @@ class FrameDenoiser:
             if fault := find_lost_light(color, frame.radiance, frame.valid, lambda: brightest):
                 raise ValueError(f"frame {frame.number}: {fault}; it was not written")
 
-    def _correct(self, denoised: Denoised, frame: PreparedFrame, result: WindowResult) -> Denoised:
-        """The denoised frame with the means of its samples, and with the samples where they are certain."""
+    def _correct(self, denoised: Denoised, frame: PreparedFrame, result: WindowResult, lights: Mask | None) -> Denoised:
+        """The denoised frame with the means of its samples, and with the samples where they are certain.
+
+        Moving lights are as rendered, and their light belongs to no other pixel.
+        """
         color, timings = denoised.color, self.stream.timings
         exposure = measure_exposure(color)
+        counted = frame.valid if lights is None else frame.valid & ~lights
         if "restore-mean" in result.plan.stages:
             with timings.stage("restore-mean"):
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
                 for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
-                    color = restore_mean(color, _where_rendered(frame, noisy, color), exposure)
+                    color = restore_mean(color, _where(counted, noisy, color), exposure)
         if result.neighbour_samples is not None:
             with timings.stage("blend-samples"):
-                noisy = _where_rendered(frame, frame.radiance, color)
+                noisy = _where(counted, frame.radiance, color)
                 color = blend_samples(color, noisy, result.neighbour_samples, exposure, frame.radiance_variance)
+        if lights is not None:
+            color = _where(~lights, color, frame.rendered)
         return _changed(denoised, color, CORRECTED)
 
-    def _with_moving_lights(self, denoised: Denoised, frame: PreparedFrame) -> Denoised:
-        """The denoised frame with bright pixels as rendered that the neighbouring results show to move together."""
+    def _moving_lights(self, frame: PreparedFrame) -> Mask | None:
+        """The bright pixels (H, W) that the neighbouring results show to move together, if there are any."""
         step = self.stream.shot.step
         others = [n for n in (frame.number - step, frame.number + step) if n in self._results]
         with self.stream.timings.stage("blend-samples"):
             excess = self._results[frame.number].excess
             assert excess is not None
             if not (others and excess.bright.any()):
-                return denoised
+                return None
             seen = np.zeros_like(excess.bright)
             for n in others:
                 other = self._results[n].excess
@@ -276,8 +282,7 @@ class FrameDenoiser:
                 seen |= confirmed_by_neighbour(*excess, *other, None if flow is None else flow.vectors)
             if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(excess.bright):
                 seen = excess.bright
-            color = np.where(seen[..., None], frame.rendered, denoised.color)
-        return _changed(denoised, color, CORRECTED)
+        return seen if seen.any() else None
 
     def _bands(self) -> list[slice]:
         height = self.stream.shot.shape[0]
@@ -315,9 +320,9 @@ def _excess(frame: PreparedFrame, picture: Array) -> Excess:
     return Excess(relative, find_bright(relative))
 
 
-def _where_rendered(frame: PreparedFrame, noisy: Array, picture: Array) -> Array:
-    """The noisy frame, with the picture in the place of pixels that were not finite."""
-    return noisy if frame.valid.all() else np.where(frame.valid[..., None], noisy, picture)
+def _where(counted: Mask, noisy: Array, picture: Array) -> Array:
+    """The noisy frame at the pixels that count, and the picture elsewhere."""
+    return noisy if counted.all() else np.where(counted[..., None], noisy, picture)
 
 
 def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
