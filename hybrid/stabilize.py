@@ -256,10 +256,11 @@ class FrameDenoiser:
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
                 for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
                     color = restore_mean(color, _where(counted, noisy, color), exposure)
-        if result.neighbour_samples is not None:
+        if (sides := result.neighbour_samples) is not None:
             with timings.stage("blend-samples"):
                 noisy = _where(counted, frame.radiance, color)
-                color = blend_samples(color, noisy, result.neighbour_samples, exposure, frame.radiance_variance)
+                sides = sides if lights is None else sides._replace(nearest=sides.nearest * ~lights)
+                color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
         if lights is not None:
             color = _where(~lights, color, frame.rendered)
         return _changed(denoised, color, CORRECTED)

@@ -53,6 +53,8 @@ _SOFT = 0.05
 _LAMP = 4.0
 # Least weight of a frame with the centre's geometry and other light.
 _OTHER_LIGHT = 0.02
+# The least squared distance of a sample from N others, of equal noise in all channels, is its variance times this over N.
+_NEAREST = 1.6
 # Cells per deviation of a mean.
 _CELLS = 6
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
@@ -65,6 +67,7 @@ class SampleMean(NamedTuple):
     mean: Floats  # (H, W, 3) radiance; 0 where no frame is trusted
     frames: Floats  # (H, W) frames' worth of samples, (Σ c)² / Σ c², c the confidence; 0 where no frame is trusted
     trust: Floats  # (H, W) in [0, 1]: 1 where the confidence of all frames adds up to 1
+    nearest: Floats  # (H, W) estimate of the centre's variance, summed over channels, by its nearest neighbour
 
 
 def average_neighbours(
@@ -85,7 +88,7 @@ def average_neighbours(
     if residuals is not None and residuals.shape != estimates.shape:
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
     shape = estimates.shape[1:]
-    mean = SampleMean(*(np.zeros(size, np.float32) for size in (shape, shape[:2], shape[:2])))
+    mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
     run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, mean)
     return mean
@@ -131,13 +134,15 @@ def blend_samples(
     # Radiance per unit of relative error.
     light = gaussian_mean(channel_mean(picture), 2.0) + np.float32(_DARK * exposure)
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
-    factor, sums = _relative_light(noisy, neighbours, rate), np.zeros((4, *light.shape), np.float32)
+    factor, sums = _relative_light(noisy, neighbours, rate), np.zeros((5, *light.shape), np.float32)
     run_bands(_compare, len(light), picture, noisy, neighbours, factor, rate, sums)
-    together, squares, products, temporal = sums
+    together, squares, products, temporal, nearest = sums
     noise = gaussian_mean(products, _SIGMA) / _PIXELS
     blended = np.empty_like(picture)
     means = gaussian_mean(together, _SIGMA), gaussian_mean(squares, _SIGMA), noise
     run_bands(_blend_shared, len(light), picture, neighbours, factor, means, blended)
+    around, nearest = gaussian_mean(temporal, _SIGMA), gaussian_mean(nearest, _SIGMA)
+    temporal *= np.minimum(np.divide(nearest, around, out=np.ones_like(around), where=around > 0), 1)
     spatial = spatial_variance(noisy, blended, rate)
     if variance is None:
         alone = np.float32(_ALONE) * spatial
@@ -318,12 +323,12 @@ def _average(
     first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, geometry: Floats,
     modulation: Floats, out: SampleMean,
 ) -> None:  # fmt: skip
-    mean, frames, trust = out
+    mean, frames, trust, nearest = out
     T, _, W, C = estimates.shape
     for y in range(first, last):
         for x in range(W):
             total, squares = np.float64(0), np.float64(0)  # the square of a small confidence must not vanish
-            greatest = np.float32(0)
+            greatest, least, count = np.float32(0), np.float32(np.inf), 0
             for t in range(T):
                 weight = max(confidence[t, y, x], np.float32(_OTHER_LIGHT) * geometry[t, y, x])
                 greatest += max(confidence[t, y, x], geometry[t, y, x])
@@ -336,11 +341,17 @@ def _average(
                     continue
                 total += weight
                 squares += np.float64(weight) ** 2
+                distance = np.float32(0)
                 for c in range(C):
                     value = estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
+                    own = estimates[T // 2, y, x, c] + (residuals[T // 2, y, x, c] if add else np.float32(0))
                     mean[y, x, c] += weight * value * modulation[y, x, c]
+                    distance += ((own - value) * modulation[y, x, c]) ** 2
+                count += 1
+                least = min(least, distance)
             if total > 0:
                 frames[y, x] = total * total / squares
+                nearest[y, x] = least * np.float32(count / _NEAREST)
                 centre = max(confidence[T // 2, y, x], geometry[T // 2, y, x])
                 trust[y, x] = min(greatest - centre, np.float32(1))
                 for c in range(C):
@@ -377,7 +388,7 @@ def _compare(
     first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, rate: Floats,
     sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², variance."""
+    """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², two variances."""
     _, W, C = picture.shape
     for y in range(first, last):
         for x in range(W):
@@ -393,6 +404,7 @@ def _compare(
                 sums[1, y, x] += m_p * m_p
                 product += n_m * m_p
                 sums[3, y, x] += n_m * n_m / (1 + _WARPED / neighbours.frames[y, x])
+            sums[4, y, x] = min(scale * neighbours.nearest[y, x] * scale, np.float32(3) * _LIMIT * _LIMIT)
             sums[2, y, x] = product * product
 
 
