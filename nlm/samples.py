@@ -57,9 +57,11 @@ _OTHER_LIGHT = 0.02
 # noise that all channels share, and more for other noise. The least one takes a bright sample that a single one of six
 # frames shows as well for light without noise: a sparkle, 0.13 dB of a shot.
 _SECOND, _FEW = 0.33, 0.28
-# Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's. Over 4, light that
-# changes by 2 % a frame leaves an error of 3 % where one neighbour shows what comes into the picture.
-_LIGHT = 2.0
+# Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's for the variance, and
+# the share of the noise that this leaves: one of 20 pixels' worth is taken for light. Over 4 pixels light that changes by
+# 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
+_LIGHT = 1.25
+_LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # Cells per deviation of a mean.
 _CELLS = 6
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
@@ -116,8 +118,8 @@ def blend_samples(
 
     Notes
     -----
-    With p the picture, n the noisy frame and m the mean of the neighbours, times K[n m] / K[m²] where the light has
-    changed, all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
+    With p the picture, n the noisy frame and m the mean of the neighbours, times K[n m] / K[m²] as the light may have
+    changed (K narrower, 20 pixels, in v), all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
 
         β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = K[((n − m)(m − p))²] / N,
 
@@ -140,8 +142,8 @@ def blend_samples(
     # Radiance per unit of relative error.
     light = gaussian_mean(channel_mean(picture), 2.0) + np.float32(_DARK * exposure)
     rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
-    factor, sums = _relative_light(noisy, neighbours, rate), np.zeros((5, *light.shape), np.float32)
-    run_bands(_compare, len(light), picture, noisy, neighbours, factor, rate, sums)
+    (factor, near), sums = _relative_light(noisy, neighbours, rate), np.zeros((5, *light.shape), np.float32)
+    run_bands(_compare, len(light), picture, noisy, neighbours, factor, near, rate, sums)
     together, squares, products, temporal, nearest = sums
     noise = gaussian_mean(products, _SIGMA) / _PIXELS
     blended = np.empty_like(picture)
@@ -162,12 +164,15 @@ def blend_samples(
     return blended
 
 
-def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> Floats:
-    """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel."""
+def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list[Floats]:
+    """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel, over two sizes."""
     products = np.empty((2, *rate.shape), np.float32)
     run_bands(_multiply, len(rate), noisy, neighbours, rate, products)
-    together, alone = (gaussian_mean(product, _LIGHT) for product in products)
-    return np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2)
+    factors = []
+    for sigma in (_SIGMA, _LIGHT):
+        together, alone = (gaussian_mean(product, sigma) for product in products)
+        factors.append(np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2))
+    return factors
 
 
 def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
@@ -392,8 +397,8 @@ def _energy(first: int, last: int, residual: Floats, rate: Floats, energy: Float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
-    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, rate: Floats,
-    sums: Floats,
+    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, near: Floats,
+    rate: Floats, sums: Floats,
 ) -> None:  # fmt: skip
     """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², two variances."""
     _, W, C = picture.shape
@@ -410,7 +415,9 @@ def _compare(
                 sums[0, y, x] += n_p * m_p
                 sums[1, y, x] += m_p * m_p
                 product += n_m * m_p
-                sums[3, y, x] += n_m * n_m / (1 + _WARPED / neighbours.frames[y, x])
+                n_m = scale * (n - neighbours.mean[y, x, c] * near[y, x])
+                n_m = min(max(n_m, -_LIMIT), _LIMIT)
+                sums[3, y, x] += n_m * n_m / (_LEFT * (1 + _WARPED / neighbours.frames[y, x]))
             sums[4, y, x] = min(scale * neighbours.nearest[y, x] * scale, np.float32(3) * _LIMIT * _LIMIT)
             sums[2, y, x] = product * product
 
