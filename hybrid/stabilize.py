@@ -259,7 +259,8 @@ class FrameDenoiser:
         if (sides := result.neighbour_samples) is not None:
             with timings.stage("blend-samples"):
                 noisy = _where(counted, frame.radiance, color)
-                sides = sides if lights is None else sides._replace(nearest=sides.nearest * ~lights)
+                if not counted.all():
+                    sides = sides._replace(nearest=sides.nearest * counted)
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
         if lights is not None:
             color = _where(~lights, color, frame.rendered)

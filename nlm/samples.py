@@ -78,7 +78,7 @@ class SampleMean(NamedTuple):
 
 
 def average_neighbours(
-    estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats
+    estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats, noisy: Floats
 ) -> SampleMean:
     """Average the samples of all frames of a window except the centre.
 
@@ -90,6 +90,7 @@ def average_neighbours(
     confidence, geometry : (T, H, W) float32
         Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
     modulation : (H, W, 3) float32, factor from the unit of the window to radiance
+    noisy : (H, W, 3) float32, radiance of the centre as rendered
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
     if residuals is not None and residuals.shape != estimates.shape:
@@ -97,7 +98,7 @@ def average_neighbours(
     shape = estimates.shape[1:]
     mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
-    run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, mean)
+    run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, noisy, mean)
     return mean
 
 
@@ -332,7 +333,7 @@ def _restore(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(
     first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, geometry: Floats,
-    modulation: Floats, out: SampleMean,
+    modulation: Floats, noisy: Floats, out: SampleMean,
 ) -> None:  # fmt: skip
     mean, frames, trust, nearest = out
     T, _, W, C = estimates.shape
@@ -356,9 +357,9 @@ def _average(
                 distance = np.float32(0)
                 for c in range(C):
                     value = estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
-                    own = estimates[T // 2, y, x, c] + (residuals[T // 2, y, x, c] if add else np.float32(0))
-                    mean[y, x, c] += weight * value * modulation[y, x, c]
-                    distance += ((own - value) * modulation[y, x, c]) ** 2
+                    value *= modulation[y, x, c]
+                    mean[y, x, c] += weight * value
+                    distance += (noisy[y, x, c] - value) ** 2
                 count += 1
                 least, second = min(least, distance), min(max(least, distance), second)
             if total > 0:

@@ -122,7 +122,8 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
             # Before the first pass is pulled to the centre's: the samples stay as they are.
             pictures, residual = (color, None) if estimates is None else (estimates, sources.residual)
             assert pictures is not None
-            sides = average_neighbours(pictures, residual, confidence, warped.confidence, modulation)
+            noisy = centre.radiance[padded]
+            sides = average_neighbours(pictures, residual, confidence, warped.confidence, modulation, noisy)
         weight = None
         if estimates is not None and "drift" in stages:
             weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)

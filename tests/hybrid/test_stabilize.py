@@ -512,3 +512,5 @@ class TestSamples:
         elsewhere = np.ones((96, 160), bool)
         elsewhere[rows % 96, columns] = False
         assert np.abs(result - truth(scene, number))[elsewhere].mean() < 0.1
+        # The light of the flakes, 3 % of the frame's, went into the mean of all other pixels too.
+        assert result[elsewhere].mean() == pytest.approx(truth(scene, number)[elsewhere].mean(), rel=0.005)

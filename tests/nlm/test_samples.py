@@ -28,11 +28,15 @@ def noisy(truth: np.ndarray, noise: float, seed: int) -> np.ndarray:
     return (truth * grain).astype(np.float32)
 
 
-def window(truth: np.ndarray, noise: float, frames: int = 5) -> tuple[np.ndarray, SampleMean]:
-    """The noisy centre, and the mean of the frames beside it."""
+def window(truth: np.ndarray, noise: float, firefly: tuple[int, int] | None = None) -> tuple[np.ndarray, SampleMean]:
+    """The noisy centre, with a firefly, and the mean of the frames beside it."""
+    frames = 5
     all_frames = np.stack([noisy(truth, noise, 10 + t) for t in range(frames)])
+    if firefly is not None:
+        all_frames[frames // 2][firefly] = 80
     confidence = np.ones(all_frames.shape[:3], np.float32)
-    return all_frames[frames // 2], average_neighbours(all_frames, None, confidence, confidence, np.ones_like(truth))
+    own = all_frames[frames // 2]
+    return own, average_neighbours(all_frames, None, confidence, confidence, np.ones_like(truth), own)
 
 
 def error(image: np.ndarray, truth: np.ndarray) -> float:
@@ -46,19 +50,34 @@ def test_the_mean_of_the_sides_is_its_definition() -> None:
     confidence = rng.random((5, 9, 11), np.float32)
     confidence[:, 3] = 0
     estimates[0, 5] = np.nan
-    modulation = rng.uniform(0.1, 1, (9, 11, 3)).astype(np.float32)
-    found = average_neighbours(estimates, residuals, confidence, np.zeros_like(confidence), modulation)
+    modulation, own = rng.uniform(0.1, 1, (2, 9, 11, 3)).astype(np.float32)
+    found = average_neighbours(estimates, residuals, confidence, np.zeros_like(confidence), modulation, own)
     for y, x in np.ndindex(9, 11):
         sides = [t for t in (0, 1, 3, 4) if confidence[t, y, x] > 0 and np.isfinite(estimates[t, y, x]).all()]
         weights = confidence[sides, y, x].astype(np.float64)
         if not sides:
             assert not found.mean[y, x].any()
-            assert found.frames[y, x] == found.trust[y, x] == 0
+            assert found.frames[y, x] == found.trust[y, x] == found.nearest[y, x] == 0
             continue
         mean = (weights[:, None] * (estimates + residuals)[sides, y, x]).sum(axis=0) / weights.sum() * modulation[y, x]
         np.testing.assert_allclose(found.mean[y, x], mean, rtol=1e-5, atol=1e-6)
         assert found.frames[y, x] == pytest.approx(weights.sum() ** 2 / np.square(weights).sum(), rel=1e-5)
         assert found.trust[y, x] == pytest.approx(min(confidence[[0, 1, 3, 4], y, x].sum(), 1), rel=1e-5)
+        apart = (estimates + residuals)[sides, y, x] * modulation[y, x] - own[y, x]
+        distances = np.sort(np.square(apart).sum(axis=-1))
+        expected = distances[1] * (0.33 * len(sides) - 0.28) if len(sides) > 1 else distances[0] / 1.7
+        assert found.nearest[y, x] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("frames", [3, 5, 7])
+def test_the_second_nearest_sample_tells_the_variance(frames: int) -> None:
+    """Noise of all channels together, which a warp has made smaller in the neighbours; other noise counts as more."""
+    rng = np.random.default_rng(14)
+    noise = rng.standard_normal((frames, *SHAPE, 1)).astype(np.float32) * ONES
+    noise[np.arange(frames) != frames // 2] *= np.float32(np.sqrt(0.7))
+    confidence = np.ones(noise.shape[:3], np.float32)
+    found = average_neighbours(noise, None, confidence, confidence, ONES, noise[frames // 2])
+    assert found.nearest.mean() == pytest.approx(3, rel=0.06)
 
 
 @pytest.mark.parametrize("blurred", [True, False])
@@ -82,10 +101,36 @@ def test_the_picture_is_never_worse_than_the_samples_or_itself(noise: float, wro
     assert error(result, truth) <= 1.02 * min(error(own, truth), error(smooth, truth)) + 0.03 * error(own, truth)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+def test_lights_that_pass_over_the_neighbours_are_no_noise(noise: float) -> None:
+    """Snow of one pixel in a hundred in the four frames beside the centre: it counted as noise of a tenth of the light."""
+    truth = lines()
+    frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
+    rng = np.random.default_rng(15)
+    for t in (0, 1, 3, 4):
+        frames[t][rng.random(SHAPE) < 0.01] = 5
+    confidence = np.ones(frames.shape[:3], np.float32)
+    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
+    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
+    result = blend_samples(smooth, frames[2], sides, 0.5)
+    assert error(result, truth) < error(frames[2], truth) + 0.02 * error(smooth, truth)
+
+
+def test_light_that_changes_where_one_neighbour_shows_the_place_is_no_noise() -> None:
+    """A rim that came into the picture: the next frame alone shows it, in light that is 2 % brighter."""
+    truth = lines()
+    frames = np.stack([noisy(truth * np.float32(1 + 0.02 * (t - 2)), 0.001, 10 + t) for t in range(5)])
+    confidence = np.ones(frames.shape[:3], np.float32)
+    confidence[[0, 1, 4], :, :2] = 0
+    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
+    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
+    result = blend_samples(smooth, frames[2], sides, 0.5)
+    assert error(result, truth) < 1.02 * error(frames[2], truth)
+
+
 def test_a_firefly_of_one_frame_is_no_reason() -> None:
     truth = lines()
-    own, sides = window(truth, 0.05)
-    own[40, 50] = 80
+    own, sides = window(truth, 0.05, firefly=(40, 50))
     result = blend_samples(truth, own, sides, 0.5)
     assert np.abs(result[35:46, 45:56] - truth[35:46, 45:56]).max() < 0.1
 
@@ -95,20 +140,22 @@ def test_a_side_frame_that_shows_something_else_is_no_reason() -> None:
     truth = lines()
     own = noisy(truth, 0.2, 3)
     other = np.ascontiguousarray(truth[::-1, ::-1])
-    sides = SampleMean(other, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32))
+    far = np.square(own - other).sum(axis=-1)
+    sides = SampleMean(other, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32), far)
     assert error(blend_samples(truth, own, sides, 0.5), truth) < 0.03 * error(other, truth)
 
 
 def test_side_frames_in_another_light_tell_the_noise_nevertheless() -> None:
     truth = lines()
     own, sides = window(truth, 0.01)
-    dim = SampleMean(np.float32(0.7) * sides.mean, sides.frames, sides.trust)
+    far = np.square(own - np.float32(0.7) * sides.mean).sum(axis=-1)
+    dim = sides._replace(mean=np.float32(0.7) * sides.mean, nearest=far)
     smooth = np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape).astype(np.float32)
     assert error(blend_samples(smooth, own, dim, 0.5), truth) < 1.5 * error(own, truth)
 
 
 def test_a_frame_alone_that_is_flat_has_no_noise() -> None:
-    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((3, *SHAPE), np.float32))
     flat = np.full_like(ONES, 0.5)
     textured = flat * np.random.default_rng(4).uniform(0.8, 1.1, flat.shape).astype(np.float32)
     np.testing.assert_allclose(blend_samples(textured, flat, alone, 0.5), flat, rtol=1e-5)
@@ -118,7 +165,7 @@ def test_a_frame_alone_that_is_flat_has_no_noise() -> None:
 def test_a_frame_alone_with_noise_is_left_to_the_picture(spread: int) -> None:
     """Filters of a renderer may spread samples over several pixels: smooth noise is noise nevertheless."""
 
-    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((3, *SHAPE), np.float32))
     own = cv2.GaussianBlur(noisy(ONES, 0.5, 5), (0, 0), 0.8) if spread > 1 else noisy(ONES, 0.5, 5)
     assert np.abs(blend_samples(ONES, own, alone, 1.0) - ONES).max() < 0.02
 
@@ -143,7 +190,7 @@ def test_a_wrong_outline_is_mended_where_the_alignment_is_off_too() -> None:
 
 
 def test_the_variance_of_the_renderer_counts_where_no_frame_beside_does() -> None:
-    alone = SampleMean(np.zeros_like(ONES), *np.zeros((2, *SHAPE), np.float32))
+    alone = SampleMean(np.zeros_like(ONES), *np.zeros((3, *SHAPE), np.float32))
     truth = lines()
     own = noisy(truth, 0.01, 6)
     known = np.square(np.float32(0.01) * truth)
@@ -157,7 +204,7 @@ def test_the_variance_of_the_renderer_counts_where_no_frame_beside_does() -> Non
 def test_both_corrections_scale_with_the_light(scale: float) -> None:
     truth = lines()
     own, sides = window(truth, 0.1)
-    bright = SampleMean(np.float32(scale) * sides.mean, sides.frames, sides.trust)
+    bright = sides._replace(mean=np.float32(scale) * sides.mean, nearest=np.float32(scale**2) * sides.nearest)
     smooth = np.float32(0.9) * truth
     more = np.float32(scale)
     np.testing.assert_allclose(
@@ -171,7 +218,7 @@ def test_both_corrections_scale_with_the_light(scale: float) -> None:
 
 def test_black_stays_black() -> None:
     black = np.zeros_like(ONES)
-    sides = SampleMean(black, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32))
+    sides = SampleMean(black, np.full(SHAPE, 4, np.float32), np.ones(SHAPE, np.float32), black[..., 0])
     np.testing.assert_array_equal(blend_samples(black, black, sides, 1.0), black)
     np.testing.assert_array_equal(restore_mean(black, black, 1.0), black)
 
@@ -235,4 +282,6 @@ def test_shapes_must_fit() -> None:
     with pytest.raises(ValueError, match="noisy: expected shape"):
         blend_samples(lines()[1:], own, sides, 1.0)
     with pytest.raises(ValueError, match="residuals: expected shape"):
-        average_neighbours(np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), np.ones((4, 5, 3)))
+        average_neighbours(
+            np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), *np.ones((2, 4, 5, 3))
+        )
