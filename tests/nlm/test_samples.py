@@ -103,7 +103,7 @@ def test_the_picture_is_never_worse_than_the_samples_or_itself(noise: float, wro
 
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
 def test_lights_that_pass_over_the_neighbours_are_no_noise(noise: float) -> None:
-    """Snow of one pixel in a hundred in the four frames beside the centre: it counted as noise of a tenth of the light."""
+    """Snow of one pixel in a hundred in the frames beside the centre: it counted as noise of a tenth of the light."""
     truth = lines()
     frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
     rng = np.random.default_rng(15)
