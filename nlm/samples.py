@@ -120,7 +120,7 @@ def blend_samples(
     Notes
     -----
     With p the picture, n the noisy frame and m the mean of the neighbours, times K[n m] / K[m²] as the light may have
-    changed (K narrower, 20 pixels, in v), all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
+    changed (over 20 pixels in v), all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
 
         β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = K[((n − m)(m − p))²] / N,
 
