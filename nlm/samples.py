@@ -57,9 +57,9 @@ _OTHER_LIGHT = 0.02
 # noise that all channels share, and more for other noise. The least one takes a bright sample that a single one of six
 # frames shows as well for light without noise: a sparkle, 0.13 dB of a shot.
 _SECOND, _FEW = 0.33, 0.28
-# Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's for the variance, and
-# the share of the noise that this leaves: one of 20 pixels' worth is taken for light. Over 4 pixels light that changes by
-# 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
+# Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's for the variance,
+# and the share of the noise that this leaves: one of 20 pixels' worth is taken for light. Over 4 pixels light that
+# changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # Cells per deviation of a mean.
