@@ -95,7 +95,7 @@ def average_neighbours(
     estimates, confidence = check_window(estimates, confidence, "confidence")
     if residuals is not None and residuals.shape != estimates.shape:
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
-    shape = estimates.shape[1:]
+    shape, noisy = estimates.shape[1:], np.ascontiguousarray(noisy, np.float32)
     mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
     given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
     run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, noisy, mean)
