@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from loops.parallel import run_bands
 from nlm.average import channel_mean, check_window
 from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
-from nlm.variance import gaussian_mean, second_differences
+from nlm.variance import gaussian_mean, ratio, second_differences
 
 Floats = NDArray[np.float32]
 
@@ -240,14 +240,24 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         around = gaussian_mean(sums[0] / np.float32(side**2), sigma / side)[None]
         dark = np.float32(1e-3 * exposure)
         run_bands(_sum_differences, sums.shape[1], picture, noisy, around, dark, rows, columns, side, sums)
-        means = np.stack([around[0], *(gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:])])
+        means = np.stack([gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:]])
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
-        pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
+        pixels = min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1])
         restored = np.empty_like(picture)
-        limits = dark, pixels, np.float32(certain), np.float32(few)
-        run_bands(_restore, len(picture), picture, means, limits, rows, columns, restored)
+        changes = _known_changes(means.reshape(bins, 6, *around.shape[1:]), pixels, certain, few)
+        changes = np.concatenate([around, changes])
+        run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
         picture = restored
     return picture
+
+
+def _known_changes(sums: Floats, pixels: float, certain: float, few: float) -> Floats:
+    """Known relative changes of three channels, from the means of each bin (bins, 6, rows, columns)."""
+    lit, noise, fourth = sums[:, 0], sums[:, 4], sums[:, 5]
+    known = np.square(sums[:, 1:4]).mean(axis=1)
+    unsure = certain * (1 + np.square(few * ratio(fourth, pixels * np.square(noise))))
+    share = np.clip(1 - ratio(unsure * noise / pixels, known), 0, 1)
+    return (sums[:, 1:4] * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -290,7 +300,9 @@ def _sum_differences(
 ) -> None:  # fmt: skip
     """Sum over cells, for each bin: weight × light, differences of three channels, square, and square²."""
     blended, bins = np.empty((1, around.shape[2]), np.float32), len(sums) // 6
+    cells = np.empty((sums.shape[2], len(sums) - 1), np.float32)
     for row in range(first, last):
+        cells[:] = 0
         for y in rows.pixels[row * side : (row + 1) * side]:
             blend_rows(around, rows, y, blended)
             for column in range(sums.shape[2]):
@@ -306,44 +318,34 @@ def _sum_differences(
                     below, above = _bin(light, dark, bins)
                     for near in range(min(bins, 2)):
                         share = above if near else np.float32(1) - above
-                        plane = 1 + 6 * (below + near)
-                        sums[plane, row, column] += share * weight * light
-                        sums[plane + 1, row, column] += share * r
-                        sums[plane + 2, row, column] += share * g
-                        sums[plane + 3, row, column] += share * b
-                        sums[plane + 4, row, column] += share * power
-                        sums[plane + 5, row, column] += share * (power * power)
+                        cell = cells[column, 6 * (below + near) :]
+                        cell[0] += share * weight * light
+                        cell[1] += share * r
+                        cell[2] += share * g
+                        cell[3] += share * b
+                        cell[4] += share * power
+                        cell[5] += share * (power * power)
+        sums[1:, row] = cells.T
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _restore(
-    first: int, last: int, picture: Floats, means: Floats, limits: tuple[np.float32, ...], rows: Axis, columns: Axis,
+    first: int, last: int, picture: Floats, changes: Floats, dark: np.float32, rows: Axis, columns: Axis,
     restored: Floats,
 ) -> None:  # fmt: skip
-    """Add the known part of the mean differences to a picture."""
-    dark, pixels, certain, few = limits
-    zero, one = np.float32(0), np.float32(1)
-    bins, found = len(means) // 6, np.empty(6, np.float32)
-    blended = np.empty((means.shape[0], means.shape[2]), np.float32)
+    """Add the known relative changes to a picture; their first plane is the light around."""
+    zero, bins = np.float32(0), len(changes) // 3
+    blended = np.empty((changes.shape[0], changes.shape[2]), np.float32)
     for y in range(first, last):
-        blend_rows(means, rows, y, blended)
+        blend_rows(changes, rows, y, blended)
         for x in range(picture.shape[1]):
-            around = blend_columns(blended, 0, columns, x)
-            light = _level(picture, y, x) + np.float32(_SOFT) * around + dark
+            light = _level(picture, y, x) + np.float32(_SOFT) * blend_columns(blended, 0, columns, x) + dark
             below, above = _bin(light, dark, bins)
-            for i in range(6):
-                found[i] = blend_columns(blended, 1 + 6 * below + i, columns, x)
+            for c in range(3):
+                change = blend_columns(blended, 1 + 3 * below + c, columns, x)
                 if above > zero:
-                    found[i] += above * (blend_columns(blended, 7 + 6 * below + i, columns, x) - found[i])
-            lit, red, green, blue, noise, fourth = found
-            power = pixels * (noise * noise)
-            unsure = certain * (one + ((few * fourth / power) ** 2 if power > zero else zero))
-            known = (red * red + green * green + blue * blue) / np.float32(3)
-            share = (known - unsure * noise / pixels) / known if known > zero else zero
-            factor = min(max(share, zero), one) * light / lit
-            restored[y, x, 0] = max(picture[y, x, 0] + red * factor, min(picture[y, x, 0], zero))
-            restored[y, x, 1] = max(picture[y, x, 1] + green * factor, min(picture[y, x, 1], zero))
-            restored[y, x, 2] = max(picture[y, x, 2] + blue * factor, min(picture[y, x, 2], zero))
+                    change += above * (blend_columns(blended, 4 + 3 * below + c, columns, x) - change)
+                restored[y, x, c] = max(picture[y, x, c] + light * change, min(picture[y, x, c], zero))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
