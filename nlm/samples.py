@@ -242,22 +242,24 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         run_bands(_sum_differences, sums.shape[1], picture, noisy, around, dark, rows, columns, side, sums)
         means = np.stack([gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:]])
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
-        pixels = min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1])
+        pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
         restored = np.empty_like(picture)
-        changes = _known_changes(means.reshape(bins, 6, *around.shape[1:]), pixels, certain, few)
+        changes = _known_changes(
+            means.reshape(bins, 6, *around.shape[1:]), pixels, np.float32(certain), np.float32(few)
+        )
         changes = np.concatenate([around, changes])
         run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
         picture = restored
     return picture
 
 
-def _known_changes(sums: Floats, pixels: float, certain: float, few: float) -> Floats:
+def _known_changes(sums: Floats, pixels: np.float32, certain: np.float32, few: np.float32) -> Floats:
     """Known relative changes of three channels, from the means of each bin (bins, 6, rows, columns)."""
     lit, noise, fourth = sums[:, 0], sums[:, 4], sums[:, 5]
     known = np.square(sums[:, 1:4]).mean(axis=1)
-    unsure = certain * (1 + np.square(few * ratio(fourth, pixels * np.square(noise))))
-    share = np.clip(1 - ratio(unsure * noise / pixels, known), 0, 1)
-    return (sums[:, 1:4] * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:])
+    unsure = certain * (np.float32(1) + np.square(few * ratio(fourth, pixels * np.square(noise))))
+    share = np.clip(np.float32(1) - ratio(unsure * noise / pixels, known), 0, 1)
+    return np.asarray((sums[:, 1:4] * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:]), np.float32)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
