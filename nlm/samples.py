@@ -43,8 +43,8 @@ _LIMIT = np.float32(6)
 # (deviation in pixels, k, f, bins) of the Gaussians over which means are restored, where the square of a mean exceeds
 # k (1 + (f / N)²) times its variance, N the number of samples that make the noise: a variance from a few bright samples
 # is unknown itself. Without f a shot at 54 dB lost 2 dB to five fireflies; with f no shot at 8 to 512 samples loses
-# 0.1. f / N for its square costs that shot 0.8 dB, and more of the light that a thousand samples know.
-_MEANS = (48.0, 1.0, 1000.0, 1), (12.0, 7.0, 300.0, 1), (48.0, 4.0, 1000.0, 12)
+# 0.1. f / N in place of its square loses more of the light that a thousand samples know.
+_MEANS = (48.0, 1.0, 800.0, 1), (12.0, 7.0, 300.0, 1), (48.0, 4.0, 1000.0, 12)
 # Stops of light in a bin: darkness beside bright places has a mean of its own.
 _STOPS = np.float32(2)
 # Limit of the distance of a sample from the picture when means are compared, in units of the light. Limits of 20 to 200
@@ -225,7 +225,7 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make the
     noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels but
     those much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
-    nothing around it. The means over σ = 48 pixels come first (k = 1, f = 1000), then those over 12 (7, 300), and last
+    nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300), and last
     those over 48 (4, 1000) of pixels of similar light: K is then over each of 12 bins of two stops, a = 0, and a pixel
     counts in the two bins next to it.
     """
