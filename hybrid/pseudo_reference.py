@@ -108,11 +108,11 @@ def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Ti
     noisy image is then regressed on their difference) takes a third run of OIDN, and was worth 0.05 dB less than the
     constant on thirteen shots.
     """
-    if aligned.first_pass is None or aligned.residual is None or aligned.centre_first_pass is None:
+    if aligned.first_pass is None or (residual := aligned.residual) is None or aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("pool"):
-        pooled = pool_samples(aligned.first_pass, aligned.residual, aligned.confidence, aligned.exposure)
+        pooled = pool_samples(aligned.first_pass, residual, aligned.confidence, aligned.exposure)
         mean = pooled.average * aligned.modulation
         image = pooled.image * aligned.modulation
     with timings.stage("denoise"):

@@ -78,7 +78,7 @@ class WindowResult:
     plan: Plan  # the stages that ran on the window
     # the samples of the other frames at the centre's pixels; with the stage "blend-samples"
     neighbour_samples: SampleMean | None
-    trust: tuple[Trust | None, ...]  # in the frames before and after
+    trust: tuple[Trust | None, ...]  # in the frames before and after; empty of `as_neighbour`
     drift_weight: Array | None  # (H, W): as `AlignedWindow.drift_weight`
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
@@ -87,6 +87,11 @@ class WindowResult:
     repaired: int
     fireflies: int
     outliers: int
+
+    def as_neighbour(self) -> WindowResult:
+        """The result without what only the average of its own frame reads."""
+        alone = Denoised(self.denoised.color)
+        return replace(self, denoised=alone, neighbour_samples=None, trust=(), drift_weight=None)
 
 
 @dataclass(frozen=True)
@@ -136,9 +141,12 @@ class FrameDenoiser:
         noisy frame (`hybrid.validation.find_lost_light`).
         """
         averaged = self.neighbours(number)
-        self._results = {n: result for n, result in self._results.items() if n in averaged}
+        # Of the frame before only what the average reads is left.
+        self._results = {
+            n: result if n >= number else result.as_neighbour() for n, result in self._results.items() if n in averaged
+        }
         for n in averaged:
-            if n not in self._results:
+            if n not in self._results or (n == number and not self._results[n].trust):
                 self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
                 try:
                     self._results[n] = self._denoise_window(n)

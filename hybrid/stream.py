@@ -250,7 +250,9 @@ class FrameStream:
                 inside = np.zeros_like(prepared.valid)
                 inside[region] = prepared.valid[region]
                 prepared = replace(prepared, unfiltered=replace(prepared.unfiltered, region=region), valid=inside)
-        self._cache["read", (number,)] = frame
+        # A first pass reads no more of it.
+        kept = ("number", "color", "albedo", "normal", "estimate", "source")
+        self._cache["read", (number,)] = Frame(**{name: getattr(frame, name) for name in kept})
         return prepared
 
     def _small(self, number: int) -> SmallFrame:

@@ -96,6 +96,7 @@ def pool_samples(window: UNetWindow) -> PooledWindow:
     few samples lost up to 5 dB.
     """
     first_pass, residual, confidence, modulation, exposure, gain, _, _ = window
+    assert residual is not None
     centre = confidence.shape[1] // 2
     total = confidence.sum(1, keepdim=True)
     centre_only = torch.zeros_like(confidence)
@@ -256,13 +257,15 @@ def denoise_window(
     run: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
     *,
     borders: Borders = ((0, 0), (0, 0)),
+    residual: Callable[[slice], NDArray[np.float32]] | None = None,
 ) -> UNetOutput:
     """Run a model, or with gradients `run` where it is wrapped, on an aligned window; the output has the window's size.
 
-    `borders` are the pixels by which the window is mirrored beyond its borders. Without gradients all work at full size
-    runs in strips (`network.strips`), so that the features of all frames are never in memory at once; on a CPU the
-    inputs are packed in one pass (`network.cpu.input_packing`). Raises ValueError if the window has another number of
-    frames.
+    `borders` are the pixels by which the window is mirrored beyond its borders. `residual` makes rows (T, h, W, 3) of
+    the residual of a single window on a CPU, which is then never in memory as a whole. Without gradients all work at
+    full size runs in strips (`network.strips`), so that the features of all frames are never in memory at once; on a
+    CPU the inputs are packed in one pass (`network.cpu.input_packing`). Raises ValueError if the window has another
+    number of frames.
     """
     model.expect_frames(window.confidence.shape[1])
     height, width = window.modulation.shape[-2:]
@@ -276,7 +279,7 @@ def denoise_window(
         *inputs, average = pack_rows(rows)
         encoded, blend = (model if run is None else run)(*inputs)
     else:
-        pack = packer(window, columns) if can_pack(window) else pack_rows
+        pack = packer(window, columns, residual) if can_pack(window) else pack_rows
 
         def encode(rows: Tensor) -> list[Tensor]:
             frames, shared, static, average = pack(rows[:, 0].numpy())

@@ -17,8 +17,8 @@ class UNetWindow(NamedTuple):
 
     first_pass: Tensor  # ``(N, T, 3, H, W)`` irradiance: each frame denoised by itself
     # ``(N, T, 3, H, W)`` irradiance of the noisy frames minus `first_pass`, each frame's in its own place, aligned to
-    # the nearest pixel
-    residual: Tensor
+    # the nearest pixel; None where `network.robust_unet.denoise_window` gets a function for it
+    residual: Tensor | None
     confidence: Tensor  # ``(N, T, 1, H, W)``, at least 0
     modulation: Tensor  # ``(N, 3, H, W)``; radiance is irradiance times modulation
     exposure: Tensor  # ``(N,)``, positive: brightness of the irradiance of whole frames

@@ -118,6 +118,13 @@ def check_window(window: Floats, weight: Floats, name: str = "weight") -> tuple[
     return np.ascontiguousarray(window, np.float32), np.ascontiguousarray(weight, np.float32)
 
 
+def check_strip(strip: Floats, window: Floats, top: int) -> None:
+    """Raise ValueError unless a strip holds rows of a window from row `top` on."""
+    expected = (len(window), min(strip.shape[1], window.shape[1] - top), *window.shape[2:])
+    if strip.shape != expected:
+        raise ValueError(f"residuals: expected shape {expected} from row {top} on, got {strip.shape}")
+
+
 def check_exposure(exposure: float) -> None:
     """Raise ValueError unless the exposure is positive and finite."""
     if not (exposure > 0 and np.isfinite(exposure)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import cv2
@@ -10,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_exposure, check_window
+from nlm.average import check_exposure, check_strip, check_window
 
 Floats = NDArray[np.float32]
 
@@ -65,13 +66,16 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     return pooled
 
 
-def clamp_to_window(picture: Floats, estimates: Floats, residuals: Floats) -> Floats:
+def clamp_to_window(picture: Floats, estimates: Floats, residuals: Iterable[tuple[int, Floats]]) -> Floats:
     """Clamp each channel of a picture (H, W, 3) to the range of estimates and samples within 3×3 pixels of any frame.
 
-    Estimates and residuals are those of `pool_samples`; non-finite values do not count.
+    Estimates and residuals are those of `pool_samples`, the residuals in strips of rows, with the first row of each;
+    non-finite values do not count.
     """
     low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
-    run_bands(_range, len(picture), estimates, residuals, low, high)
+    for top, strip in residuals:
+        check_strip(strip, estimates, top)
+        run_bands(_range, strip.shape[1], estimates, strip, low, high, top)
     box = np.ones((3, 3), np.uint8)
     return np.clip(picture, cv2.erode(low, box).reshape(low.shape), cv2.dilate(high, box).reshape(low.shape))
 
@@ -115,14 +119,15 @@ def _pool(
 
 
 @njit(cache=True, nogil=True)
-def _range(first: int, last: int, estimates: Floats, residuals: Floats, low: Floats, high: Floats) -> None:
+def _range(first: int, last: int, estimates: Floats, residuals: Floats, low: Floats, high: Floats, top: int) -> None:
     """Write the least and the greatest finite value of the estimates and the samples of all frames."""
     infinite = np.float32(np.inf)
-    for y in range(first, last):
+    for row in range(first, last):
+        y = top + row
         least, most = low[y].reshape(-1), high[y].reshape(-1)
         least[:], most[:] = infinite, -infinite
         for t in range(len(estimates)):
-            estimate, residual = estimates[t, y].reshape(-1), residuals[t, y].reshape(-1)
+            estimate, residual = estimates[t, y].reshape(-1), residuals[t, row].reshape(-1)
             # Choices and no branches, so that several values are computed at once.
             for i in range(len(least)):
                 value = estimate[i]

@@ -6,6 +6,7 @@ of a window show where, as samples of one frame are independent of those of anot
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import channel_mean, check_window
+from nlm.average import channel_mean, check_strip, check_window
 from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
 from nlm.variance import gaussian_mean, ratio, second_differences
 
@@ -81,7 +82,12 @@ class SampleMean(NamedTuple):
 
 
 def average_neighbours(
-    estimates: Floats, residuals: Floats | None, confidence: Floats, geometry: Floats, modulation: Floats, noisy: Floats
+    estimates: Floats,
+    residuals: Iterable[tuple[int, Floats]] | None,
+    confidence: Floats,
+    geometry: Floats,
+    modulation: Floats,
+    noisy: Floats,
 ) -> SampleMean:
     """Average the samples of all frames of a window except the centre.
 
@@ -89,19 +95,20 @@ def average_neighbours(
     ----------
     estimates : (T, H, W, 3) float32
         Denoised, aligned; with `residuals` None the noisy frames.
-    residuals : (T, H, W, 3) float32, optional, noisy frame minus estimate, aligned
+    residuals : iterable of (int, (T, h, W, 3) float32), optional
+        Noisy frame minus estimate, aligned, in strips of rows with the first row of each; together they are the frame.
     confidence, geometry : (T, H, W) float32
         Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
     modulation : (H, W, 3) float32, factor from the unit of the window to radiance
     noisy : (H, W, 3) float32, radiance of the centre as rendered
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
-    if residuals is not None and residuals.shape != estimates.shape:
-        raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
     shape, noisy = estimates.shape[1:], np.ascontiguousarray(noisy, np.float32)
     mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
-    given = estimates, estimates if residuals is None else np.ascontiguousarray(residuals, np.float32)
-    run_bands(_average, shape[0], *given, residuals is not None, confidence, geometry, modulation, noisy, mean)
+    for top, strip in [(0, estimates)] if residuals is None else residuals:
+        check_strip(strip, estimates, top)
+        given = estimates, np.ascontiguousarray(strip, np.float32), residuals is not None
+        run_bands(_average, strip.shape[1], *given, confidence, geometry, modulation, noisy, mean, top)
     return mean
 
 
@@ -353,11 +360,12 @@ def _restore(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(
     first: int, last: int, estimates: Floats, residuals: Floats, add: bool, confidence: Floats, geometry: Floats,
-    modulation: Floats, noisy: Floats, out: SampleMean,
+    modulation: Floats, noisy: Floats, out: SampleMean, top: int,
 ) -> None:  # fmt: skip
     mean, frames, trust, nearest = out
     T, _, W, C = estimates.shape
-    for y in range(first, last):
+    for row in range(first, last):
+        y = top + row
         for x in range(W):
             total, squares = np.float64(0), np.float64(0)  # the square of a small confidence must not vanish
             greatest, count = np.float32(0), 0
@@ -369,14 +377,14 @@ def _average(
                     continue
                 level = np.float32(0)
                 for c in range(C):
-                    level += estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
+                    level += estimates[t, y, x, c] + (residuals[t, row, x, c] if add else np.float32(0))
                 if not np.isfinite(level):
                     continue
                 total += weight
                 squares += np.float64(weight) ** 2
                 distance = np.float32(0)
                 for c in range(C):
-                    value = estimates[t, y, x, c] + (residuals[t, y, x, c] if add else np.float32(0))
+                    value = estimates[t, y, x, c] + (residuals[t, row, x, c] if add else np.float32(0))
                     value *= modulation[y, x, c]
                     mean[y, x, c] += weight * value
                     distance += (noisy[y, x, c] - value) ** 2

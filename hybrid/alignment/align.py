@@ -120,7 +120,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
         sides = None
         if "blend-samples" in stages:
             # Before the first pass is pulled to the centre's: the samples stay as they are.
-            pictures, residual = (color, None) if estimates is None else (estimates, sources.residual)
+            pictures, residual = (color, None) if estimates is None else (estimates, sources.residual_strips())
             assert pictures is not None
             noisy = centre.radiance[padded]
             sides = average_neighbours(pictures, residual, confidence, warped.confidence, modulation, noisy)

@@ -148,7 +148,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
             repaired = repaired | bad_here
         layers[name] = layer
     albedo, normal, variance = layers.values()
-    albedo = None if albedo is None else np.maximum(albedo, 0)
+    albedo = albedo if albedo is None or albedo.min() >= 0 else np.maximum(albedo, 0)
     aovs = {}
     for name, layer in frame.aovs.items():
         aovs[name], bad_here = replace_nonfinite(layer)

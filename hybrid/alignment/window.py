@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -21,6 +21,9 @@ from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_wi
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+
+# Rows of a strip of residuals: those of five frames fit the caches of a processor.
+STRIP = 64
 
 
 @dataclass(frozen=True)
@@ -84,21 +87,31 @@ class WarpSources:
                 out[...] = getattr(frame, name)[first : first + len(here)]
         return window
 
-    @cached_property
-    def residual(self) -> Array:
-        """Noisy irradiance − first pass of each frame, (T, h, W, 3), each divided by its own albedo.
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the rows."""
+        width = next(frame.irradiance.shape[1] for frame in self.frames if frame is not None)
+        return self.rows.stop - self.rows.start, width
 
-        Warped to the nearest pixel; 0 where a frame or its first pass is missing.
+    def residual(self, part: tuple[slice, slice] = np.s_[:, :]) -> Array:
+        """Noisy irradiance − first pass of each frame, (T, h, w, 3), each divided by its own albedo.
+
+        Warped to the nearest pixel; 0 where a frame or its first pass is missing. `part` are rows and columns.
         """
-        shape = next(frame.irradiance[self.rows].shape for frame in self.frames if frame is not None)
-        residuals = np.empty((len(self.frames), *shape), np.float32)
+        (top, bottom, _), (left, right, _) = (s.indices(size) for s, size in zip(part, self.shape, strict=True))
+        residuals = np.empty((len(self.frames), bottom - top, right - left, 3), np.float32)
         for frame, denoised, flow, out in zip(self.frames, self.first_pass, self.flows, residuals, strict=True):
             if frame is None or denoised is None:
                 out[:] = 0
                 continue
-            divisor = frame.albedo if frame.demodulated else None
-            warp_residual(frame.irradiance, denoised, divisor, flow, self.rows.start, out)
+            divisor, moved = frame.albedo if frame.demodulated else None, None if flow is None else flow[part]
+            warp_residual(frame.irradiance, denoised, divisor, moved, (self.rows.start + top, left), out)
         return residuals
+
+    def residual_strips(self) -> Iterator[tuple[int, Array]]:
+        """Yield the residual strip by strip, with the first row of each: it is made for each use, and not kept."""
+        for top in range(0, self.shape[0], STRIP):
+            yield top, self.residual(np.s_[top : top + STRIP, :])
 
 
 @dataclass(frozen=True)
@@ -183,8 +196,8 @@ class AlignedWindow:
 
     @property
     def residual(self) -> Array | None:
-        """Noisy irradiance − first pass, aligned, (T, H, W, 3); None without a first pass (`WarpSources.residual`)."""
-        return None if self.first_pass is None else self.sources.residual
+        """Noisy irradiance − first pass, aligned, (T, H, W, 3); None without a first pass. Made at each access."""
+        return None if self.first_pass is None else self.sources.residual()
 
     @property
     def centre(self) -> int:

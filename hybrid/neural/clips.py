@@ -135,7 +135,7 @@ def _level(
 ) -> dict[str, torch.Tensor]:
     """Fields of a clip at one noise level, with L = 1; with its own target if it needs one."""
     aligned = stream.align(number)
-    if aligned.first_pass is None or aligned.residual is None:
+    if aligned.first_pass is None or (residual := aligned.residual) is None:
         raise ValueError("estimate: expected one that gives pictures, since clips hold estimates, got none")
     color = aligned.mixed(aligned.color)
     noisy, _ = replace_nonfinite(shot.read(number).color)
@@ -148,7 +148,7 @@ def _level(
         "albedo": np.zeros_like(color) if aligned.albedo is None else aligned.mixed(aligned.albedo),
         "normal": np.zeros_like(color) if aligned.normal is None else aligned.mixed(aligned.normal),
         "estimate": aligned.first_pass,
-        "residual": aligned.residual,
+        "residual": residual,
         "confidence": aligned.confidence[..., None],
     }
     images = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,14 +38,14 @@ class UNetDenoiser(NetworkDenoiser):
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         """Denoise the centre of a window."""
-        if aligned.first_pass is None or aligned.residual is None or aligned.centre_first_pass is None:
+        if aligned.first_pass is None or aligned.centre_first_pass is None:
             raise ValueError("estimate: expected those of the frames, as this network takes, got none")
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
             black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
             nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, self._window(aligned), nothing, bool(black))
-            limited = clamp_to_window(result.irradiance, aligned.first_pass, aligned.residual)
+            limited = clamp_to_window(result.irradiance, aligned.first_pass, aligned.sources.residual_strips())
             result = result._replace(irradiance=limited)
             filtered = filter_aovs(aligned, limited)
             shared = share_out(aligned, filtered, limited, add=self.setup.add_layers)
@@ -60,18 +61,28 @@ class UNetDenoiser(NetworkDenoiser):
         borders: Borders = border(outer[0], height), border(outer[1], width)
         layers = {name: layer for name, layer in window._asdict().items() if layer is not None}
         parts = {name: layer if layer.ndim == 1 else layer[..., *outer] for name, layer in layers.items()}
-        tile = UNetWindow(**{name: part.to(self.setup.torch_device) for name, part in parts.items()})
-        output = denoise_window(self.model, tile, borders=borders)
+        tile = window._replace(**{name: part.to(self.setup.torch_device) for name, part in parts.items()})
+        in_strips = partial(_residual_rows, aligned, outer) if window.residual is None else None
+        output = denoise_window(self.model, tile, borders=borders, residual=in_strips)
         return Tile(output.irradiance, None, output.parts)
 
     def _window(self, aligned: AlignedWindow) -> UNetWindow:
         """The window as tensors that are views of its arrays."""
-        layers: Any = aligned.first_pass, aligned.residual, aligned.confidence[..., None], aligned.modulation[None]
-        first_pass, residual, confidence, modulation = (tensor_of(layer, copied=False) for layer in layers)
+        layers: Any = aligned.first_pass, aligned.confidence[..., None], aligned.modulation[None]
+        first_pass, confidence, modulation = (tensor_of(layer, copied=False) for layer in layers)
+        # On a processor the residual is made strip by strip; a breakdown reads the whole.
+        whole = None if self.setup.torch_device.type == "cpu" and self.setup.breakdown is None else aligned.residual
+        residual = None if whole is None else tensor_of(whole, copied=False)
         guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.guides
         centre = {n: tensor_of(np.asarray(g, np.float32)[None], copied=False)[:, 0] for n, g in guides.items()}
         gain, exposure = gain_of(aligned), exposure_of(aligned)
         return UNetWindow(first_pass, residual, confidence, modulation[:, 0], exposure, gain, **centre)
+
+
+def _residual_rows(aligned: AlignedWindow, outer: Block, rows: slice) -> Array:
+    """Rows of the residual within a tile, (T, h, w, 3)."""
+    top = outer[0].start
+    return aligned.sources.residual((slice(top + rows.start, top + rows.stop), outer[1]))
 
 
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:

@@ -165,5 +165,5 @@ if __name__ == "__main__":
     window, image = np.zeros((3, 4, 4, 3), np.float32), np.zeros((4, 4, 3), np.float32)
     confidence = np.zeros(window.shape[:3], np.float32)
     # Every run reaches these late; what is compiled by then is loaded.
-    mean = average_neighbours(window, window, confidence, confidence, image, image)
+    mean = average_neighbours(window, [(0, window)], confidence, confidence, image, image)
     restore_mean(blend_samples(image, image, mean, 1.0), image, 1.0)

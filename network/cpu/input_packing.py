@@ -26,7 +26,7 @@ Indices = NDArray[np.int64]
 
 
 class _Source(NamedTuple):
-    """Layers of one window, channels last; guides that are missing have no rows."""
+    """Layers of one window, channels last; the residual from row `top` on; guides that are missing have no rows."""
 
     first_pass: Floats
     residual: Floats
@@ -51,15 +51,19 @@ def can_pack(window: UNetWindow) -> bool:
     return all(layer.dtype == torch.float32 and layer.device.type == "cpu" for layer in layers)
 
 
-def packer(window: UNetWindow, columns: Indices) -> Callable[[Indices], PackedInputs]:
+def packer(
+    window: UNetWindow, columns: Indices, residual: Callable[[slice], Floats] | None = None
+) -> Callable[[Indices], PackedInputs]:
     """Make a function that packs rows of a window: it maps h row numbers to inputs of h×w pixels.
 
     `columns` has the column of the window for each column of the inputs; layers whose channels are not last are copied.
+    `residual` is as for `network.robust_unet.denoise_window`.
     """
-    layers = [_pixels(layer) for layer in (window.first_pass, window.residual, window.confidence, window.modulation)]
-    batch, count = layers[0].shape[:2]
+    first_pass, confidence, modulation = map(_pixels, (window.first_pass, window.confidence, window.modulation))
+    batch, count = first_pass.shape[:2]
+    whole = None if window.residual is None else _pixels(window.residual)
     missing = np.empty((batch, 0, 0, 3), np.float32)
-    layers += [missing if guide is None else _pixels(guide) for guide in (window.albedo, window.normal)]
+    guides = [missing if guide is None else _pixels(guide) for guide in (window.albedo, window.normal)]
     scales = np.stack([window.exposure.numpy(), window.gain.numpy()], axis=1)
 
     def pack(rows: Indices) -> PackedInputs:
@@ -67,10 +71,13 @@ def packer(window: UNetWindow, columns: Indices) -> Callable[[Indices], PackedIn
         frames = np.empty((count, batch, *size, FRAME_CHANNELS), np.float32)
         channels = SHARED_CHANNELS, STATIC_CHANNELS, 3
         shared, static, average = (np.empty((batch, *size, depth), np.float32) for depth in channels)
+        top = 0 if residual is None else int(rows.min())
+        strip = None if residual is None else residual(slice(top, int(rows.max()) + 1))
         for n in range(batch):
-            source = _Source(*(layer[n] for layer in layers))
+            noise = whole[n] if strip is None and whole is not None else strip
+            source = _Source(first_pass[n], noise, confidence[n], modulation[n], *(guide[n] for guide in guides))
             target = _Target(frames[:, n], shared[n], static[n], average[n])
-            run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table())
+            run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table(), top)
         flat = frames.reshape(count * batch, *size, FRAME_CHANNELS)
         return PackedInputs(
             *(torch.from_numpy(pixels).permute(0, 3, 1, 2) for pixels in (flat, shared, static, average))
@@ -87,7 +94,7 @@ def _pixels(layer: Tensor) -> Floats:
 @njit(cache=True, nogil=True)
 def _pack(
     first: int, last: int, source: _Source, scales: Floats, rows: Indices, columns: Indices, target: _Target,
-    curve: Floats,
+    curve: Floats, top: int,
 ) -> None:  # fmt: skip
     first_pass, residual, confidence, modulation, albedo, normal = source
     frames, shared, static, average = target
@@ -99,6 +106,7 @@ def _pack(
     bits = value.view(np.uint32)  # of the same four bytes
     for y in range(first, last):
         row = rows[y]
+        strip = row - top
         for x in range(len(columns)):
             column = columns[x]
             total = zero
@@ -115,11 +123,11 @@ def _pack(
                 level, excess = zero, zero
                 for c in range(3):
                     level += first_pass[t, row, column, c]
-                    excess += residual[t, row, column, c]
+                    excess += residual[t, strip, column, c]
                 limit = RESIDUAL_LIMIT * (max(level / np.float32(3), zero) + exposure)
                 kept = limit / max(abs(excess / np.float32(3)), limit)
                 for c in range(3):
-                    held[t, c] = residual[t, row, column, c] * kept
+                    held[t, c] = residual[t, strip, column, c] * kept
             samples = one / squares / np.float32(T)
             guides = shared[y, x]
             for c in range(3):

@@ -51,7 +51,7 @@ def test_the_mean_of_the_sides_is_its_definition() -> None:
     confidence[:, 3] = 0
     estimates[0, 5] = np.nan
     modulation, own = rng.uniform(0.1, 1, (2, 9, 11, 3)).astype(np.float32)
-    found = average_neighbours(estimates, residuals, confidence, np.zeros_like(confidence), modulation, own)
+    found = average_neighbours(estimates, [(0, residuals)], confidence, np.zeros_like(confidence), modulation, own)
     for y, x in np.ndindex(9, 11):
         sides = [t for t in (0, 1, 3, 4) if confidence[t, y, x] > 0 and np.isfinite(estimates[t, y, x]).all()]
         weights = confidence[sides, y, x].astype(np.float64)
@@ -300,7 +300,6 @@ def test_shapes_must_fit() -> None:
     own, sides = window(lines(), 0.1)
     with pytest.raises(ValueError, match="noisy: expected shape"):
         blend_samples(lines()[1:], own, sides, 1.0)
+    strips = [(0, np.zeros((3, 4, 4, 3)))]
     with pytest.raises(ValueError, match="residuals: expected shape"):
-        average_neighbours(
-            np.zeros((3, 4, 5, 3)), np.zeros((3, 4, 4, 3)), *np.ones((2, 3, 4, 5)), *np.ones((2, 4, 5, 3))
-        )
+        average_neighbours(np.zeros((3, 4, 5, 3)), strips, *np.ones((2, 3, 4, 5)), *np.ones((2, 4, 5, 3)))

@@ -20,5 +20,5 @@ def test_the_difference_is_moved_by_whole_pixels(moves, divided):
     expected = warp(difference, flow[rows], interpolation="nearest", first_row=rows.start)[0]
     found = np.empty((14, 30, 3), np.float32)
     given = irradiance, first_pass, albedo if divided else None, flow[rows] if moves else None
-    warp_residual(*given, rows.start, found)
+    warp_residual(*given, (rows.start, 0), found)
     np.testing.assert_array_equal(found, expected if moves else difference[rows])
