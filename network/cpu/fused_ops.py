@@ -217,13 +217,24 @@ def _spread(bits: Any, source: Any, low: Any) -> None:
 
 
 @njit(nogil=True)
-def _add_taps(sums: Any, above: Any, centre: Any, below: Any, taps: Any) -> None:
-    a0, a1, a2, o0, o1, o2, b0, b1, b2 = taps
-    for x in range(np.uintp(len(sums))):  # unsigned: numba tests signed indices for counting from the end
+def _nine(t: Any) -> Any:
+    return t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2], t[2, 0], t[2, 1], t[2, 2]
+
+
+@njit(nogil=True)
+def _add_taps(red: Any, green: Any, blue: Any, above: Any, centre: Any, below: Any, taps: Any) -> None:
+    r, g, b = taps
+    for x in range(np.uintp(len(red))):  # unsigned: numba tests signed indices for counting from the end
         after, beyond = x + np.uintp(1), x + np.uintp(2)
-        upper = a0 * above[x] + a1 * above[after] + a2 * above[beyond]
-        middle = o0 * centre[x] + o1 * centre[after] + o2 * centre[beyond]
-        sums[x] += upper + middle + (b0 * below[x] + b1 * below[after] + b2 * below[beyond])
+        a0, a1, a2 = above[x], above[after], above[beyond]
+        c0, c1, c2 = centre[x], centre[after], centre[beyond]
+        b0, b1, b2 = below[x], below[after], below[beyond]
+        upper, middle = r[0] * a0 + r[1] * a1 + r[2] * a2, r[3] * c0 + r[4] * c1 + r[5] * c2
+        red[x] += upper + middle + (r[6] * b0 + r[7] * b1 + r[8] * b2)
+        upper, middle = g[0] * a0 + g[1] * a1 + g[2] * a2, g[3] * c0 + g[4] * c1 + g[5] * c2
+        green[x] += upper + middle + (g[6] * b0 + g[7] * b1 + g[8] * b2)
+        upper, middle = b[0] * a0 + b[1] * a1 + b[2] * a2, b[3] * c0 + b[4] * c1 + b[5] * c2
+        blue[x] += upper + middle + (b[6] * b0 + b[7] * b1 + b[8] * b2)
 
 
 @njit(cache=True, nogil=True)
@@ -248,9 +259,8 @@ def _convolve_to_rgb(
         above, centre, below = rows[(y - 1) % 3], rows[y % 3], rows[(y + 1) % 3]
         for color in range(3):
             sums[color] = bias[color]
-            for c in range(channels):
-                t = taps[color, c]
-                nine = t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2], t[2, 0], t[2, 1], t[2, 2]
-                _add_taps(sums[color], above[c], centre[c], below[c], nine)
+        for c in range(channels):
+            nine = _nine(taps[0, c]), _nine(taps[1, c]), _nine(taps[2, c])
+            _add_taps(sums[0], sums[1], sums[2], above[c], centre[c], below[c], nine)
         for x in range(width):
             image[y, x, 0], image[y, x, 1], image[y, x, 2] = sums[0, x], sums[1, x], sums[2, x]
