@@ -20,6 +20,8 @@ from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
+from hybrid.alignment.residual import Limited, measure_limited
+from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
 from hybrid.files.frame import Frame, Frames
@@ -164,7 +166,8 @@ class FrameStream:
         # Frame by frame, as a first pass may need the frame as read, which is dropped then.
         pairs = [(self.frame(n), self.denoised(n) if with_first_pass else None) for n in numbers]
         frames, denoised = zip(*pairs, strict=True)
-        return self._collect(number, numbers, frames, denoised if with_first_pass else None)
+        window = self._collect(number, numbers, frames, denoised if with_first_pass else None)
+        return replace(window, limited=tuple(map(self._limited, numbers))) if with_first_pass else window
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
         """The window of a frame and its two neighbours, with these results (H, W, 3) in the place of a first pass."""
@@ -275,6 +278,19 @@ class FrameStream:
                 return measure_pair(first, second, (self._small(a), self._small(b)))
 
         return self._cached("pair facts", (a, b), measure)
+
+    def _limited(self, number: int) -> Limited | None:
+        """The light that the limit of residuals takes from a frame; None if that is little, or without a first pass."""
+        frame, denoised = self.frame(number), self.denoised(number)
+        if frame is None or denoised is None:
+            return None
+
+        def measure(_: int) -> Limited | None:
+            with self.timings.stage("plan"):
+                albedo = frame.albedo if frame.demodulated else None
+                return measure_limited(frame.irradiance, denoised, albedo, measure_exposure(frame.irradiance))
+
+        return self._cached("limited", (number,), measure)
 
     def _repeats(self, a: int, b: int) -> bool:
         """Whether one of two neighbouring frames is the other once more."""

@@ -88,7 +88,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
     own = layers.pop("color") if given else layers["color"]
     warped = _warp_neighbours(window, layers, guides, padded, timings)
     flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
-    sources = WarpSources(window.frames, flows, window.first_pass or (), padded)
+    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded)
     with timings.stage("confidence"):
         # Before the first pass is warped, whose place in memory the guide of all frames has until then.
         clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None

@@ -14,7 +14,7 @@ from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import PreparedFrame
-from hybrid.alignment.residual import warp_residual
+from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.passes import NO_PASSES, Passes
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
@@ -37,6 +37,7 @@ class Window:
     repeated: tuple[bool, ...]  # whether a frame has the samples of the frame beside it on the side of the centre
     # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
+    limited: tuple[Limited | None, ...] = ()  # what the limit of residuals takes from each frame with a first pass
 
     @property
     def centre(self) -> PreparedFrame:
@@ -68,6 +69,7 @@ class WarpSources:
     # (h, W, 2), from these rows of the centre to each; None for the centre and where there is none
     flows: Sequence[Array | None]
     first_pass: Sequence[Array | None]  # (H, W, 3): denoised radiance of each frame; empty without a first pass
+    limited: Sequence[Limited | None]  # as `Window.limited`
     rows: slice  # of the centre
 
     def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
@@ -93,19 +95,22 @@ class WarpSources:
         width = next(frame.irradiance.shape[1] for frame in self.frames if frame is not None)
         return self.rows.stop - self.rows.start, width
 
-    def residual(self, part: tuple[slice, slice] = np.s_[:, :]) -> Array:
+    def residual(self, part: tuple[slice, slice] = np.s_[:, :], *, limited: bool = False) -> Array:
         """Noisy irradiance − first pass of each frame, (T, h, w, 3), each divided by its own albedo.
 
-        Warped to the nearest pixel; 0 where a frame or its first pass is missing. `part` are rows and columns.
+        Warped to the nearest pixel; 0 where a frame or its first pass is missing. `part` are rows and columns;
+        `limited` as a network gets it, with bright samples limited and their light spread.
         """
         (top, bottom, _), (left, right, _) = (s.indices(size) for s, size in zip(part, self.shape, strict=True))
         residuals = np.empty((len(self.frames), bottom - top, right - left, 3), np.float32)
-        for frame, denoised, flow, out in zip(self.frames, self.first_pass, self.flows, residuals, strict=True):
+        limits = self.limited if limited else len(self.frames) * (None,)
+        sources = zip(self.frames, self.first_pass, self.flows, limits, residuals, strict=True)
+        for frame, denoised, flow, limit, out in sources:
             if frame is None or denoised is None:
                 out[:] = 0
                 continue
             divisor, moved = frame.albedo if frame.demodulated else None, None if flow is None else flow[part]
-            warp_residual(frame.irradiance, denoised, divisor, moved, (self.rows.start + top, left), out)
+            warp_residual(frame.irradiance, denoised, divisor, moved, (self.rows.start + top, left), out, limit)
         return residuals
 
     def residual_strips(self) -> Iterator[tuple[int, Array]]:
@@ -196,8 +201,11 @@ class AlignedWindow:
 
     @property
     def residual(self) -> Array | None:
-        """Noisy irradiance − first pass, aligned, (T, H, W, 3); None without a first pass. Made at each access."""
-        return None if self.first_pass is None else self.sources.residual()
+        """Noisy irradiance − first pass, aligned and limited, (T, H, W, 3); None without a first pass.
+
+        Made at each access.
+        """
+        return None if self.first_pass is None else self.sources.residual(limited=True)
 
     @property
     def centre(self) -> int:

@@ -82,7 +82,7 @@ class UNetDenoiser(NetworkDenoiser):
 def _residual_rows(aligned: AlignedWindow, outer: Block, rows: slice) -> Array:
     """Rows of the residual within a tile, (T, h, w, 3)."""
     top = outer[0].start
-    return aligned.sources.residual((slice(top + rows.start, top + rows.stop), outer[1]))
+    return aligned.sources.residual((slice(top + rows.start, top + rows.stop), outer[1]), limited=True)
 
 
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
