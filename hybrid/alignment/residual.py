@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -74,7 +74,10 @@ def measure_limited(irradiance: Array, first_pass: Array, albedo: Array | None, 
 
     Parameters
     ----------
-    irradiance, first_pass, albedo
+    irradiance : (H, W, 3) array
+    first_pass : (H, W, 3) array
+        Radiance.
+    albedo : (H, W, 3) array or None
         As for `warp_residual`.
     exposure : float
         Of the irradiance.
@@ -99,16 +102,14 @@ _NOTHING = Limited(np.empty((0, 0, 0), np.float32), cell_axis(1, 1), cell_axis(1
 
 
 @njit(nogil=True, inline="always")
-def _limit(residual: Array, light: np.float32) -> np.float32:
+def _limit(residual: Any, light: Any) -> Any:
     """Factor that limits a residual to `RESIDUAL_LIMIT` times the light, in the mean over channels."""
     limit = RESIDUAL_LIMIT * light
     return limit / max(abs((residual[0] + residual[1] + residual[2]) / np.float32(3)), limit)
 
 
 @njit(nogil=True, inline="always")
-def _difference(
-    irradiance: Array, first_pass: Array, albedo: Array, row: int, column: int, residual: Array
-) -> np.float32:
+def _difference(irradiance: Any, first_pass: Any, albedo: Any, row: Any, column: Any, residual: Any) -> Any:
     """Write irradiance − first pass of a pixel; return the first pass, in the mean over channels and at least 0."""
     level, zero = np.float32(0), np.float32(0)
     for c in range(3):
@@ -166,7 +167,7 @@ def _warp_residual(
 
 
 @njit(nogil=True, inline="always")
-def _between(cells: Array, columns: Axis, x: int) -> np.float32:
+def _between(cells: Any, columns: Any, x: Any) -> Any:
     """Value between the centres of a row's cells."""
     first = cells[columns.before[x]]
     return first + columns.share[x] * (cells[columns.after[x]] - first)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flow.warp import warp
-from hybrid.alignment.residual import warp_residual
+from hybrid.alignment.residual import measure_limited, warp_residual
 from hybrid.alignment.transfer import demodulate
 
 
@@ -22,3 +22,56 @@ def test_the_difference_is_moved_by_whole_pixels(moves, divided):
     given = irradiance, first_pass, albedo if divided else None, flow[rows] if moves else None
     warp_residual(*given, (rows.start, 0), found)
     np.testing.assert_array_equal(found, expected if moves else difference[rows])
+
+
+def few_bright_samples(scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A gray wall of light 1 that one sample in fifty carries, and a first pass that is right."""
+    rng = np.random.default_rng(1)
+    bright = rng.random((120, 160, 1)) < 0.02
+    irradiance = np.where(bright, np.float32(50), np.float32(0)) * np.ones(3, np.float32)
+    return np.float32(scale) * irradiance, np.full(irradiance.shape, scale, np.float32)
+
+
+def limited_residual(irradiance, first_pass, limited, rows=slice(0, 120)):
+    out = np.empty((rows.stop - rows.start, 160, 3), np.float32)
+    warp_residual(irradiance, first_pass, None, None, (rows.start, 0), out, limited)
+    return out
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e5])
+def test_limited_residuals_keep_the_light_of_a_first_pass_that_is_right(scale):
+    """The limit alone leaves a seventh of it; noise of few samples keeps some of it cut."""
+    irradiance, first_pass = few_bright_samples(scale)
+    limited = measure_limited(irradiance, first_pass, None, 0.1 * scale)
+    found = limited_residual(irradiance, first_pass, limited) / scale
+    assert found.max() < 8
+    assert abs(found.mean()) < 0.1
+
+
+def test_no_more_light_is_spread_than_was_cut():
+    irradiance, first_pass = few_bright_samples()
+    limited = measure_limited(irradiance, 2 * first_pass, None, 0.1)
+    found = limited_residual(irradiance, 2 * first_pass, limited)
+    assert found.mean() == pytest.approx(float((irradiance - 2 * first_pass).mean()), abs=0.05)
+
+
+def test_noise_within_the_limit_is_left_alone():
+    first_pass = np.ones((40, 50, 3), np.float32)
+    noisy = np.random.default_rng(0).exponential(1.0, first_pass.shape).astype(np.float32)
+    assert measure_limited(np.minimum(noisy, 6), first_pass, None, 0.1) is None
+    assert measure_limited(first_pass, 2 * first_pass, None, 0.1) is None  # a first pass that is too bright
+
+
+def test_one_firefly_brightens_nothing():
+    """What is cut off from it is no light that anything around it lacks."""
+    first_pass = np.ones((120, 160, 3), np.float32)
+    noisy = first_pass.copy()
+    noisy[60, 80] = 1e6
+    assert measure_limited(noisy, first_pass, None, 0.1) is None
+
+
+def test_a_part_is_limited_as_the_whole():
+    irradiance, first_pass = few_bright_samples()
+    limited = measure_limited(irradiance, first_pass, None, 0.1)
+    whole = limited_residual(irradiance, first_pass, limited)
+    np.testing.assert_array_equal(limited_residual(irradiance, first_pass, limited, slice(37, 80)), whole[37:80])
