@@ -23,6 +23,9 @@ Floats = NDArray[np.float32]
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
 # costs up to 1.3 dB of a rendered shot at 8 samples.
 _DEVIATIONS = 2.5
+# Deviations of the estimate of that noise: at 0, places where no frame has a bright sample became dimples in a flat wall
+# at 8 samples. No shot at 8 or 512 samples changes by more than 0.04 dB, and the steadiest gains 0.3 dB in time.
+_SCATTER = 2.0
 # The squared error of the picture counts as far as it exceeds the variance of the samples by 4 deviations: a shot at 58
 # to 64 dB gains 0.9 and 2.6 dB at 128 and 512 samples, and no shot at 8 to 512 samples loses 0.05 dB. With 2 the same
 # gains 1.3 and 3.1 dB, and another shot loses 0.5 dB at 32 samples.
@@ -132,7 +135,7 @@ def blend_samples(
     With p the picture, n the noisy frame and m the mean of the neighbours, times K[n m] / K[m²] as the light may have
     changed (over 20 pixels in v), all relative to the light, and K a Gaussian mean, first p becomes p + β (m − p),
 
-        β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = K[((n − m)(m − p))²] / N,
+        β = (K[(n − p)(m − p)] − 2.5 e) / K[(m − p)²],    e² = (K[q] + 2 √(K[q²] / N)) / N,    q = ((n − m)(m − p))²,
 
     clamped to [0, 1]: the noise of n and that of m are independent, so that only differences from p that both show
     count. Then p becomes p + w (n − p), the shrinkage of James and Stein: with d = (n − p)², N = 4πσ² the pixels of K,
@@ -156,7 +159,9 @@ def blend_samples(
     (factor, near), sums = _relative_light(noisy, neighbours, rate), np.zeros((5, *light.shape), np.float32)
     run_bands(_compare, len(light), picture, noisy, neighbours, factor, near, rate, sums)
     together, squares, products, temporal, nearest = sums
-    noise = gaussian_mean(products, _SIGMA) / _PIXELS
+    # Where no bright sample is near, the noise is greater than it seems: by two deviations of its own estimate.
+    scatter = np.sqrt(gaussian_mean(np.square(products), _SIGMA) / _PIXELS)
+    noise = (gaussian_mean(products, _SIGMA) + np.float32(_SCATTER) * scatter) / _PIXELS
     blended = np.empty_like(picture)
     means = gaussian_mean(together, _SIGMA), gaussian_mean(squares, _SIGMA), noise
     run_bands(_blend_shared, len(light), picture, neighbours, factor, means, blended)

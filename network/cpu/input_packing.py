@@ -71,11 +71,14 @@ def packer(
         frames = np.empty((count, batch, *size, FRAME_CHANNELS), np.float32)
         channels = SHARED_CHANNELS, STATIC_CHANNELS, 3
         shared, static, average = (np.empty((batch, *size, depth), np.float32) for depth in channels)
-        top = 0 if residual is None else int(rows.min())
-        strip = None if residual is None else residual(slice(top, int(rows.max()) + 1))
+        if whole is None:
+            assert residual is not None
+            top = int(rows.min())
+            strips = residual(slice(top, int(rows.max()) + 1))[None]  # one window at a time
+        else:
+            top, strips = 0, whole
         for n in range(batch):
-            noise = whole[n] if strip is None and whole is not None else strip
-            source = _Source(first_pass[n], noise, confidence[n], modulation[n], *(guide[n] for guide in guides))
+            source = _Source(first_pass[n], strips[n], confidence[n], modulation[n], *(guide[n] for guide in guides))
             target = _Target(frames[:, n], shared[n], static[n], average[n])
             run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table(), top)
         flat = frames.reshape(count * batch, *size, FRAME_CHANNELS)

@@ -54,8 +54,10 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
     given = {}
 
-    def spy(model, window, **options):
-        given.update(window._asdict())
+    def spy(model, window, residual, **options):
+        given.update(
+            window._asdict(), residual=residual(slice(0, window.first_pass.shape[-2]))[None].transpose(0, 1, 4, 2, 3)
+        )
         raise StopIteration
 
     monkeypatch.setattr(unet_denoiser, "denoise_window", spy)
