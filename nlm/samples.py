@@ -23,7 +23,7 @@ Floats = NDArray[np.float32]
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
 # costs up to 1.3 dB of a rendered shot at 8 samples.
 _DEVIATIONS = 2.5
-# Deviations of the estimate of that noise: at 0, places where no frame has a bright sample became dimples in a flat wall
+# Deviations of the estimate of that noise: at 0, places where no frame has a bright sample became dimples in a wall
 # at 8 samples. No shot at 8 or 512 samples changes by more than 0.04 dB, and the steadiest gains 0.3 dB in time.
 _SCATTER = 2.0
 # The squared error of the picture counts as far as it exceeds the variance of the samples by 4 deviations: a shot at 58

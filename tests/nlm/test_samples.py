@@ -303,3 +303,21 @@ def test_shapes_must_fit() -> None:
     strips = [(0, np.zeros((3, 4, 4, 3)))]
     with pytest.raises(ValueError, match="residuals: expected shape"):
         average_neighbours(np.zeros((3, 4, 5, 3)), strips, *np.ones((2, 3, 4, 5)), *np.ones((2, 4, 5, 3)))
+
+
+def test_a_wall_lit_by_rare_samples_has_no_dimples():
+    """Where two frames happen to have no bright sample, both show less light than the wall has."""
+    wall = np.full((160, 160, 3), 0.2, np.float32)
+
+    def few_bright(rng: np.random.Generator) -> np.ndarray:
+        bright, dark = rng.exponential(3, wall.shape[:2]), rng.exponential(0.02, wall.shape[:2])
+        return np.where(rng.random(wall.shape[:2]) < 0.06, bright, dark)[..., None].astype(np.float32) * wall / 0.2
+
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        frames = np.stack([few_bright(rng) for _ in range(3)])
+        confidence = np.ones(frames.shape[:3], np.float32)
+        sides = average_neighbours(frames, None, confidence, confidence, np.ones_like(wall), frames[1])
+        found.append(float(np.abs(blend_samples(wall, frames[1], sides, 0.2) / wall - 1).max()))
+    assert max(found) < 0.5  # 2.2 where the scatter of the noise does not count
