@@ -159,6 +159,9 @@ class FrameDenoiser:
             denoised = self._stabilize(number)
         frame = self.stream.frame(number)
         if frame is not None:
+            if frame.valid.any() and not frame.radiance.any():
+                # Before it counts as a fault: what leaks into black between lit frames is no more than an error.
+                denoised = _changed(denoised, np.zeros_like(denoised.color), CORRECTED)
             self._check_light(denoised.color, frame, result.brightest)
             lights = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
             denoised = self._correct(denoised, frame, result, lights)

@@ -101,7 +101,8 @@ def average_neighbours(
     residuals : iterable of (int, (T, h, W, 3) float32), optional
         Noisy frame minus estimate, aligned, in strips of rows with the first row of each; together they are the frame.
     confidence, geometry : (T, H, W) float32
-        Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise.
+        Confidence, and confidence by geometry alone: frames that differ in light alone still measure the noise, times
+        the estimates' quotient.
     modulation : (H, W, 3) float32, factor from the unit of the window to radiance
     noisy : (H, W, 3) float32, radiance of the centre as rendered
     """
@@ -388,9 +389,12 @@ def _average(
                 total += weight
                 squares += np.float64(weight) ** 2
                 distance = np.float32(0)
+                # Frames in another light show the detail in that of the centre.
+                relit = add and confidence[t, y, x] < np.float32(_OTHER_LIGHT) * geometry[t, y, x]
                 for c in range(C):
-                    value = estimates[t, y, x, c] + (residuals[t, row, x, c] if add else np.float32(0))
-                    value *= modulation[y, x, c]
+                    here, there = estimates[T // 2, y, x, c], estimates[t, y, x, c]
+                    value = (there + (residuals[t, row, x, c] if add else np.float32(0))) * modulation[y, x, c]
+                    value *= here / there if relit and there > here / _FAR else np.float32(1)
                     mean[y, x, c] += weight * value
                     distance += (noisy[y, x, c] - value) ** 2
                 count += 1

@@ -482,6 +482,16 @@ class TestSamples:
         result = made(shot, lambda a: Denoised(truth(STILL, a.number)), rules=Rules())
         np.testing.assert_allclose(result, truth(STILL, MIDDLE), rtol=1e-3)
 
+    def test_a_black_frame_between_lit_ones_is_black(self, tmp_path):
+        """What leaked into it from its neighbours was an error: a fade from black was not written at all."""
+
+        def dark(index, layers):
+            layers["ViewLayer.Combined"] *= index != 3
+
+        shot = open_shot(STILL.write(tmp_path, edit=dark))
+        for rules in (Rules(), STEADY):
+            assert not made(shot, lambda a: Denoised(0.1 * truth(STILL, a.number)), rules=rules).any()
+
     def test_bands_of_a_frame_give_the_same_picture(self, tmp_path):
         scene = replace(MOVING, height=96)
         shot = open_shot(scene.write(tmp_path))
