@@ -26,7 +26,7 @@ from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
 from nlm.moving_lights import confirmed_by_neighbour, find_bright
 from nlm.parts import limit_change
-from nlm.samples import SampleMean, blend_samples, restore_mean
+from nlm.samples import SampleMean, blend_samples, limit_lamps, restore_mean
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -260,19 +260,22 @@ class FrameDenoiser:
         Moving lights are as rendered, and their light belongs to no other pixel.
         """
         color, timings = denoised.color, self.stream.timings
-        exposure = measure_exposure(color)
+        exposure, sides = measure_exposure(color), result.neighbour_samples
+        shown = [frame.rendered] if sides is None else [frame.rendered, sides.mean]
+        color = limit_lamps(color, shown, exposure)
         counted = frame.valid if lights is None else frame.valid & ~lights
         if "restore-mean" in result.plan.stages:
             with timings.stage("restore-mean"):
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
                 for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
                     color = restore_mean(color, _where(counted, noisy, color), exposure)
-        if (sides := result.neighbour_samples) is not None:
+        if sides is not None:
             with timings.stage("blend-samples"):
                 noisy = _where(counted, frame.radiance, color)
                 if not counted.all():
                     sides = sides._replace(nearest=sides.nearest * counted)
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
+        color = limit_lamps(color, shown, exposure)
         if lights is not None:
             color = _where(~lights, color, frame.rendered)
         return _changed(denoised, color, CORRECTED)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nlm.samples import SampleMean, average_neighbours, blend_samples, restore_mean, spatial_variance
+from nlm.samples import SampleMean, average_neighbours, blend_samples, limit_lamps, restore_mean, spatial_variance
 
 SHAPE = (96, 128)
 ONES = np.ones((*SHAPE, 3), np.float32)
@@ -296,6 +296,19 @@ def test_a_lamp_that_is_too_bright_darkens_nothing_around_it(lamp: float) -> Non
     picture[inside] *= 1.1
     room = ~inside
     assert abs(restore_mean(picture, own, 0.3)[room].mean() / own[room].mean() - 1) < 0.005
+
+
+@pytest.mark.parametrize("lamp", [10.0, 5000.0])
+def test_a_lamp_is_no_brighter_than_its_samples(lamp: float) -> None:
+    """A sun that moves without vectors came out at up to three times its light."""
+    own = np.full_like(ONES, 0.3)
+    own[40:43, 50:53] = lamp
+    other = np.roll(own, 20, axis=1)
+    held = limit_lamps(3 * np.maximum(own, other), [own, other], 0.3)
+    assert held[40:43, 50:53].max() == held[40:43, 70:73].max() == lamp
+    # Light below four exposures may be in the picture alone.
+    assert held[0, 0].min() == pytest.approx(0.9)
+    np.testing.assert_array_equal(limit_lamps(own, [other], 10 * lamp), own)
 
 
 def test_a_few_fireflies_glow_over_nothing() -> None:
