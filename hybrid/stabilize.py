@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.warp import warp
 from hybrid.alignment.align import align, align_results, measure_stillness
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import measure_exposure
@@ -281,9 +282,9 @@ class FrameDenoiser:
         return _changed(denoised, color, CORRECTED)
 
     def _moving_lights(self, frame: PreparedFrame) -> Mask | None:
-        """The bright pixels (H, W) that the neighbouring results show to move together, if there are any."""
+        """The bright pixels (H, W) that the neighbouring frames show to move together, if there are any."""
         step = self.stream.shot.step
-        others = [n for n in (frame.number - step, frame.number + step) if n in self._results]
+        others = [n for n in (frame.number - step, frame.number + step) if self.stream.shot.has(n)]
         with self.stream.timings.stage("blend-samples"):
             excess = self._results[frame.number].excess
             assert excess is not None
@@ -291,14 +292,24 @@ class FrameDenoiser:
                 return None
             seen = np.zeros_like(excess.bright)
             for n in others:
-                other = self._results[n].excess
-                if other is None:
+                if (other := self._excess_of(n, frame.number)) is None:
                     continue
                 flow = self.stream.flow(frame.number, n)
                 seen |= confirmed_by_neighbour(*excess, *other, None if flow is None else flow.vectors)
             if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(excess.bright):
                 seen = excess.bright
         return seen if seen.any() else None
+
+    def _excess_of(self, number: int, beside: int) -> Excess | None:
+        """The excess of a neighbour: over the frame's own result where a classical preset has no other."""
+        if "stabilize" in self.stream.rules.allowed:
+            return self._results[number].excess if number in self._results else None
+        there, flow = self.stream.frame(number), self.stream.flow(number, beside)
+        if there is None or flow is None:
+            return None
+        picture, shown = warp(self._results[beside].denoised.color, flow.vectors)
+        relative = _excess(there, picture).relative * shown
+        return Excess(relative, find_bright(relative))
 
     def _bands(self) -> list[slice]:
         height = self.stream.shot.shape[0]

@@ -20,10 +20,10 @@ from nlm.samples import SampleMean, average_neighbours, blend_samples, limit_lam
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_halves, variance_from_window
 
 __all__ = [
-    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours",
-    "blend_samples", "clamp_to_window", "color_gate", "color_gates", "confirmed_by_neighbour", "drift_weights",
-    "filter_layers", "find_bright", "find_bright_samples", "find_sums", "guided_filter", "joint_nlm",
-    "limit_lamps", "measure_guide", "measure_highlights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers",
-    "relight", "replace_fireflies", "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance",
-    "split_light", "sums_to", "variance_from_halves", "variance_from_window",
+    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours", "blend_samples",
+    "clamp_to_window", "color_gate", "color_gates", "confirmed_by_neighbour", "drift_weights", "filter_layers",
+    "find_bright", "find_bright_samples", "find_sums", "guided_filter", "joint_nlm", "limit_lamps", "measure_guide",
+    "measure_highlights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers", "relight",
+    "replace_fireflies", "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance", "split_light",
+    "sums_to", "variance_from_halves", "variance_from_window",
 ]  # fmt: skip

@@ -220,7 +220,7 @@ def _energy_of(image: Floats, rate: Floats) -> Floats:
 def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> Floats:
     """Clamp light beyond four exposures (H, W, 3), in each channel, to the brightest of the samples within two pixels.
 
-    A denoiser makes up to three times the light of a lamp of 10,000 exposures, which no mean of so few samples corrects.
+    A denoiser makes up to three times the light of a lamp of 10,000 exposures, which no mean of few samples corrects.
     """
     lamp = channel_mean(picture) > _LAMP * exposure
     if not lamp.any():

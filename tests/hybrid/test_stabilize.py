@@ -498,7 +498,8 @@ class TestSamples:
         whole, parts = (made(shot, self.blurred, rules=Rules(), rows=rows) for rows in (None, 32))
         np.testing.assert_array_equal(whole, parts)
 
-    def test_snow_that_a_denoiser_takes_for_noise_stays(self, tmp_path):
+    @pytest.mark.parametrize("rules", [Rules(), Rules(off=frozenset({"stabilize"}))], ids=["network", "classical"])
+    def test_snow_that_a_denoiser_takes_for_noise_stays(self, tmp_path, rules):
         """Flakes of a pixel that fall by seven rows a frame, which no vector says."""
         flakes = np.random.default_rng(5).integers(0, (96, 160), (90, 2))
         scene = Scene(height=96, width=160, frames=5, step=(0, 0), noise=0.1)
@@ -515,7 +516,7 @@ class TestSamples:
         def median(aligned):
             return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.centre_irradiance * aligned.modulation), 5))
 
-        result = made(shot, median, number, Rules(), first_pass=blind)
+        result = made(shot, median, number, rules, first_pass=blind)
         rows, columns = (flakes + np.array([14, 0])).T
         inside = (rows >= 8) & (rows < 88)
         assert np.mean(result[rows[inside] % 96, columns[inside]].mean(axis=-1) > 4) > 0.9
