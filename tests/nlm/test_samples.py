@@ -139,7 +139,7 @@ def test_frames_in_another_light_show_the_detail_that_was_lost(change: float) ->
     confidence, geometry = np.zeros(window.shape[:3], np.float32), np.ones(window.shape[:3], np.float32)
     # Parts of the picture that some frames do not show.
     geometry[0, :, ::2], geometry[4, ::3] = 0, 0
-    sides = average_neighbours(estimates, window - estimates, confidence, geometry, ONES, window[2])
+    sides = average_neighbours(estimates, [(0, window - estimates)], confidence, geometry, ONES, window[2])
     assert error(blend_samples(smooth, window[2], sides, 0.5), truth) < 1.05 * error(window[2], truth)
 
 
