@@ -245,23 +245,24 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     -----
     With K a Gaussian mean, a that of the picture in the mean over channels (highlights count as at most
     four exposures), l the picture plus 5 % of a and 0.1 % of the exposure, u = 1 / max(l, a) and d = u (noisy −
-    picture), of noisy − picture at most 20 l, the picture becomes picture + s l K d / K(u l),
+    picture), of noisy − picture at most 20 l, the picture becomes picture + s l D / K(u l),
 
-        s = max(0, 1 − k (1 + (f / N)²) v / (K d)²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
+        s = max(0, 1 − k (1 + (f / N)²) v / D²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
 
-    in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make the
-    noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels but
-    those much brighter than their surroundings, which count by their relative error: a lamp that is too bright darkens
-    nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300), and last
-    those over 48 (4, 1000) of pixels of similar light: K is then over each of 12 bins of two stops, a = 0, and a pixel
-    counts in the two bins next to it.
+    D is K d, without what the light cut off by the limit explains: a mean without the brightest samples is too dark.
+    All in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make
+    the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels
+    but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright
+    darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300),
+    and last those over 48 (4, 1000) of pixels of similar light: K is then over each of 12 bins of two stops, a = 0,
+    and a pixel counts in the two bins next to it.
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few, bins in _MEANS:
         # Cells of σ / 6 pixels blur nothing that a Gaussian mean keeps.
         side = max(int(sigma / _CELLS), 1)
         rows, columns = (cell_axis(length, side) for length in picture.shape[:2])
-        sums = np.zeros((1 + 6 * bins, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
+        sums = np.zeros((1 + 7 * bins, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
         if bins == 1:
             run_bands(_sum_levels, sums.shape[1], picture, np.float32(_LAMP * exposure), rows, columns, side, sums)
         around = gaussian_mean(sums[0] / np.float32(side**2), sigma / side)[None]
@@ -272,7 +273,7 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
         restored = np.empty_like(picture)
         changes = _known_changes(
-            means.reshape(bins, 6, *around.shape[1:]), pixels, np.float32(certain), np.float32(few)
+            means.reshape(bins, 7, *around.shape[1:]), pixels, np.float32(certain), np.float32(few)
         )
         changes = np.concatenate([around, changes])
         run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
@@ -281,12 +282,13 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
 
 
 def _known_changes(sums: Floats, pixels: np.float32, certain: np.float32, few: np.float32) -> Floats:
-    """Known relative changes of three channels, from the means of each bin (bins, 6, rows, columns)."""
-    lit, noise, fourth = sums[:, 0], sums[:, 4], sums[:, 5]
-    known = np.square(sums[:, 1:4]).mean(axis=1)
+    """Known relative changes of three channels, from the means of each bin (bins, 7, rows, columns)."""
+    lit, noise, fourth, cut = sums[:, 0], sums[:, 4], sums[:, 5], sums[:, 6:]
+    differences = sums[:, 1:4] + np.clip(-sums[:, 1:4], np.minimum(cut, 0), np.maximum(cut, 0))
+    known = np.square(differences).mean(axis=1)
     unsure = certain * (np.float32(1) + np.square(few * ratio(fourth, pixels * np.square(noise))))
     share = np.clip(np.float32(1) - ratio(unsure * noise / pixels, known), 0, 1)
-    return np.asarray((sums[:, 1:4] * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:]), np.float32)
+    return np.asarray((differences * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:]), np.float32)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -327,8 +329,8 @@ def _sum_differences(
     first: int, last: int, picture: Floats, noisy: Floats, around: Floats, dark: np.float32, rows: Axis, columns: Axis,
     side: int, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum over cells, for each bin: weight × light, differences of three channels, square, and square²."""
-    blended, bins = np.empty((1, around.shape[2]), np.float32), len(sums) // 6
+    """Sum over cells, for each bin: weight × light, differences of three channels, square, square², and what is cut."""
+    blended, bins = np.empty((1, around.shape[2]), np.float32), len(sums) // 7
     cells = np.empty((sums.shape[2], len(sums) - 1), np.float32)
     for row in range(first, last):
         cells[:] = 0
@@ -339,21 +341,26 @@ def _sum_differences(
                     level = blend_columns(blended, 0, columns, x)
                     light = _level(picture, y, x) + np.float32(_SOFT) * level + dark
                     weight = np.float32(1) / max(light, level)
+                    red = noisy[y, x, 0] - picture[y, x, 0]
+                    green = noisy[y, x, 1] - picture[y, x, 1]
+                    blue = noisy[y, x, 2] - picture[y, x, 2]
                     reach = _FAR * light
-                    r = weight * min(max(noisy[y, x, 0] - picture[y, x, 0], -reach), reach)
-                    g = weight * min(max(noisy[y, x, 1] - picture[y, x, 1], -reach), reach)
-                    b = weight * min(max(noisy[y, x, 2] - picture[y, x, 2], -reach), reach)
+                    r = weight * min(max(red, -reach), reach)
+                    g = weight * min(max(green, -reach), reach)
+                    b = weight * min(max(blue, -reach), reach)
+                    cut = (weight * (red + green + blue) - (r + g + b)) / np.float32(3)
                     power = (r * r + g * g + b * b) / np.float32(3)
                     below, above = _bin(light, dark, bins)
                     for near in range(min(bins, 2)):
                         share = above if near else np.float32(1) - above
-                        cell = cells[column, 6 * (below + near) :]
+                        cell = cells[column, 7 * (below + near) :]
                         cell[0] += share * weight * light
                         cell[1] += share * r
                         cell[2] += share * g
                         cell[3] += share * b
                         cell[4] += share * power
                         cell[5] += share * (power * power)
+                        cell[6] += share * cut
         sums[1:, row] = cells.T
 
 

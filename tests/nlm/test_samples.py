@@ -349,3 +349,14 @@ def test_a_wall_lit_by_rare_samples_has_no_dimples():
         sides = average_neighbours(frames, None, confidence, confidence, np.ones_like(wall), frames[1])
         found.append(float(np.abs(blend_samples(wall, frames[1], sides, 0.2) / wall - 1).max()))
     assert max(found) < 0.5  # 2.2 where the scatter of the noise does not count
+
+
+@pytest.mark.parametrize("wrong", [1.0, 0.8, 1.3])
+def test_light_of_rare_samples_darkens_no_picture(wrong):
+    """Samples of fifty times the light count as twenty: a picture that is right is not too bright for them."""
+    wall = np.full((256, 256, 3), 0.2, np.float32)
+    bright = np.random.default_rng(0).random(wall.shape[:2]) < 0.02
+    rendered = bright[..., None] * np.float32(50) * wall
+    restored = restore_mean(np.float32(wrong) * wall, rendered, 0.2)
+    assert restored.mean() / 0.2 > min(wrong, 1) - 0.03
+    assert restored.mean() / 0.2 < max(wrong, 1) + 0.03
