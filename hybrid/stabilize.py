@@ -380,7 +380,9 @@ def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
     """The picture and its parts with what no filter took (`hybrid.alignment.unfiltered`)."""
     unfiltered, aovs = frame.unfiltered, dict(denoised.aovs)
     for name in aovs.keys() & unfiltered.gray:
-        aovs[name] = as_gray(aovs[name])
+        # Parts of a colored light add up to it, with the tint that their shares of it have.
+        if name not in denoised.parts or "color" in unfiltered.gray:
+            aovs[name] = as_gray(aovs[name])
     for name in aovs.keys() & unfiltered.negative.keys() & denoised.parts:
         # Shared out of the picture, which had no negative light, parts have none.
         aovs[name] = np.maximum(aovs[name], 0) + unfiltered.smooth_negative(name, denoised.color, frame.guide)

@@ -2,6 +2,7 @@
 
 import importlib.util
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from hybrid import stabilize
 from hybrid.alignment.align import Stillness, align_results, measure_stillness
+from hybrid.alignment.unfiltered import Unfiltered
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
@@ -16,7 +18,7 @@ from hybrid.first_pass import PerFrame
 from hybrid.pipeline import BESIDE
 from hybrid.plan import Rules
 from hybrid.records import read_records
-from hybrid.stabilize import MOST, Denoised, FrameDenoiser, _changed
+from hybrid.stabilize import MOST, Denoised, FrameDenoiser, _changed, _with_unfiltered
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, denoise_view, only
 
@@ -347,6 +349,19 @@ class TestMean:
 
         whole, burnt = self.mean_of(tmp_path / "whole"), self.mean_of(tmp_path / "burnt", burn)
         assert burnt == pytest.approx(whole, abs=1e-3)
+
+
+@pytest.mark.parametrize("gray", [False, True])
+def test_a_gray_part_adds_up(gray):
+    """Made gray under a colored light, parts missed their sum by 5 % of a pixel."""
+    rng = np.random.default_rng(3)
+    parts = {name: rng.random((4, 5, 1 if gray else 3), np.float32) * np.ones(3, np.float32) for name in "ab"}
+    apart = {**parts, "mask": rng.random((4, 5, 3), np.float32)}
+    frame = SimpleNamespace(unfiltered=Unfiltered(gray=frozenset({"b", "mask", *(["color", "a"] if gray else [])})))
+    frame.guide = np.ones((4, 5, 3), np.float32)
+    result = _with_unfiltered(Denoised(parts["a"] + parts["b"], apart, parts=frozenset("ab")), frame)
+    np.testing.assert_allclose(result.aovs["a"] + result.aovs["b"], result.color, rtol=1e-6)
+    assert np.ptp(result.aovs["mask"], axis=-1).max() == 0
 
 
 class TestInFiles:
