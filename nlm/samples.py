@@ -71,7 +71,7 @@ _SECOND, _FEW = 0.33, 0.28
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # Cells per deviation of a mean.
-_CELLS = 6
+_CELLS = 4
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
 _WARPED = np.float32(0.7)
 
@@ -259,7 +259,7 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few, bins in _MEANS:
-        # Cells of σ / 6 pixels blur nothing that a Gaussian mean keeps.
+        # Cells of σ / 4 pixels blur nothing that a Gaussian mean keeps.
         side = max(int(sigma / _CELLS), 1)
         rows, columns = (cell_axis(length, side) for length in picture.shape[:2])
         sums = np.zeros((1 + 7 * bins, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
@@ -271,11 +271,12 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         means = np.stack([gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:]])
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
         pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
-        restored = np.empty_like(picture)
         changes = _known_changes(
             means.reshape(bins, 7, *around.shape[1:]), pixels, np.float32(certain), np.float32(few)
         )
-        changes = np.concatenate([around, changes])
+        if not changes.any():
+            continue
+        changes, restored = np.concatenate([around, changes]), np.empty_like(picture)
         run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
         picture = restored
     return picture

@@ -358,5 +358,5 @@ def test_light_of_rare_samples_darkens_no_picture(wrong):
     bright = np.random.default_rng(0).random(wall.shape[:2]) < 0.02
     rendered = bright[..., None] * np.float32(50) * wall
     restored = restore_mean(np.float32(wrong) * wall, rendered, 0.2)
-    assert restored.mean() / 0.2 > min(wrong, 1) - 0.03
-    assert restored.mean() / 0.2 < max(wrong, 1) + 0.03
+    assert restored.mean() / 0.2 > min(wrong, 1) - 0.05  # 0.2 without the light that is cut
+    assert restored.mean() / 0.2 < max(wrong, 1) + 0.05
