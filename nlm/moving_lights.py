@@ -11,7 +11,7 @@ Mask = NDArray[np.bool_]
 # A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
 # Fewer bright pixels show no motion; a greater share of all pixels is noise.
-_LEAST, _MOST = 20, 0.05
+LEAST, _MOST = 20, 0.05
 # Search radius, pixels a frame, and side of the searched block.
 _REACH, _BLOCK = 32, 512
 # This share of the bright pixels must share a motion, and more than chance by six deviations and eight pixels.
@@ -31,7 +31,7 @@ def find_bright(excess: Floats) -> Mask:
     bulk = 1.4826 * float(np.median(np.abs(excess)))
     bright = excess > max(_ABOVE, _DEVIATIONS * bulk)
     count = np.count_nonzero(bright)
-    return bright if _LEAST <= count <= _MOST * bright.size else np.zeros_like(bright)
+    return bright if LEAST <= count <= _MOST * bright.size else np.zeros_like(bright)
 
 
 def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
@@ -42,7 +42,7 @@ def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
     """
     rows, columns = (_busiest(here.sum(axis=1 - axis)) for axis in (0, 1))
     a, b = (mask[rows, columns].astype(np.float64) for mask in (here, there))
-    if a.sum() < _LEAST or b.sum() < _LEAST:
+    if a.sum() < LEAST or b.sum() < LEAST:
         return []
     size = [length + _REACH for length in a.shape]
     counts = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size).round()
