@@ -128,19 +128,17 @@ def test_light_that_changes_where_one_neighbour_shows_the_place_is_no_noise() ->
     assert error(result, truth) < 1.02 * error(frames[2], truth)
 
 
-@pytest.mark.parametrize("change", [0.2, 0.6, 1.5, 8.0])
-def test_frames_in_another_light_show_the_detail_that_was_lost(change: float) -> None:
-    """Frames of alternating exposure: their mean was in the light of none, and pictures of 1 % noise lost 4 dB."""
-    truth, frames = lines(), 5
-    light = np.float32([change, 1 / change, 1, change, 1 / change])
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+def test_lines_at_a_rim_that_no_frame_shows_are_no_noise_where_there_is_next_to_none(noise: float) -> None:
+    """The rest of the frame tells the noise: a shot without any came out at 48 dB."""
+    truth = lines()
+    frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
+    confidence = np.ones(frames.shape[:3], np.float32)
+    confidence[[0, 1, 3, 4], :, :12] = 0
+    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
     smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
-    window = np.stack([noisy(truth * light[t], 0.01, 10 + t) for t in range(frames)])
-    estimates = np.stack([smooth * light[t] for t in range(frames)])
-    confidence, geometry = np.zeros(window.shape[:3], np.float32), np.ones(window.shape[:3], np.float32)
-    # Parts of the picture that some frames do not show.
-    geometry[0, :, ::2], geometry[4, ::3] = 0, 0
-    sides = average_neighbours(estimates, [(0, window - estimates)], confidence, geometry, ONES, window[2])
-    assert error(blend_samples(smooth, window[2], sides, 0.5), truth) < 1.05 * error(window[2], truth)
+    result = blend_samples(smooth, frames[2], sides, 0.5)
+    assert error(result, truth) < 1.02 * error(frames[2], truth) + 1e-5
 
 
 def test_a_firefly_of_one_frame_is_no_reason() -> None:
