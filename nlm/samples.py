@@ -36,8 +36,8 @@ _APART = 6
 # Where no neighbour is trusted, the noise counts this many times: no frame denoised alone, at 8 to 512 samples, then
 # loses 0.01 dB; at 1 one loses 0.4.
 _ALONE = 1.5
-# Where so much of a frame is trusted, noise elsewhere is at most so many times the greatest there: without noise lines of
-# a pixel at a rim that no other frame shows are no noise. This changes no shot at 8 to 512 samples.
+# Where so much of a frame is trusted, noise elsewhere is at most so many times the greatest there: without noise lines
+# of a pixel at a rim that no other frame shows are no noise. This changes no shot at 8 to 512 samples.
 _MOSTLY, _GREATEST = 0.8, np.float32(2)
 # Deviation, pixels, of the Gaussian that averages errors and variances: over 200 pixels. Over fewer, noise of few
 # bright samples exceeds its own variance.
