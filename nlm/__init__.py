@@ -16,11 +16,12 @@ from nlm.nonlocal_means import joint_nlm
 from nlm.parts import filter_layers, find_sums, split_light, sums_to
 from nlm.pooling import PooledSamples, clamp_to_window, pool_samples
 from nlm.relight import relight
-from nlm.samples import SampleMean, average_neighbours, blend_samples, limit_lamps, restore_mean
+from nlm.samples import SampleMean, average_neighbours, beside_lamps, blend_samples, limit_lamps, restore_mean
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_halves, variance_from_window
 
 __all__ = [
-    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours", "blend_samples",
+    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours", "beside_lamps",
+    "blend_samples",
     "clamp_to_window", "color_gate", "color_gates", "confirmed_by_neighbour", "drift_weights", "filter_layers",
     "find_bright", "find_bright_samples", "find_sums", "guided_filter", "joint_nlm", "limit_lamps", "measure_guide",
     "measure_highlights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers", "relight",

@@ -64,6 +64,8 @@ _FAR = np.float32(20)
 _SOFT = 0.05
 # Light beyond so many exposures is a highlight, and does not count in the mean of its surroundings.
 _LAMP = 4.0
+# Beyond so many, what a denoiser gets wrong of it is more than the light of all pixels beside it.
+_GLARE = 64.0
 # Least weight of a frame with the centre's geometry and other light.
 _OTHER_LIGHT = 0.02
 # The second least squared distance of a sample from N others, over its variance, is 1 / (0.33 N − 0.28) for Gaussian
@@ -223,6 +225,12 @@ def _energy_of(image: Floats, rate: Floats) -> Floats:
     energy = np.empty(rate.shape, np.float32)
     run_bands(_energy, len(rate), second_differences(image), rate, energy)
     return energy
+
+
+def beside_lamps(picture: Floats, exposure: float) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) within two of a light that a picture shows beyond 64 exposures."""
+    lamp = (channel_mean(picture) > _GLARE * exposure).astype(np.uint8)
+    return np.asarray(cv2.dilate(lamp, np.ones((5, 5), np.uint8)) > 0)
 
 
 def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> Floats:

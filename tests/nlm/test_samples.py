@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from nlm.samples import SampleMean, average_neighbours, blend_samples, limit_lamps, restore_mean, spatial_variance
+from nlm.samples import (
+    SampleMean,
+    average_neighbours,
+    beside_lamps,
+    blend_samples,
+    limit_lamps,
+    restore_mean,
+    spatial_variance,
+)
 
 SHAPE = (96, 128)
 ONES = np.ones((*SHAPE, 3), np.float32)
@@ -307,6 +315,21 @@ def test_a_lamp_is_no_brighter_than_its_samples(lamp: float) -> None:
     # Light below four exposures may be in the picture alone.
     assert held[0, 0].min() == pytest.approx(0.9)
     np.testing.assert_array_equal(limit_lamps(own, [other], 10 * lamp), own)
+
+
+def test_the_halo_of_a_lamp_is_told_from_the_room() -> None:
+    """Counted with the room it darkened that by 1 %."""
+    truth = np.full_like(ONES, 0.3)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    distance = np.hypot(y - 48, x - 64)
+    truth[distance < 4] = 1000
+    own, picture = noisy(truth, 0.2, 11), truth.copy()
+    picture[(distance >= 4) & (distance < 5.5)] = 10
+    far, room = ~beside_lamps(picture, 0.3), distance >= 8
+    assert far[room].all() and not far[distance < 5.5].any()
+    result = restore_mean(picture, np.where(far[..., None], own, picture), 0.3)
+    assert abs(result[room].mean() / own[room].mean() - 1) < 0.002
+    assert not beside_lamps(picture, 100.0).any()
 
 
 def test_a_few_fireflies_glow_over_nothing() -> None:
