@@ -325,8 +325,10 @@ def test_the_halo_of_a_lamp_is_told_from_the_room() -> None:
     truth[distance < 4] = 1000
     own, picture = noisy(truth, 0.2, 11), truth.copy()
     picture[(distance >= 4) & (distance < 5.5)] = 10
-    far, room = ~beside_lamps(picture, 0.3), distance >= 8
-    assert far[room].all() and not far[distance < 5.5].any()
+    far = ~beside_lamps(picture, 0.3)
+    room = distance >= 8
+    assert far[room].all()
+    assert not far[distance < 5.5].any()
     result = restore_mean(picture, np.where(far[..., None], own, picture), 0.3)
     assert abs(result[room].mean() / own[room].mean() - 1) < 0.002
     assert not beside_lamps(picture, 100.0).any()
