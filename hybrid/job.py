@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
@@ -60,12 +60,25 @@ MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))
 class DenoiseOptions:
     """Everything that is asked for when a shot is denoised, validated before any file is opened.
 
-    Texts beside fields are the help of the options of `ravg denoise`.
-
     Raises
     ------
     ValueError
         If an option does not exist, or two contradict each other.
+
+    Attributes
+    ----------
+    stages : collection of str
+        Stages that are forced on, whatever was measured.
+    no_stages : collection of str
+        Stages that are forced off.
+    device : str
+        For ravg's networks and OIDN's: cpu, cuda, hip, sycl, metal, or auto, the first that is there.
+    strict : bool
+        Refuse layers that make no sense, and cuts, instead of working around them.
+    reuse_freed_memory : bool
+        Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
+    threads : int or None
+        Of numba, OpenCV and torch in this process; None leaves them as they are.
     """
 
     method: Annotated[
@@ -117,8 +130,8 @@ class DenoiseOptions:
         Literal["layers", "beauty"],
         "how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum",
     ] = "layers"
-    stages: Collection[str] = ()  # forced on, whatever was measured
-    no_stages: Collection[str] = ()  # forced off
+    stages: Collection[str] = ()
+    no_stages: Collection[str] = ()
     tile: Annotated[
         int | None,
         "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
@@ -129,9 +142,7 @@ class DenoiseOptions:
         "number format of the network; auto: bfloat16 on processors that have it, else float32",
         {"panel": "Resources", "envvar": "RAVG_PRECISION"},
     ] = "auto"
-    device: str = (
-        "auto"  # for ravg's networks and OIDN's: cpu, cuda, hip, sycl, metal, or auto, the first that is there
-    )
+    device: str = "auto"
     resume: Annotated[
         bool,
         "skip frames that an earlier run with the same options has finished",
@@ -147,10 +158,9 @@ class DenoiseOptions:
         "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
         {"panel": "Resources", "metavar": "SIZE", "envvar": "RAVG_MAX_MEMORY"},
     ] = None
-    strict: bool = False  # refuse layers that make no sense, and cuts, instead of working around them
-    # Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
+    strict: bool = False
     reuse_freed_memory: bool = True
-    threads: int | None = None  # of numba, OpenCV and torch in this process; None leaves them as they are
+    threads: int | None = None
 
     def __post_init__(self) -> None:
         preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release
@@ -230,6 +240,21 @@ class DenoiseOptions:
 
 
 DEFAULTS = {entry.name: entry.default for entry in fields(DenoiseOptions)}
+
+
+def _described(options: type) -> str:
+    """Attributes of a docstring, from the help texts of fields: one text for the command and for Python."""
+    lines = []
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        if texts := getattr(hint, "__metadata__", ()):
+            kind = hint.__origin__
+            chosen = ", ".join(map(repr, get_args(kind))) if get_origin(kind) is Literal else ""
+            lines += [f"    {name} : {chosen or getattr(kind, '__name__', kind)}", f"        {texts[0]}"]
+    return "\n".join([*lines, "    "])
+
+
+if DenoiseOptions.__doc__:  # none with python -OO
+    DenoiseOptions.__doc__ = DenoiseOptions.__doc__.rstrip() + "\n" + _described(DenoiseOptions)
 
 
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:

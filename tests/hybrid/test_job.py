@@ -1,6 +1,9 @@
 """The way in for other programs does what the command does."""
 
 import doctest
+import inspect
+import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -250,3 +253,9 @@ def test_threads_and_the_allocator_are_those_that_were_asked_for(shot_folder, tm
     assert called == ["reuse"]
     run(threads=3, reuse_freed_memory=False)
     assert called == ["reuse", 3]
+
+
+def test_help_in_python_states_every_option():
+    text = inspect.getdoc(DenoiseOptions)
+    for entry in fields(DenoiseOptions):
+        assert re.search(rf"^{entry.name} : .+\n    \S", text, re.MULTILINE), entry.name
