@@ -26,7 +26,7 @@ from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import PACKAGES, versions
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, OIDN_MODES, SPECS, FirstPassSource, PerFrame, find_first_pass
-from hybrid.memory import parse_size, plan_rows
+from hybrid.memory import MemoryPlan, parse_size, plan_memory
 from hybrid.oidn import find_device
 from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames, sources_of, temporal_support
 from hybrid.plan import NEURAL_STAGES, Rules
@@ -134,7 +134,7 @@ class DenoiseOptions:
     no_stages: Collection[str] = ()
     tile: Annotated[
         int | None,
-        "side of the network's tiles in pixels (default: 2048; 640 for kernels; 384 with --max-memory)",
+        "side of the network's tiles in pixels (default: 2048; 640 for kernels)",
         {"panel": "Resources", "metavar": "N"},
     ] = None
     precision: Annotated[
@@ -155,7 +155,7 @@ class DenoiseOptions:
     ] = False
     max_memory: Annotated[
         str | None,
-        "most memory to use, such as 8G; works on bands of rows, which is slower (default: no limit)",
+        "most memory to use, such as 8G; uses temporary files and bands of rows, which is slower (default: no limit)",
         {"panel": "Resources", "metavar": "SIZE", "envvar": "RAVG_MAX_MEMORY"},
     ] = None
     strict: bool = False
@@ -320,7 +320,7 @@ def open_denoiser(
     neural = import_neural()
     denoiser: WindowDenoiser = neural.open_network(
         options.weights_file,
-        tile=neural.SMALL_TILE if options.tile is None and options.max_memory is not None else options.tile,
+        tile=options.tile,
         precision=options.precision,
         device=options.device,
         threshold=options.threshold,
@@ -497,7 +497,7 @@ class Job:
             raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
         with validating or nullcontext():
             if options.max_memory is not None:  # even with no stage, before any pixel is read
-                plan_rows(parse_size(options.max_memory), shot.views[0], ())
+                plan_memory(parse_size(options.max_memory), shot.views[0], ())
             views, report = validate_views(shot, strict=options.strict)
             _check_views(views, report, options)
         if options.preset == "auto":
@@ -506,7 +506,7 @@ class Job:
         first_passes = tuple(choose_first_pass(view, options, denoiser) for view in views)
         check_paths(shot, output, options, first_passes, paths)
         job = cls(options, str(output), views, report, denoiser, first_passes, timings, breakdown)
-        job.plan_rows()
+        job.plan_memory()
         return job
 
     @property
@@ -554,17 +554,17 @@ class Job:
             "ravg/versions": json.dumps(versions(*packages), sort_keys=True),
         }
 
-    def plan_rows(self) -> int | None:
-        """How many rows of a frame are denoised at a time, None for all; ValueError where not even a band fits."""
+    def plan_memory(self) -> MemoryPlan:
+        """How the run stays within its limit, if it has one; ValueError where not even a band of rows fits."""
         if self.options.max_memory is None:
-            return None
-        return plan_rows(
+            return MemoryPlan(None, in_files=False)
+        return plan_memory(
             parse_size(self.options.max_memory) // len(self.views),
             self.views[0],
             self.options.rules.allowed,
             self.first_passes[0].first_pass,
             radius=self.denoiser.radius,
-            network=self.denoiser.memory(self.views[0].shape),
+            network=self.denoiser.memory,
             pools=self.denoiser.pools,
         )
 
@@ -586,7 +586,8 @@ class Job:
         options, runs, done, total = self.options, self.options.passes, 0, self.total()
         prepare_process(options)
         views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
-        settings = RunSettings(self.plan_rows(), options.max_memory is None, attributes=self.header())
+        background = options.max_memory is None
+        settings = RunSettings(*self.plan_memory(), background=background, attributes=self.header())
         home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent
         with ExitStack() as stack:
             for run, margin in enumerate(self.margins(), start=1):

@@ -1,17 +1,19 @@
-"""How many rows of a frame may be worked on at a time, for a given amount of memory.
+"""How many rows of a frame may be worked on at a time, for a given amount of memory, and where frames are kept.
 
-The frames of a window are held as a whole; the planes of alignment and filters, several times as many, only for some
-rows. Memory therefore has a lower bound, below which a run is refused.
+Frames of a window lie in memory, or in temporary files; the planes of alignment and filters exist for some rows only. A
+frame is read, prepared and finished as a whole: memory therefore has a lower bound, below which a run is refused.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from typing import NamedTuple
 
 from hybrid.alignment.align import MARGIN, aligned_planes
 from hybrid.alignment.prepare import prepared_planes
+from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.stream import FirstPass, can_refine, kept_planes
@@ -27,10 +29,11 @@ CODE = 64 * 2**20
 # Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once: at 960×540
 # the peak is 4 % above the plan.
 SHARE = 0.94
-# Temporary planes while a frame is prepared, while rows of a window are filtered, and while a network reads them.
-PREPARING, FILTERING, GIVING = 14, 40, 12
+# Temporary planes while rows of a window are filtered, while a network reads them, and while samples correct a finished
+# picture.
+FILTERING, GIVING, FINISHING = 40, 30, 38
 # Temporary planes while TV-L1 solves for a flow.
-REFINING = 45
+REFINING = 38
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -47,57 +50,79 @@ def parse_size(words: str) -> int:
     return int(size)
 
 
-def plan_rows(
+class MemoryPlan(NamedTuple):
+    """How a run stays within its limit."""
+
+    rows: int | None  # of a frame that are worked on at a time, a multiple of 64; None for all
+    in_files: bool  # whether what is kept for later windows lies in temporary files
+
+
+def plan_memory(
     limit: int,
     shot: Shot,
     stages: Collection[str],
     first_pass: FirstPass | None = None,
     *,
     radius: int = 2,
-    network: int | None = None,
+    network: Callable[[tuple[int, int]], int | None] = lambda _: None,
     pools: bool = False,
-) -> int | None:
-    """Find how many rows of a frame may be worked on at a time: a multiple of 64, or None for all.
+) -> MemoryPlan:
+    """Plan a run: whole frames in memory if they fit, else with what is kept in files, and as many rows as then fit.
 
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
-    `network` the bytes that a network takes while it runs; with `pools` samples are pooled and denoised by OIDN. Raises
-    ValueError, with what is needed, if not even the fewest rows fit.
+    `network` maps height and width to the bytes that a network takes while it runs; with `pools` samples are pooled and
+    denoised by OIDN. Raises ValueError, with what is needed, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
-    prepared, written or worked on. `tests/reliability/test_memory.py` measures the true peak.
+    prepared, finished or worked on. `tests/reliability/test_memory.py` measures the true peak.
     """
     height, width = shot.shape
-    layers, neural = shot.layers(shot.numbers[0]), network is not None
+    layers, neural = shot.layers(shot.numbers[0]), network(shot.shape) is not None
     kept = kept_planes(shot, stages, first_pass, radius)
-    # Reading: the file as it is, the frame as read, and the planes of its preparation.
-    reading = len(shot.header(shot.numbers[0]).channel_names) + prepared_planes(layers) + PREPARING
+    # The frame as read, with the file that it is read from, or with what is prepared of it.
+    prepared = prepared_planes(layers)
+    reading = prepared + max(len(shot.header(shot.numbers[0]).channel_names), prepared)
     passing = max(reading, REFINING if can_refine(stages) else 0)
     # A first pass made of windows is filtered beside a network too.
     filtered = not neural or (first_pass is not None and first_pass.from_noisy)
-    worked = 2.0 * (2 * radius + 1) * aligned_planes(layers) + (FILTERING if filtered else GIVING)
+    worked = _worked_planes(layers, 2 * radius + 1, filtered)
     plane = 4 * height * width
-    base, code = (BASE, OIDN) if network is None else (BASE_NEURAL + network, OIDN_NEURAL)
+    base, code = (BASE_NEURAL, OIDN_NEURAL) if neural else (BASE, OIDN)
     holds = 0 if first_pass is None else first_pass.holds
     if pools:
         holds = max(holds, HOLDS_FAST)
         worked += 3 * (2 * radius + 1) + 18  # residuals, pooled samples and their average
     oidn = min(holds, code + OIDN_OF_PIXEL * height * width * holds // HOLDS)
 
-    def needed(rows: int) -> int:
-        share = min(rows + 2 * MARGIN, height) / height
+    def needed(rows: int, in_files: bool) -> int:
+        outer = min(rows + 2 * MARGIN, height)
+        share = outer / height
+        # The rows that are worked on are read from files.
+        held, read = (0.0, kept * share) if in_files else (kept, 0.0)
+        working = plane * (worked * share + read) + (network((outer, width)) or 0)
         # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
-        at_once = max(plane * passing + oidn, plane * worked * share + (oidn if pools else min(oidn, CODE)))
-        return base + round(plane * kept + at_once)
+        working += oidn if pools else min(oidn, CODE)
+        return base + round(plane * held + max(plane * passing + oidn, plane * FINISHING, working))
 
     budget = round(SHARE * limit)
-    if needed(height) <= budget:
-        return None
-    if needed(STRIP) > budget:
-        least = math.ceil(100 * needed(STRIP) / SHARE / 2**30) / 100  # so much is enough
+    for in_files in (False, True):
+        if needed(height, in_files) <= budget:
+            return MemoryPlan(None, in_files)
+    if needed(STRIP, True) > budget:
+        least = math.ceil(100 * needed(STRIP, True) / SHARE / 2**30) / 100  # so much is enough
         raise ValueError(
             f"max-memory is {limit / 2**30:.2f} GiB, expected at least {least:.2f} GiB for {width}x{height} pixels"
         )
     rows = STRIP
-    while needed(rows + STRIP) <= budget:
+    while needed(rows + STRIP, True) <= budget:
         rows += STRIP
-    return rows
+    return MemoryPlan(rows, True)
+
+
+def _worked_planes(layers: Layers, frames: int, filtered: bool) -> float:
+    """Count the float32 planes of an aligned window of so many frames, and of what reads it."""
+    if filtered:
+        return 2.0 * frames * aligned_planes(layers) + FILTERING
+    # A network reads the first pass, confidences and AOVs alone.
+    aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
+    return frames * (7 + 2.0 * aovs) + GIVING

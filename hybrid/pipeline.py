@@ -21,6 +21,7 @@ from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
 from hybrid.plan import Plan, Rules
 from hybrid.prefetch import Prefetcher
+from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
 from hybrid.stream import FirstPass, FrameStream
@@ -73,7 +74,8 @@ class View(NamedTuple):
 class RunSettings:
     """How frames are read, denoised and written; none of it changes a pixel."""
 
-    rows: int | None = None  # how many rows of a frame to work on at a time (`hybrid.memory.plan_rows`); None for all
+    rows: int | None = None  # how many rows of a frame to work on at a time (`hybrid.memory.plan_memory`); None for all
+    in_files: bool = False  # whether what is kept for later windows lies in temporary files
     # whether to read and write in the background, which takes the memory of one frame read and one written
     background: bool = True
     # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
@@ -181,9 +183,9 @@ class _ShotDenoiser:
         self.support = temporal_support(views[0].first_pass, radius, rules)
         self.sources = sources_of(views, radius, rules, settings.sources)
         self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
-        self.denoisers = []
+        self.denoisers, keeper = [], Keeper(in_files=settings.in_files)
         for reader, view in zip(self.readers, views, strict=True):
-            stream = FrameStream(reader, rules, view.first_pass, radius=radius, timings=timings)
+            stream = FrameStream(reader, rules, view.first_pass, radius=radius, timings=timings, keeper=keeper)
             self.denoisers.append(FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going))
 
     def make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:

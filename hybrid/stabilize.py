@@ -150,7 +150,7 @@ class FrameDenoiser:
             if n not in self._results or (n == number and not self._results[n].trust):
                 self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
                 try:
-                    self._results[n] = self._denoise_window(n)
+                    self._results[n] = self.stream.keeper.keep(self._denoise_window(n))
                 except (ValueError, OSError):
                     if n == number or not self.keep_going:
                         raise
@@ -191,8 +191,12 @@ class FrameDenoiser:
         window: Window | None = stream.window(number)
         assert window is not None
         plan = stream.plan(numbers, Context(window.first_pass is not None, stream.radius))
-        brightest = max(frame.mean for frame in window.frames if frame is not None)
-        exposure, layers, bands = window.lit.as_rendered.exposure, _Layers(stream.shot.shape), self._bands()
+        brightest = 0.0
+        for there in window.frames:
+            brightest = brightest if there is None else max(brightest, there.mean)
+            stream.keeper.release()  # a mean reads the whole frame
+        exposure, bands = window.lit.as_rendered.exposure, self._bands()
+        layers = _Layers(stream.shot.shape, stream.keeper.empty)
         outliers = 0
         for band in bands:
             assert window is not None
@@ -212,6 +216,7 @@ class FrameDenoiser:
             shares, parts = aligned.shares, denoised.parts
             repaired, fireflies = aligned.repaired, aligned.fireflies
             del aligned, denoised, named  # before the next band is aligned
+            stream.keeper.release()
         samples = layers.named("sides")
         color = layers.named("color")[""]
         frame, excess = stream.frame(number), None
@@ -244,6 +249,7 @@ class FrameDenoiser:
             aligned, confidence = align_results(window, result.trust, stillness, result.exposure, band, timings=timings)
             with timings.stage("stabilize"):
                 color[band] = average(aligned, confidence)
+            self.stream.keeper.release()
         with timings.stage("stabilize"):
             return _changed(result.denoised, color)
 
@@ -327,8 +333,8 @@ class FrameDenoiser:
 class _Layers:
     """Layers of a frame, put together from bands of rows; a single band is taken as it is."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._shape = shape
+    def __init__(self, shape: tuple[int, int], empty: Callable[[tuple[int, ...], np.dtype[Any]], NDArray[Any]]) -> None:
+        self._shape, self._empty = shape, empty
         self._layers: dict[tuple[str, str], NDArray[Any]] = {}
 
     def add(self, band: slice, inner: slice, layers: Mapping[tuple[str, str], NDArray[Any] | None]) -> None:
@@ -340,7 +346,7 @@ class _Layers:
                 self._layers[key] = layer
                 continue
             if key not in self._layers:
-                self._layers[key] = np.empty((*self._shape, *layer.shape[2:]), layer.dtype)
+                self._layers[key] = self._empty((*self._shape, *layer.shape[2:]), layer.dtype)
             self._layers[key][band] = layer[inner]
 
     def named(self, kind: str) -> dict[str, Any]:

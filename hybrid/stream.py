@@ -28,6 +28,7 @@ from hybrid.files.frame import Frame, Frames
 from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
+from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 
 Array = NDArray[np.float32]
@@ -76,12 +77,14 @@ class FrameStream:
         radius: int = RADIUS,
         refine: Callable[..., Array] = refine_flow,
         timings: Timings | None = None,
+        keeper: Keeper | None = None,
     ) -> None:
         self.shot = shot
         self.rules = rules
         self.source = first_pass
         self.radius = radius
         self.timings = timings or Timings()
+        self.keeper = keeper or Keeper()
         self._refine = refine
         # Kind of a value and the frames it belongs to → the value.
         self._cache: dict[tuple[str, tuple[int, ...]], object] = {}
@@ -219,13 +222,14 @@ class FrameStream:
         if before == centre:
             return step
         with self.timings.stage("flow"):
-            return compose_flows(step, flows[before]) if reverse else compose_flows(flows[before], step)
+            composed = compose_flows(step, flows[before]) if reverse else compose_flows(flows[before], step)
+        return self.keeper.keep(composed)
 
     # How each value is made.
 
     def _cached(self, kind: str, frames: tuple[int, ...], make: Callable[..., Value]) -> Value:
         if (kind, frames) not in self._cache:
-            self._cache[kind, frames] = make(*frames)
+            self._cache[kind, frames] = self.keeper.keep(make(*frames))
         return cast(Value, self._cache[kind, frames])
 
     def _load(self, number: int) -> PreparedFrame:
@@ -255,7 +259,8 @@ class FrameStream:
                 prepared = replace(prepared, unfiltered=replace(prepared.unfiltered, region=region), valid=inside)
         # A first pass reads no more of it.
         kept = ("number", "color", "albedo", "normal", "estimate", "source")
-        self._cache["read", (number,)] = Frame(**{name: getattr(frame, name) for name in kept})
+        read = Frame(**{name: getattr(frame, name) for name in kept})
+        prepared, self._cache["read", (number,)] = self.keeper.keep((prepared, read))  # they share layers
         return prepared
 
     def _small(self, number: int) -> SmallFrame:
@@ -312,13 +317,16 @@ class FrameStream:
 
 
 def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int) -> float:
-    """Count the float32 planes that stay in memory while windows slide: frames, flows and results."""
+    """Count the float32 planes that are kept while windows slide: frames, flows and results."""
     layers = shot.layers(shot.numbers[0])
     support = radius if first_pass is None else first_pass.reach(radius)
-    frames = min(2 * support + 1, shot.count)
-    results = 3 if "stabilize" in stages else 1
-    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
-    return frames * prepared_planes(layers) + _flow_planes(layers, stages, frames, radius) + results * written
+    # Fireflies are looked for in frames beyond the window.
+    frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), shot.count)
+    results = 2 if "stabilize" in stages else 1
+    # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
+    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10
+    pictures = results * written + 4 * (results - 1)
+    return frames * prepared_planes(layers) + _flow_planes(layers, stages, frames, radius) + pictures
 
 
 def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:

@@ -27,6 +27,7 @@ from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
 from hybrid.pass_sums import classify_passes, sample_rows
+from hybrid.runtime.kept import Keeper
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -34,6 +35,8 @@ Mask = NDArray[np.bool_]
 # Pairs that are read, spread over all files of the shot and not over the frames that were asked for: the result must
 # not depend on the chunk that a frame comes in.
 PAIRS = 2
+# Pixels above which the frames of these pairs lie in temporary files: four of 7680×4320 take 7 GiB.
+LARGE = 2**24
 # Rows for shares and bounds, and for the comparison of edges; larger frames are reduced to about so many.
 THIN, EDGE_ROWS = 270, 540
 # A layer whose values lie within this of each other, relative to the largest, is constant: half floats round by 5e-4.
@@ -199,8 +202,11 @@ def _validate_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationR
         surfaces.extend(Patches(pair) for pair in _surface_pairs(earlier, later, roles, shot.step))
         return surfaces
 
+    # Pairs of frames this large lie in files, as all are compared until no question is left.
+    height, width = shot.shape
+    keeper = Keeper(in_files=height * width > LARGE)
     for a, b in pairs:
-        earlier, later = shot.read(a), shot.read(b)
+        earlier, later = keeper.keep(shot.read(a)), keeper.keep(shot.read(b))
         checks.add(earlier, later)
         if (pair := _pair_of(earlier, later, earlier.color, later.color, shot.step)) is not None:
             light.append(Patches(pair))

@@ -2,14 +2,13 @@
 
 from hybrid.neural.clips import ClipSource, write_clips
 from hybrid.neural.oidn_networks import bundled_preset, denoise_bundled
-from hybrid.neural.opening import SMALL_TILE, open_network
+from hybrid.neural.opening import open_network
 from hybrid.neural.train import TrainInputs, train_network
 from network.checkpoint import shipped_weights
 from network.paper import TKPCN_WEIGHTS
 from network.presets import PRESETS as TRAINING_PRESETS
 
 __all__ = [
-    "SMALL_TILE",
     "TKPCN_WEIGHTS",
     "TRAINING_PRESETS",
     "ClipSource",

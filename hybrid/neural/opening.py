@@ -12,9 +12,6 @@ from network.checkpoint import load_model
 from network.devices import find_device, has_bfloat16
 from network.robust_unet import RobustUNet
 
-# Side of a tile where memory is short, pixels.
-SMALL_TILE = 384
-
 
 def open_network(
     weights: Path,

@@ -21,7 +21,7 @@ from hybrid.files.decode import decode_frame
 from hybrid.files.exr import read_exr
 from hybrid.files.replace import replace_file
 from hybrid.files.shots import open_matching_sequence, open_shot, output_path
-from hybrid.memory import plan_rows
+from hybrid.memory import plan_memory
 from hybrid.pipeline import View, denoise_frames
 from hybrid.plan import Rules
 from hybrid.records import read_records
@@ -95,9 +95,9 @@ def test_memory_is_shared_between_the_views_of_a_file(tmp_path, monkeypatch):
 
     def plan(limit, *args, **options):
         asked.append(limit)
-        return plan_rows(limit, *args, **options)
+        return plan_memory(limit, *args, **options)
 
-    monkeypatch.setattr(job, "plan_rows", plan)
+    monkeypatch.setattr(job, "plan_memory", plan)
     shot = open_shot(Scene(frames=2).write(tmp_path / "in", edit=edit))
     options = job.DenoiseOptions(preset="draft", max_memory="8G")
     assert len(job.Job.open(shot, tmp_path / "out", options).views) == 2
@@ -117,9 +117,8 @@ def test_a_matching_sequence_has_the_frames_that_were_asked_for(shot_folder):
 
 
 def test_the_network_has_the_tile_and_the_layers_that_were_asked_for(monkeypatch):
-    """Small tiles where memory is limited; layers to be summed where the beauty is their sum."""
+    """With a limit of memory too, as pictures depend on tiles; layers to be summed where the beauty is their sum."""
     fake = SimpleNamespace(
-        SMALL_TILE=384,
         shipped_weights=lambda preset: preset,
         open_network=lambda _, **options: SimpleNamespace(needs_first_pass=True, **options),
     )
@@ -128,7 +127,7 @@ def test_the_network_has_the_tile_and_the_layers_that_were_asked_for(monkeypatch
         job.open_denoiser(job.DenoiseOptions(**options))
         for options in ({}, {"max_memory": "8G"}, {"max_memory": "8G", "tile": 64}, {"aov_sum": "beauty"})
     )
-    assert [made.tile for made in (plain, limited, tiled)] == [None, 384, 64]
+    assert [made.tile for made in (plain, limited, tiled)] == [None, None, 64]
     assert [made.add_layers for made in (plain, summed)] == [False, True]
 
 

@@ -179,6 +179,17 @@ def test_where_the_light_of_the_whole_frame_drifts_no_finished_picture_is_averag
         assert confidence[[0, 2]].mean() > 0.8
 
 
+def test_of_the_frame_before_only_what_is_averaged_is_kept(tmp_path):
+    """Samples, trust and drift of the frame before stayed in memory, a tenth of what is kept; it can be made anew."""
+    maker = pictures(open_shot(MOVING.write(tmp_path)), nearly(MOVING))
+    color = maker.make(MIDDLE).denoised.color
+    maker.make(MIDDLE + 1)
+    before = maker._results[MIDDLE]
+    assert before.neighbour_samples is before.drift_weight is None
+    assert not before.trust
+    np.testing.assert_array_equal(maker.make(MIDDLE).denoised.color, color)
+
+
 def test_what_shows_another_light_is_left_out(tmp_path):
     def flare(index, layers):
         if index == 3:

@@ -269,6 +269,17 @@ def test_what_makes_sense_gives_no_finding() -> None:
     assert judgement.variance_scale is None
 
 
+def test_pairs_of_large_frames_lie_in_files_and_are_judged_alike(tmp_path, monkeypatch) -> None:
+    """Two pairs of 7680×4320 took 10.4 GiB, more than a frame that is denoised under a limit of 6 GiB."""
+    wrong = write(tmp_path, vector(lambda v: -v))
+    expected = validate_layers(open_shot(wrong))
+    monkeypatch.setattr("hybrid.validation.LARGE", 0)
+    monkeypatch.setattr("hybrid.runtime.kept.SMALLEST", 1)
+    found = validate_layers(open_shot(wrong))
+    assert found.findings == expected.findings
+    assert found.motion == expected.motion
+
+
 def test_no_frame_is_read_twice_and_a_second_pair_only_where_one_leaves_a_question(tmp_path, monkeypatch) -> None:
     bundled, wrong = EXAMPLE / "noisy.####.exr", write(tmp_path, vector(lambda v: -v))
     read = Shot.read
