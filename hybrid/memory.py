@@ -32,6 +32,8 @@ SHARE = 0.94
 # Temporary planes while rows of a window are filtered, while a network reads them, and while samples correct a finished
 # picture.
 FILTERING, GIVING, FINISHING = 40, 30, 38
+# Planes that exist while pairs of frames are compared before a run: 8.4 GiB at 7680×4320.
+VALIDATING = 65
 # Temporary planes while TV-L1 solves for a flow.
 REFINING = 38
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -102,7 +104,8 @@ def plan_memory(
         working = plane * (worked * share + read) + (network((outer, width)) or 0)
         # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
         working += oidn if pools else min(oidn, CODE)
-        return base + round(plane * held + max(plane * passing + oidn, plane * FINISHING, working))
+        at_once = max(plane * passing + oidn, plane * FINISHING, working)
+        return base + round(max(plane * held + at_once, plane * VALIDATING))
 
     budget = round(SHARE * limit)
     for in_files in (False, True):
