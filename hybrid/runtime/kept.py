@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import sys
 import tempfile
 import weakref
 from collections.abc import Mapping
@@ -55,7 +56,7 @@ class Keeper:
 
     def release(self) -> None:
         """Let the system take back the pages of files that have been read; they are read again when they are used."""
-        if self.in_files and hasattr(mmap, "MADV_DONTNEED"):  # elsewhere the system does so when memory is short
+        if self.in_files and sys.platform != "win32":  # which does so by itself when memory is short
             for mapping in list(self._mappings):
                 mapping.madvise(mmap.MADV_DONTNEED)
 
