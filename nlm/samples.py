@@ -238,7 +238,8 @@ def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> 
 
     A denoiser makes up to three times the light of a lamp of 10,000 exposures, which no mean of few samples corrects.
     """
-    lamp = channel_mean(picture) > _LAMP * exposure
+    light = channel_mean(picture)
+    lamp = (light > _LAMP * exposure) & np.isfinite(light)  # what is not finite is refused, and not mended
     if not lamp.any():
         return picture
     brightest = cv2.dilate(np.maximum.reduce(samples), np.ones((5, 5), np.uint8))
