@@ -53,7 +53,7 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
         G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,    N = (Σ c)² / Σ c²,
 
     where r' is r scaled down to |r'| ≤ 6 (e + exposure), in the mean over channels, so that fireflies keep their hue
-    and lose their power. `nlm.samples.restore_mean` adds the lost light to the denoised picture.
+    and lose their power. `hybrid.alignment.residual` spreads that light around them beforehand, as far as it is missed.
     """
     if residuals.shape != estimates.shape:
         raise ValueError(f"residuals: expected shape {estimates.shape} like the estimates, got {residuals.shape}")
