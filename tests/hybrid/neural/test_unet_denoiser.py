@@ -1,5 +1,7 @@
 """Windows on their way to the final stage: guides, and frames without light."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -58,3 +60,16 @@ def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, 
     aligner = FrameStream(open_shot(folder), only({"warp"}), radius=denoiser.radius, first_pass=Classical(DRAFT))
     denoiser(aligner.align(SCENE.first + 2))
     assert bool(seen) == (preset == "quality")
+
+
+def test_the_network_gets_limited_residuals():
+    """Those of bright samples, with the light that the limit takes spread around them."""
+    asked = []
+
+    class Sources:
+        def residual(self, part, *, limited=False):
+            asked.append((part, limited))
+
+    block = slice(10, 50), slice(0, 30)
+    unet_denoiser._residual_rows(SimpleNamespace(sources=Sources()), block, slice(2, 7))
+    assert asked == [((slice(12, 17), block[1]), True)]
