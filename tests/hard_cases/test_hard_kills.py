@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -60,8 +61,16 @@ class Bench:
         """Run to the end."""
         self.said.write_bytes(b"")
         process = self.start(output, *more, before=before)
-        process.join(120)
+        self.join(process)
         return Done(process.exitcode, self.said.read_text(errors="replace"))
+
+    def join(self, *processes: BaseProcess) -> None:
+        """Wait for processes; kill those that hang, which pytest would wait for at its end."""
+        for process in processes:
+            process.join(120)
+            if process.exitcode is None:
+                process.kill()
+                process.join()
 
     def check(self, output: Path, *, complete: bool = False, tidy: bool = False) -> None:
         """Assert that every frame that is there is whole, and that the input is what it was."""
@@ -111,6 +120,12 @@ def test_kills_at_random_moments_lose_nothing(bench, record_property):
     record_property("cases", KILLS)
 
 
+def test_a_kill_while_threads_start_does_not_block_the_next_run(bench):
+    assert bench.run(bench.folder / "blocked", before=die_while_threads_start).code == -signal.SIGKILL
+    bench.run(bench.folder / "blocked").succeeds()
+    bench.check(bench.folder / "blocked", complete=True, tidy=True)
+
+
 @pytest.mark.parametrize("number", range(STOPS))
 def test_a_stop_leaves_whole_frames_and_says_how_many(bench, number):
     output = bench.folder / f"stopped.{number}"
@@ -132,6 +147,13 @@ def limit_files() -> None:
     import resource
 
     resource.setrlimit(resource.RLIMIT_FSIZE, (FULL, FULL))
+
+
+def die_while_threads_start() -> None:
+    from numba.np.ufunc import parallel
+
+    parallel._backend_init_process_lock.acquire()
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def be_nobody() -> None:
@@ -174,7 +196,6 @@ def test_two_runs_at_once_into_one_folder(bench):
     for number in range(3):
         output = bench.folder / f"twice.{number}"
         processes = [bench.start(output), bench.start(output)]
-        for process in processes:
-            process.join(120)
+        bench.join(*processes)
         assert [process.exitcode for process in processes] == [0, 0]
         bench.check(output, complete=True, tidy=True)
