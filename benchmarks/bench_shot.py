@@ -1,7 +1,6 @@
 """CPU seconds and peak memory of whole processes at film size, beside OIDN's in the same run, as JSON.
 
     python benchmarks/bench_shot.py [--shots pan busy] [--frames 10] [--scale 6] [--commands "denoise --preset fast"]
-    python benchmarks/bench_shot.py --sweep           # `fast`: other sizes, numbers of frames, windows, cores
     python benchmarks/bench_shot.py --write FOLDER    # the shots alone
 
 Shots are made of the bundled one, which runs to and fro:
@@ -14,8 +13,7 @@ Shots are made of the bundled one, which runs to and fro:
 
 Each command runs in a process of its own, as a user would run it; so does OIDN (`--oidn`), which reads the same
 files, takes the guides as they are (*high*) or filters them first (*best*), and writes with the same code. Peak
-memory is the operating system's count. Windows of other lengths than five are of the preset's weights in a network for
-so many frames.
+memory is the operating system's count.
 """
 
 from __future__ import annotations
@@ -45,10 +43,6 @@ REPEAT = 6
 VIEW = "ViewLayer"
 SHOTS = ("pan", "busy", "tiled")
 PREFILTERS = {"high": None, "best": "high"}
-FAST = "denoise --preset fast"
-# Scale, frames, window and cores: one of them at a time differs from the second, or the frames from the first.
-SWEEP = [(1, 3, 5, 2), (3, 3, 5, 2), (6, 3, 5, 2), (12, 3, 5, 2), (3, 1, 5, 2), (3, 10, 5, 2), (3, 20, 5, 2)]
-SWEEP += [(3, 3, 3, 2), (3, 3, 7, 2), (3, 3, 5, 1), (1, 10, 5, 2), (1, 100, 5, 2)]
 
 
 def tile_shot(folder: Path, frames: int, scale: int = REPEAT) -> None:
@@ -150,40 +144,10 @@ def run_oidn(pattern: str, out: Path, mode: str) -> None:
         shot.write(output_path(out, shot, number), number, {"color": color})
 
 
-def write_weights(path: Path, frames: int) -> str:
-    """Write the weights of `fast` for windows of so many frames; the command that denoises with them."""
-    from network.checkpoint import load_model, save_model, shipped_weights
-    from network.robust_unet import RobustUNet, RobustUNetConfig
-
-    model = RobustUNet(RobustUNetConfig(frames, "small"))
-    model.load_state_dict(load_model(shipped_weights("fast")).state_dict())
-    save_model(path, model)
-    return f"denoise --weights {path} --first-pass oidn-fast"
-
-
-def sweep(folder: Path) -> None:
-    """Print what `fast` costs on *pan* for each row of `SWEEP`."""
-    for scale, frames, window, cores in SWEEP:
-        there = folder / f"{scale}x{frames}"
-        pattern = str(there / "pan.####.exr") if there.exists() else write_shot("pan", there, frames, scale)
-        command = FAST if window == 5 else write_weights(folder / f"{window}.safetensors", window)
-        first, *rest = command.split()
-        out = folder / "out" / f"{scale}x{frames}x{window}x{cores}"
-        words = [sys.executable, "-m", "hybrid.cli", first, pattern, "-o", str(out), *rest]
-        cost = measure(words, cores)
-        facts = {"size": f"{320 * scale}x{180 * scale}", "frames": frames, "window": window, "cores": cores}
-        print(json.dumps({**facts, **_per_frame(cost, frames)}), flush=True)
-
-
-def measure(words: Sequence[str], cores: int | None = None) -> dict[str, float]:
-    """Run a command, on all cores or so many; its seconds and peak memory as the operating system has counted them."""
+def measure(words: Sequence[str]) -> dict[str, float]:
+    """Run a command; its seconds and peak memory as the operating system has counted them."""
     began = time.perf_counter()
-    process = subprocess.Popen(
-        words,
-        stderr=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        preexec_fn=None if cores is None else lambda: os.sched_setaffinity(0, range(cores)),
-    )
+    process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), words)
@@ -202,7 +166,6 @@ def main(argv: list[str] | None = None) -> int:
     presets = [f"denoise --preset {preset}" for preset in ("fast", "balanced", "quality")]
     parser.add_argument("--commands", nargs="*", default=presets)
     parser.add_argument("--oidn", nargs="*", choices=sorted(PREFILTERS), default=["high", "best"])
-    parser.add_argument("--sweep", action="store_true", help="measure `SWEEP` and nothing else")
     parser.add_argument("--write", type=Path, metavar="FOLDER", help="write the shots there, and measure nothing")
     parser.add_argument("--run-oidn", nargs=3, metavar=("SHOT", "OUT", "MODE"), help=argparse.SUPPRESS)
     options = parser.parse_args(argv)
@@ -211,9 +174,6 @@ def main(argv: list[str] | None = None) -> int:
         run_oidn(pattern, Path(out), mode)
         return 0
     with tempfile.TemporaryDirectory() as name:
-        if options.sweep:
-            sweep(Path(name))
-            return 0
         for shot in options.shots:
             folder = (options.write or Path(name)) / shot
             pattern = write_shot(shot, folder, options.frames, options.scale)
