@@ -50,45 +50,34 @@ OIDN_MODE_OF_PRESET = {"fast": "oidn-fast", "balanced": "oidn-fast", "quality": 
 
 
 @dataclass(frozen=True)
-class PerFrame:
+class PerFrame(FirstPass):
     """A first pass that is a function of the frame alone."""
 
     # from a frame to its denoised radiance (H, W, 3), or None where it has none
     function: Callable[[Frame], Array | None]
-    holds: int = 0  # bytes that it takes for itself
-    files: Shot | None = None  # the finished sequence that it reads, if it does
-    from_noisy = False
     reads_frame = True
 
-    def reach(self, radius: int) -> int:
-        """See `hybrid.stream.FirstPass`."""
-        return radius
-
     def make(self, stream: FrameStream, number: int) -> Array | None:
-        """See `hybrid.stream.FirstPass`."""
+        """See `FirstPass`."""
         frame, prepared = stream.as_read(number), stream.frame(number)
         with stream.timings.stage("estimate"):
             return _checked(self.function(frame), frame, None if prepared is None else prepared.highlights)
 
 
 @dataclass(frozen=True)
-class GuideAware:
+class GuideAware(FirstPass):
     """A first pass by a denoiser whose settings depend on the noise of its guides."""
 
     # from a frame (number, color, albedo and normal alone, all finite), and whether its guides hold noise, to its
     # denoised radiance (H, W, 3)
     function: Callable[[Frame, bool], Array]
-    holds: int = 0  # bytes that it takes for itself
-    files = None
-    from_noisy = False
-    reads_frame = False
 
     def reach(self, radius: int) -> int:
-        """See `hybrid.stream.FirstPass`."""
+        """See `FirstPass`."""
         return radius + GUIDE_RADIUS
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
-        """See `hybrid.stream.FirstPass`."""
+        """See `FirstPass`."""
         prepared = stream.frame(number)
         assert prepared is not None
         noisy = "prefilter" in stream.plan(stream.around(number, GUIDE_RADIUS)).stages
@@ -98,21 +87,18 @@ class GuideAware:
 
 
 @dataclass(frozen=True)
-class Classical:
+class Classical(FirstPass):
     """A first pass by the classical chain, from the window of noisy frames around each frame."""
 
     preset: ClassicalPreset  # the settings of the chain
-    holds = 0
-    files = None
     from_noisy = True
-    reads_frame = False
 
     def reach(self, radius: int) -> int:
-        """See `hybrid.stream.FirstPass`."""
+        """See `FirstPass`."""
         return 2 * radius
 
     def make(self, stream: FrameStream, number: int) -> Array:
-        """See `hybrid.stream.FirstPass`."""
+        """See `FirstPass`."""
         window = align(stream.window(number, noisy=True), timings=stream.timings)
         return filter_window(window, self.preset, timings=stream.timings)
 
@@ -246,7 +232,7 @@ def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: _Kept
         run = partial(store.read_or_run, run=run)
     # Networks in torch work on a strip at a time.
     holds = 0 if in_torch else HOLDS_FAST if mode == "oidn-fast" else HOLDS
-    first_pass = GuideAware(run, holds) if mode == "oidn-clean" else PerFrame(run, holds)
+    first_pass = (GuideAware if mode == "oidn-clean" else PerFrame)(run, holds=holds)
     return FirstPassSource(mode, first_pass, "", kept=() if store is None else tuple(store.places.values()))
 
 

@@ -7,9 +7,9 @@ dropped when one of the frames it belongs to leaves the kept ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol, TypeVar, cast
+from typing import ClassVar, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,30 +35,22 @@ Array = NDArray[np.float32]
 Value = TypeVar("Value")
 
 
-class FirstPass(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class FirstPass:
     """A source of denoised single frames (`hybrid.first_pass` has three kinds)."""
 
-    @property
-    def holds(self) -> int:
-        """Bytes that it takes for itself while it works."""
-
-    @property
-    def files(self) -> Shot | None:
-        """The finished sequence that it reads, if it does."""
-
-    @property
-    def from_noisy(self) -> bool:
-        """Whether it denoises windows of noisy frames."""
-
-    @property
-    def reads_frame(self) -> bool:
-        """Whether it reads `FrameStream.as_read`."""
+    holds: int = 0  # bytes that it takes for itself while it works
+    files: Shot | None = None  # the finished sequence that it reads, if it does
+    from_noisy: ClassVar[bool] = False  # whether it denoises windows of noisy frames
+    reads_frame: ClassVar[bool] = False  # whether it reads `FrameStream.as_read`
 
     def reach(self, radius: int) -> int:
         """Count the frames on each side of the centre that are read for a window of this radius."""
+        return radius
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
         """Denoise frame `number` of the stream: radiance (H, W, 3), finite; None where there is nothing to read."""
+        raise NotImplementedError
 
 
 class FrameStream:
@@ -321,7 +313,7 @@ def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | Non
     layers = shot.layers(shot.numbers[0])
     support = radius if first_pass is None else first_pass.reach(radius)
     # Fireflies are looked for in frames beyond the window.
-    frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), shot.count)
+    frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), len(shot.files))
     results = 2 if "stabilize" in stages else 1
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
     written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10

@@ -69,11 +69,6 @@ class Shot:
         return tuple(sorted(self.files))
 
     @property
-    def count(self) -> int:
-        """Number of files, asked for or not."""
-        return len(self.files)
-
-    @property
     def aovs(self) -> tuple[str, ...]:
         """Names of the AOVs that are read."""
         return self.reader.files.aovs
@@ -428,7 +423,7 @@ def output_path(pattern: str | Path, shot: Shot, number: int, *, include_context
     if Path(pattern).is_dir() or names.path(number).suffix.lower() != ".exr":
         path = Path(pattern) / shot.path(number).name
     else:
-        count = shot.count if include_context else len(shot)
+        count = len(shot.files if include_context else shot)
         if not names.digits and count > 1:
             raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
         path = names.path(number)

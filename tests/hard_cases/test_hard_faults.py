@@ -447,7 +447,7 @@ def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size
     """320×180 was refused "at least 2.3 GiB" for a run that peaks at 0.54 GiB."""
     shot = open_shot(Scene(frames=5).write(tmp_path))
     monkeypatch.setattr(type(shot), "shape", size)
-    estimates = PerFrame(lambda frame: frame.color, holds)
+    estimates = PerFrame(lambda frame: frame.color, holds=holds)
 
     def plan(gibibytes):
         def network(shape):
