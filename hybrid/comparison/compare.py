@@ -7,8 +7,7 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -67,15 +66,15 @@ def compare_shot(
 
     Raises ValueError before any method runs: if shot and reference have no frame in common; if another input lacks a
     frame or differs in size; if levels are given without samples or without the method "noisy"; if a ladder has one
-    number of samples twice, or a level without some frame. Afterwards: if a method has left out frames.
+    number of samples twice, or a level without some frame.
     """
     options = options or CompareOptions()
     halves = reference if isinstance(reference, tuple) else (reference,)
     numbers = _common_frames(shot, halves)
     _check_levels(numbers, methods, options)
     inputs = _inputs(numbers, halves, methods, options.levels)
-    steps = _Steps(on_step, methods, options)
-    steps.start("read the shot, its motion and the reference", 0)
+    steps = _Steps(on_step, _count_steps(methods, options))
+    steps.start("read the shot, its motion and the reference")
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         store = FrameStore(Path(kept))
         with ThreadPoolExecutor(1) as background:
@@ -87,20 +86,19 @@ def compare_shot(
             findings = [*options.findings, *(check.result() if check is not None else ())]
         evaluator = Evaluator(store, numbers, pairs, options.exposure, static)
         load = load_average()
-        timed = time_methods(methods, shot, options.rounds, store, partial(steps.start, first=1))
+        timed = time_methods(methods, shot, options.rounds, store, steps.start)
         statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, steps)
         law, law_facts = _noise_law(evaluator, statistics, options)
         results = [
-            MethodResult(
-                name, method.settings, method.family, method.sweep, method.base, absent_reason=timed.absent[name]
-            )
+            replace(_result_of(name, method), absent_reason=timed.absent[name])
             if name in timed.absent
-            else _result(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
+            else _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             for name, method in methods.items()
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, steps)
-        map_facts = _store_all_maps(store, shot, {n: methods[n] for n in timed.runs}, evaluator, steps)
-        steps.start("done", steps.total)
+        mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
+        map_facts = _store_all_maps(store, shot, mapped, evaluator, steps)
+        steps.end()
     facts = _facts_of_frames(evaluator) | law_facts
     if findings:
         facts["Layers"] = "; ".join(findings)
@@ -108,21 +106,28 @@ def compare_shot(
 
 
 class _Steps:
-    """Numbers the steps of a comparison and reports them: reading, runs, FLIP, measuring, levels, maps."""
+    """Counts the steps of a comparison, and reports each as it starts."""
 
-    def __init__(self, on_step: OnStep | None, methods: Mapping[str, Method], options: CompareOptions) -> None:
-        self.mapped = [name for name, method in methods.items() if options.maps and method.maps is not None]
-        self.first_measure = 1 + options.rounds * len(methods)
-        self.first_level = self.first_measure + 1 + len(methods)
-        levels = len(options.levels) if options.ladder else 0
-        self.first_map = self.first_level + levels * (1 + len(_methods_of_levels(methods)))
-        self.total = self.first_map + len(self.mapped)
-        self._on_step = on_step
+    def __init__(self, on_step: OnStep | None, total: int) -> None:
+        self._on_step, self._total, self._done = on_step, total, 0
 
-    def start(self, what: str, done: int, _: int = 0, *, first: int = 0) -> None:
-        """Report a step by its number from the step `first`."""
+    def start(self, what: str) -> None:
+        """Report the next step."""
         if self._on_step is not None:
-            self._on_step(what, first + done, self.total)
+            self._on_step(what, self._done, self._total)
+        self._done += 1
+
+    def end(self) -> None:
+        """Report the end; steps that turned out to be unnecessary are skipped."""
+        self._done = self._total
+        self.start("done")
+
+
+def _count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:
+    """Steps of a comparison: reading, runs, FLIP, measuring, levels, maps."""
+    levels = len(options.levels) * (1 + len(_methods_of_levels(methods))) if options.ladder else 0
+    maps = sum(method.maps is not None for method in methods.values()) if options.maps else 0
+    return 1 + options.rounds * len(methods) + 1 + len(methods) + levels + maps
 
 
 # Checks before any method runs
@@ -201,12 +206,12 @@ def _span(numbers: Sequence[int]) -> str:
 
 def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], steps: _Steps) -> dict[str, dict[str, Statistic]]:
     """Measures of each method; without FLIP for points of a sweep."""
-    steps.start("FLIP of all methods", steps.first_measure)
+    steps.start("FLIP of all methods")
     evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
     evaluator.map_reference_changes()
     statistics = {}
-    for done, (name, method) in enumerate(methods.items(), start=1):
-        steps.start(f"measure {name}", done, first=steps.first_measure)
+    for name, method in methods.items():
+        steps.start(f"measure {name}")
         statistics[name] = evaluator.measure(name, flip=not method.sweep, change=not method.sweep)
     return statistics
 
@@ -240,18 +245,22 @@ def _measure_ladder(
         return {}
     chosen = _methods_of_levels(methods)
     measured = {options.samples: {name: statistics[name] for name in chosen if name in statistics}}
-    for index, (level, samples) in enumerate(options.levels):
-        first = steps.first_level + index * (1 + len(chosen))
+    for level, samples in options.levels:
         names = {f"{name} at {samples:g} samples": name for name in chosen if name in statistics}
         at_level = {long: chosen[name] for long, name in names.items()}
-        timed = time_methods(at_level, level, 1, evaluator.store, partial(steps.start, first=first))
-        steps.start(f"measure the level of {samples:g} samples", len(chosen), first=first)
+        timed = time_methods(at_level, level, 1, evaluator.store, steps.start)
+        steps.start(f"measure the level of {samples:g} samples")
         evaluator.map_flip(list(timed.runs))
         measured[samples] = {names[long]: evaluator.measure(long, flip=True, change=False) for long in timed.runs}
     return build_ladder(measured)
 
 
-def _result(
+def _result_of(name: str, method: Method) -> MethodResult:
+    """The result of a method, without measurements."""
+    return MethodResult(name, method.settings, method.family, method.sweep, method.base)
+
+
+def _measured(
     name: str,
     method: Method,
     runs: Sequence[RunCost],
@@ -263,12 +272,8 @@ def _result(
     seconds = summarize_runs(runs) if method.cost == "measured" else None
     unmeasured = 0.0 if method.cost == "free" else None
     stated = unmeasured if method.seconds is None else method.seconds / megapixels
-    return MethodResult(
-        name,
-        method.settings,
-        method.family,
-        method.sweep,
-        method.base,
+    return replace(
+        _result_of(name, method),
         seconds_per_megapixel=seconds.median if seconds else stated,
         spread=(seconds.least, seconds.most) if seconds and len(runs) > 1 else None,
         cpu_seconds_per_megapixel=seconds.cpu if seconds else unmeasured,
@@ -289,13 +294,12 @@ def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
 def _store_all_maps(
     store: FrameStore, shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, steps: _Steps
 ) -> dict[str, str]:
-    """Store the maps of the methods that have run; return a fact if some frames are left out."""
+    """Store the maps of methods; return a fact if some frames are left out."""
     numbers = mapped_frames(evaluator.numbers, evaluator.static.size)
-    for done, name in enumerate(steps.mapped):
-        if name in methods:
-            steps.start(f"maps of {name}", done, first=steps.first_map)
-            run_in_process(_store_maps, methods[name], shot, numbers, name, store)
-    if steps.mapped and len(numbers) < len(evaluator.numbers):
+    for name, method in methods.items():
+        steps.start(f"maps of {name}")
+        run_in_process(_store_maps, method, shot, numbers, name, store)
+    if methods and len(numbers) < len(evaluator.numbers):
         return {"Maps": f"confidence and contribution of frame {numbers[0]} only, because the frames are large"}
     return {}
 

@@ -124,7 +124,7 @@ def time_methods(
     shot: Frames,
     rounds: int,
     store: FrameStore | None = None,
-    on_step: OnStep | None = None,
+    on_step: Callable[[str], None] = lambda what: None,
 ) -> TimedRuns:
     """Run the methods in turns, so that other load of the machine affects all of them.
 
@@ -137,9 +137,8 @@ def time_methods(
     for turn in range(rounds):
         # Each round starts at another method, so that no method always follows the same one.
         start = turn * len(names) // rounds
-        for done, name in enumerate(names[start:] + names[:start]):
-            if on_step is not None:
-                on_step(f"run {name}", turn * len(names) + done, rounds * len(names))
+        for name in names[start:] + names[:start]:
+            on_step(f"run {name}")
             if name in absent or (turn and methods[name].cost != "measured"):
                 continue
             if sum(run.seconds for run in runs.get(name, [])) >= ENOUGH:
