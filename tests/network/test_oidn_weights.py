@@ -1,8 +1,7 @@
-"""Weights of OIDN: from its library, where they are found by their digest; all that is read is checked."""
+"""Weights of OIDN: from its library, where they are found by their digest."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from importlib.util import find_spec
 from pathlib import Path
@@ -68,49 +67,6 @@ def test_reads_what_was_written(tensors: dict[str, np.ndarray]) -> None:
         np.testing.assert_array_equal(read[name].numpy(), value.astype(np.float32))
 
 
-def test_a_file_cut_short_anywhere_is_refused(tensors: dict[str, np.ndarray]) -> None:
-    data = tza(tensors)
-    for length in range(len(data)):
-        with pytest.raises(ValueError, match=r"^TZA: expected") as error:
-            read_tza(data[:length])
-        assert "\n" not in str(error.value)
-
-
-def test_a_byte_changed_anywhere_is_read_or_refused(tensors: dict[str, np.ndarray]) -> None:
-    """Nothing but ValueError, no memory beyond the file's, no number that is not finite."""
-    data, rng = tza(tensors), np.random.default_rng(4)
-    for place in [*range(12), *range(data.index(b"conv.weight") - 6, len(data))]:
-        for value in (0, 255, *rng.integers(256, size=4)):
-            changed = bytearray(data)
-            changed[place] = value
-            with contextlib.suppress(ValueError):
-                read = read_tza(bytes(changed))
-                assert sum(v.numel() for v in read.values()) <= len(data)
-                assert all(bool(v.isfinite().all()) for v in read.values())
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda v: v.update({"conv.bias": np.float32([1, np.nan])}), "conv.bias: expected finite numbers"),
-        (lambda v: v.update({"conv.bias": np.float32([])}), "conv.bias of shape .0,.: expected some values"),
-    ],
-)
-def test_bad_values_are_refused(tensors, edit, message) -> None:
-    edit(tensors)
-    with pytest.raises(ValueError, match=message):
-        read_tza(tza(tensors))
-
-
-def test_what_is_no_tza_file_is_refused(tensors: dict[str, np.ndarray]) -> None:
-    data = bytearray(tza(tensors))
-    data[2] = 3
-    with pytest.raises(ValueError, match="weights: expected magic 0x41d7 and version 2, got 0x41d7 and 3"):
-        read_tza(bytes(data), "weights")
-    with pytest.raises(ValueError, match="expected a new tensor, x or oihw"):
-        read_tza(tza(tensors).replace(b"oihw", b"iohw"))
-
-
 @pytest.mark.parametrize("size", ["small", "base", "large"])
 @pytest.mark.parametrize("inputs", [3, 9])
 def test_size_is_found_from_the_tensors(size: str, inputs: int) -> None:
@@ -119,14 +75,3 @@ def test_size_is_found_from_the_tensors(size: str, inputs: int) -> None:
     assert made.config == OidnUNetConfig(inputs, size)
     for name, value in made.state_dict().items():
         np.testing.assert_array_equal(value.numpy(), values[name].astype(np.float32))
-
-
-def test_other_tensors_are_refused(tensors: dict[str, np.ndarray]) -> None:
-    with pytest.raises(ValueError, match="small, base or large U-Net, got 2 other tensors"):
-        build_unet(read_tza(tza(tensors)))
-    with pytest.raises(ValueError, match="got 0 other tensors"):
-        build_unet({})
-    values = weights_of(OidnUNet(OidnUNetConfig(9, "small")))
-    values["last.bias"] = values["last.bias"][:2]
-    with pytest.raises(ValueError, match="small, base or large U-Net"):
-        build_unet(read_tza(tza(values)))
