@@ -315,11 +315,11 @@ def invert_flow(
     return inverse, arrived
 
 
-def forward_backward_error(flow: np.ndarray, reverse: np.ndarray, *, first_row: int = 0) -> np.ndarray:
+def forward_backward_error(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
     """Measure the distance from start to end of a round trip, (H, W) float32, pixels: |f(x) + r(x + f(x))|.
 
-    The flow may be of the rows from `first_row` on; outside the frame r has its edge value.
+    Outside the frame r has its edge value.
     """
-    loop, _ = warp(reverse, flow, first_row=first_row)
+    loop, _ = warp(reverse, flow)
     loop += flow
     return np.asarray(np.hypot(loop[..., 0], loop[..., 1]))

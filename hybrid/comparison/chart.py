@@ -52,11 +52,6 @@ class _Point:
     family: int
     on_front: bool
 
-    @property
-    def color(self) -> str:
-        """Color of the family."""
-        return COLORS[self.family % len(COLORS)]
-
 
 def families(results: Sequence[MethodResult]) -> list[str]:
     """Return the families in order of appearance, which determines color and marker."""
@@ -159,20 +154,21 @@ def _leave_out_input(axes: Axes, shown: Collection[MethodResult], metric: Metric
 def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
     """Marker and error bars of a method: filled on the front, smaller for a point of a sweep."""
     result, statistic = point.result, point.result.metrics[metric.key]
+    color, kind, size = _style(point.family)
     bars = [((point.x, point.x), (statistic.low, statistic.high))]
     if cost == "seconds_per_megapixel" and result.spread and result.spread[0] > 0:
         bars.append((result.spread, (point.y, point.y)))
     for xs, ys in bars:
         if all(math.isfinite(y) and (y > 0 or not metric.logarithmic) for y in ys):
-            axes.plot(xs, ys, color=point.color, linewidth=0.9, alpha=0.6, gid=f"bar-{point.index}")
+            axes.plot(xs, ys, color=color, linewidth=0.9, alpha=0.6, gid=f"bar-{point.index}")
     axes.plot(
         [point.x],
         [point.y],
         linestyle="none",
-        marker=MARKERS[point.family % len(MARKERS)],
-        markersize=((6 if result.sweep else 8) + point.on_front) * SIZES[point.family % len(SIZES)],
-        markerfacecolor=point.color if point.on_front else "white",
-        markeredgecolor="white" if point.on_front else point.color,
+        marker=kind,
+        markersize=((6 if result.sweep else 8) + point.on_front) * size,
+        markerfacecolor=color if point.on_front else "white",
+        markeredgecolor="white" if point.on_front else color,
         markeredgewidth=0.8 if point.on_front else 1.4,
         zorder=4 if point.on_front else 3,
         clip_on=False,
@@ -193,7 +189,7 @@ def _draw_lines(axes: Axes, points: Sequence[_Point]) -> None:
             sweeps.setdefault((p.result.sweep, p.result.base), []).append((value, p))
     for group in sweeps.values():
         line = [p for _, p in sorted(group, key=lambda pair: pair[0])]
-        gid, color = f"series-{line[0].family}", line[0].color
+        gid, (color, *_) = f"series-{line[0].family}", _style(line[0].family)
         axes.plot([p.x for p in line], [p.y for p in line], color=color, linewidth=0.8, alpha=0.6, gid=gid)
 
 
@@ -262,7 +258,7 @@ def draw_ladder(ladder: Ladder) -> Figure | None:
         for name, curve in ladder[metric.key].items():
             color, kind, size = _style(names.index(name))
             style = "--" if name == INPUT else "-"
-            axes.plot(*zip(*curve, strict=True), color=color, marker=kind, markersize=0.8 * size, linestyle=style)
+            axes.plot(*zip(*curve, strict=True), color=color, marker=kind, markersize=6.4 * size, linestyle=style)
         axes.set(xscale="log", yscale="log")
         if metric.key not in ERRORS:  # the range of FLIP seldom has a power of ten
             _set_plain_ticks(axes)
@@ -278,15 +274,15 @@ def draw_ladder(ladder: Ladder) -> Figure | None:
 
 
 def _style(index: int) -> tuple[str, str, float]:
-    """Color, marker and its size, by the index of a family or of a method."""
-    return COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)], 8 * SIZES[index % len(SIZES)]
+    """Color, marker and its relative size, by the index of a family or of a method."""
+    return COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)], SIZES[index % len(SIZES)]
 
 
 def _draw_legend(figure: Figure, names: Sequence[str], columns: int = LEGEND_COLUMNS, *, lines: bool = False) -> None:
     handles = []
     for i, name in enumerate(names):
         color, kind, size = _style(i)
-        handle = Line2D([], [], color=color, marker=kind, markersize=size)
+        handle = Line2D([], [], color=color, marker=kind, markersize=8 * size)
         handle.set_linestyle("" if not lines else "--" if name == INPUT else "-")
         handles.append(handle)
     legend = figure.legend(handles, ["-"] * len(names), loc=(0.05, 0), ncols=columns, frameon=False)
@@ -317,7 +313,7 @@ def to_png(figure: Figure) -> bytes:
 
 def marker(family: int, size: float = 6.5) -> str:
     """Return the points of an SVG polygon with the marker of a family, by its index, around the origin."""
-    style = MarkerStyle(MARKERS[family % len(MARKERS)])
-    scale = 2 * size * SIZES[family % len(SIZES)]
+    _, kind, relative = _style(family)
+    style, scale = MarkerStyle(kind), 2 * size * relative
     path = style.get_path().transformed(style.get_transform() + Affine2D().scale(scale, -scale))
     return " ".join(f"{x:.2f},{y:.2f}" for x, y in np.asarray(path.to_polygons()[0]))

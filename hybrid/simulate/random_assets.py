@@ -108,9 +108,9 @@ def _new_image(name: str, pixels: np.ndarray, linear: bool = False) -> Any:
     return image
 
 
-def printed(rng: Rng, roughness: float = 0.6) -> Any:
+def printed(rng: Rng) -> Any:
     """Make a material of a painted image: labels, spines, pictures."""
-    made = plain("printed", (1, 1, 1), Roughness=roughness)
+    made = plain("printed", (1, 1, 1), Roughness=0.6)
     tree = made.node_tree
     image = node(tree, "TexImage", Vector=node(tree, "TexCoord").outputs["Generated"])
     image.image, image.projection = painted_image(rng), "BOX"

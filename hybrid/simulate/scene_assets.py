@@ -102,11 +102,6 @@ def glow(color: Color, strength: float) -> Any:
     return plain("glow", (0, 0, 0), Emission_Color=(*color, 1), Emission_Strength=strength, Specular_IOR_Level=0)
 
 
-def clear_glass(name: str, color: Color = (1, 1, 1), ior: float = 1.5) -> Any:
-    """Make smooth glass."""
-    return plain(name, color, Roughness=0, Transmission_Weight=1, IOR=ior)
-
-
 def hair_material(melanin: float, redness: float, roughness: float = 0.3) -> Any:
     """Make Cycles' principled hair; `melanin` (darkness) and `redness` are in [0, 1]."""
     made, tree = new_material("hair")

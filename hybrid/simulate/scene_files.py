@@ -18,7 +18,6 @@ from hybrid.simulate.scene_assets import (
     add_lamp,
     add_object,
     bevelled,
-    clear_glass,
     glow,
     lathe,
     new_world,
@@ -99,7 +98,7 @@ def make_material(name: str, values: dict[str, Any]) -> Any:
     if "glow" in values:
         return glow(values["glow"], values["strength"])
     if "glass" in values:
-        return clear_glass(name, values["glass"], values["ior"])
+        return plain(name, values["glass"], Roughness=0, Transmission_Weight=1, IOR=values["ior"])
     return two_tone(name, **values) if "dark" in values else plain(name, **values)
 
 
