@@ -47,13 +47,11 @@ def denoise_oidn(
     given. Part of a frame needs the whole frame's (`hybrid.alignment.transfer.autoexposure`). `device` is as for
     `find_device`.
 
-    Raises ImportError if pyoidn is not installed; ValueError if shapes differ, values are not finite, the quality is
-    unknown, or there is a normal alone; RuntimeError if OIDN reports an error, or has no such device here.
+    Raises ImportError if pyoidn is not installed; ValueError if shapes differ or values are not finite; RuntimeError if
+    OIDN reports an error, or has no such device here.
     """
     guides = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
     images = {name: _as_input(image, name, color) for name, image in {"color": color, **guides}.items()}
-    if albedo is None and normal is not None:
-        raise ValueError("normal without albedo: OIDN has no such filter; pass both, or neither")
     if prefilter is not None:
         for name in guides:
             images[name] = _execute({name: images[name]}, prefilter, device)
@@ -95,8 +93,6 @@ def _execute(
     oidn, device = _device(where)
     qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,
                  "fast": oidn.OIDN_QUALITY_FAST}  # fmt: skip
-    if quality not in qualities:
-        raise ValueError(f"quality must be one of {', '.join(qualities)}, is {quality!r}")
     output = np.empty_like(next(iter(images.values())))
     rt = oidn.Filter(device, oidn.OIDN_FILTER_TYPE_RT)
     try:  # not `with`: pyoidn 2.5.1's __exit__ returns true, which swallows the exception

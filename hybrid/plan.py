@@ -199,7 +199,6 @@ def merge(plans: Mapping[int, Plan]) -> Plan:
         decisions = {number: plan.decisions[index] for number, plan in plans.items()}
         on = tuple(number for number, decision in decisions.items() if decision.on)
         most = max(on or decisions, key=lambda n: -np.inf if (figure := decisions[n].figure) is None else figure)
-        assert stage == decisions[most].stage
         reason = decisions[most].reason
         if stage in plans[most].shares:
             reason += f"; it ran on {plans[most].shares[stage]:.0%} of the picture"

@@ -51,12 +51,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def build_preset(name: str, frames: int | None = None, seed: int = 0) -> Model:
-    """Build a network of `PRESETS` with initial weights, in training mode; the global generator is left as it was.
-
-    Raises ValueError if there is no such preset.
-    """
-    if name not in PRESETS:
-        raise ValueError(f"preset is {name!r}, expected one of {', '.join(PRESETS)}")
+    """Build a network of `PRESETS` with initial weights, in training mode; the global generator is left as it was."""
     preset = PRESETS[name]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

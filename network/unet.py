@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import cast
 
 import torch
@@ -42,12 +41,6 @@ class OidnUNetConfig:
 
     inputs: int = 9  # channels: color, then albedo, then normal
     size: str = "base"  # of ENCODERS
-
-    def __post_init__(self) -> None:
-        if self.inputs < 1:
-            raise ValueError(f"inputs: expected at least one channel, got {self.inputs}")
-        if self.size not in ENCODERS:
-            raise ValueError(f"size: expected one of {', '.join(ENCODERS)}, got {self.size!r}")
 
 
 class OidnUNet(nn.Module):
@@ -96,7 +89,7 @@ class OidnUNet(nn.Module):
         skips = []
         for stage in self.encoder[:-1]:
             skips.append(x)
-            (x,) = in_strips(partial(_convolve_and_halve, cast(Stage, stage)), 2, x)
+            (x,) = in_strips(lambda x, stage=stage: [halve(stage(x))], 2, x)
         return self.encoder[-1](x), skips
 
     def decode(self, x: Tensor, skips: Sequence[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
@@ -174,10 +167,6 @@ class Stage(nn.Sequential):
         return x
 
 
-def _convolve_and_halve(stage: Stage, x: Tensor) -> list[Tensor]:
-    return [halve(stage(x))]
-
-
 def check_size(name: str, layer: Tensor, multiple: int) -> None:
     """Raise ValueError unless height and width of a named layer ``(..., H, W)`` are positive multiples of a number."""
     for axis, length in zip(("height", "width"), layer.shape[-2:], strict=True):
@@ -192,8 +181,7 @@ def denoise_color(
     """Denoise images as OIDN does: ``(N, 3, H, W)`` linear radiance, float32, at least 0.
 
     NaN and negative values of the color count as 0; albedo is clipped to [0, 1], normals in any fixed space to [−1, 1].
-    The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`). Raises
-    ValueError if the inputs are not as many as the network's, or differ in shape.
+    The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`).
     """
     layers = [(color, lambda x: encode(clip(x * exposure, 0, LARGEST)))]
     if albedo is not None:
@@ -224,9 +212,6 @@ def _run(
     unet: OidnUNet, layers: Sequence[tuple[Tensor, Callable[[Tensor], Tensor]]], decode: Callable[[Tensor], Tensor]
 ) -> Tensor:
     """Run the network on layers of any size, each mapped to [0, 1] by its function, and decode its output."""
-    channels = sum(layer.shape[1] for layer, _ in layers)
-    if channels != unet.config.inputs:
-        raise ValueError(f"inputs: expected {unet.config.inputs} channels as the weights are for, got {channels}")
     height, width = layers[0][0].shape[2:]
     right, below = -width % unet.multiple, -height % unet.multiple
 

@@ -71,7 +71,7 @@ class Embedded:
 
 
 def embed_pictures(images: ShotImages) -> Embedded:
-    """Encode frames and maps of the reference and of all methods; ValueError if they differ in shape.
+    """Encode frames and maps of the reference and of all methods, which are alike in shape.
 
     Above `LIMIT` bytes they are cropped around the largest differences, then frames are left out.
     """
@@ -83,8 +83,8 @@ def embed_pictures(images: ShotImages) -> Embedded:
     expected = len(images.sources) * len(kept) * width * height * 3 * 4.5 / 8 * 4 / 3
     while True:
         if expected > LIMIT:
-            box, kept = _shrink(box, kept, LIMIT / expected, _point_of_differences(images, level, middle.shape))
-        elements, row = _encode_all(images.sources, kept, box, level, middle.shape)
+            box, kept = _shrink(box, kept, LIMIT / expected, _point_of_differences(images, level))
+        elements, row = _encode_all(images.sources, kept, box, level)
         expected = sum(len(text) for _, text in elements)
         if expected <= LIMIT or (len(kept) == 1 and box[2] <= SMALLEST_CROP):
             break
@@ -119,7 +119,7 @@ def _describe_extent(box: Box, kept: Sequence[int], size: tuple[int, int], frame
 
 
 def _encode_all(
-    sources: Sequence[MethodImages], frames: Sequence[int], box: Box, level: float, shape: tuple[int, ...]
+    sources: Sequence[MethodImages], frames: Sequence[int], box: Box, level: float
 ) -> tuple[list[tuple[str, str]], int]:
     """Ids and texts of all images, and the row with the strongest flicker of the methods."""
     elements = []
@@ -128,7 +128,7 @@ def _encode_all(
     for i, source in enumerate(sources):
         previous_error = None
         for k, number in enumerate(frames):
-            codes = to_codes(_cut(source.frame(number), box, shape, source.name), level)
+            codes = to_codes(_cut(source.frame(number), box), level)
             elements.append((f"p{i}-{k}", compress(codes, CODES)))
             if i == 0:
                 reference.append(codes)
@@ -136,20 +136,17 @@ def _encode_all(
             if previous_error is not None:
                 flicker += np.abs(error - previous_error).mean(axis=(1, 2))
             previous_error = error
-            for j, (title, read) in enumerate(source.maps.items()):
+            for j, read in enumerate(source.maps.values()):
                 whole = read(number)
                 if whole is None:
                     continue
-                values = _cut(whole, box, shape[:2], f"{source.name}, {title}")
-                levels = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (MAP_LEVELS - 1)).astype(np.int32)
+                levels = np.rint(np.clip(np.nan_to_num(_cut(whole, box)), 0, 1) * (MAP_LEVELS - 1)).astype(np.int32)
                 elements.append((f"m{i}-{j}-{k}", compress(levels[..., None], MAP_LEVELS)))
     return elements, int(np.argmax(flicker))
 
 
-def _cut(image: Array, box: Box, shape: tuple[int, ...], name: str) -> Array:
-    """The box of an image of the expected shape."""
-    if image.shape != shape:
-        raise ValueError(f"pictures must be alike: {name} has the shape {image.shape}, expected {shape}")
+def _cut(image: Array, box: Box) -> Array:
+    """The box of an image."""
     x, y, width, height = box
     return image[y : y + height, x : x + width]
 
@@ -165,13 +162,12 @@ def to_codes(image: Array, level: float) -> Codes:
     return np.where(finite, codes, NOT_FINITE).astype(np.int32)
 
 
-def _point_of_differences(images: ShotImages, level: float, shape: tuple[int, ...]) -> tuple[int, int]:
+def _point_of_differences(images: ShotImages, level: float) -> tuple[int, int]:
     """The pixel (x, y) around which the methods differ most in the middle frame."""
-    height, width = shape[:2]
+    height, width = images.reference(images.middle).shape[:2]
     total, squares = np.zeros((2, height, width), np.float32)
     for source in images.sources:
-        picture = _cut(source.frame(images.middle), (0, 0, width, height), shape, source.name)
-        codes = to_codes(picture, level).mean(axis=-1).astype(np.float32)
+        codes = to_codes(source.frame(images.middle), level).mean(axis=-1).astype(np.float32)
         total += codes
         squares += codes**2
     spread = np.maximum(squares / len(images.sources) - (total / len(images.sources)) ** 2, 0)

@@ -69,8 +69,6 @@ def relmse(image: Array, reference: Reference, *, trim: float = 0.0, exposure: f
     The fraction `trim` of the pixels, with the largest errors, in [0, 1), is excluded; 0.001 is usual, since a single
     firefly can outweigh the rest of the frame.
     """
-    if not 0.0 <= trim < 1.0:
-        raise ValueError(f"trim must be in [0, 1), is {trim}")
     x, a, b = _checked(image, reference, exposure)
     truth = a if b is a else (a + b) / 2
     errors = np.mean((x - a) * (x - b) / (truth**2 + EPSILON), axis=-1).ravel()
@@ -116,8 +114,6 @@ def temporal_psnr(
             [error.astype(np.float32) for error in _tone_errors(frame, truth, exposure)]
             for frame, truth in ((previous, r0), (current, r1))
         )
-        if mask.shape != current.shape[:2]:
-            raise ValueError(f"valid must have the shape {current.shape[:2]} of the frames, is {mask.shape}")
         # W is linear: the difference of the differences is the change of the error.
         change = [e1 - warp(e0, flow)[0] for e0, e1 in zip(before, after, strict=True)]
         product = np.multiply(change[0], change[-1], dtype=np.float64)[mask]
@@ -132,11 +128,7 @@ def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: 
     the squares is the unbiased variance over time. NaN without static pixels, for fewer than two frames, or if a
     frame is not finite.
     """
-    values = []
-    for frame in frames:
-        if frame.shape[:2] != static.shape:
-            raise ValueError(f"static must have the shape {frame.shape[:2]} of the frames, is {static.shape}")
-        values.append(tone_map(frame[static], exposure))
+    values = [tone_map(frame[static], exposure) for frame in frames]
     count = len(values)
     if count < 2 or not static.any():
         return np.full(count, np.nan)
@@ -152,11 +144,7 @@ def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) 
 
 def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np.float64]]:
     """Split the values into those of each shot."""
-    if not shots:
-        return [data]
-    if sum(shots) != data.size or min(shots) < 1:
-        raise ValueError(f"shots must add up to the {data.size} values, are {list(shots)}")
-    return np.split(data, np.cumsum(shots)[:-1])
+    return np.split(data, np.cumsum(shots)[:-1]) if shots else [data]
 
 
 def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] = ()) -> tuple[float, float]:
@@ -168,8 +156,6 @@ def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] 
     them say little about another shot. Efron 1979, doi:10.1214/aos/1176344552.
     """
     data = np.asarray(values, np.float64)
-    if data.ndim != 1 or data.size == 0:
-        raise ValueError(f"values must be one-dimensional and not empty, have shape {data.shape}")
     if np.isnan(data).any():
         return float("nan"), float("nan")
     rng = np.random.default_rng(0)

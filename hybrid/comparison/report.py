@@ -73,10 +73,9 @@ class Report:
 def write_report(folder: Path | str, report: Report) -> Path:
     """Write `FILES` into a folder, ``ladder.png`` where there is a ladder; return the path of the page.
 
-    Raises ValueError if two results have one name, images have no result or no frames, or images differ in shape.
+    Results have different names, images those of results.
     """
     folder, results = Path(folder), report.comparison.results
-    _check(results, report.images)
     check_report(folder)
     folder.mkdir(parents=True, exist_ok=True)
     embedded = _embed(folder, report)
@@ -117,21 +116,6 @@ def report_images(
     changes = {CHANGE_MAP: partial(load_map, REFERENCE, CHANGE_MAP)}
     there = any(store.has(REFERENCE, number, CHANGE_MAP) for number in frames)
     return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure, changes if there else {})
-
-
-def _check(results: Sequence[MethodResult], images: ShotImages | None) -> None:
-    """Raise ValueError for content that contradicts itself."""
-    names = [r.name for r in results]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"results must have different names, {name!r} appears {names.count(name)} times")
-    if REFERENCE in names:
-        raise ValueError(f"results must not be named {REFERENCE!r}: the viewer uses that name")
-    for entry in images.methods if images is not None else ():
-        if entry.name not in names:
-            raise ValueError(f"images of {entry.name!r} belong to no result; there are {', '.join(names)}")
-    if images is not None and not images.frames:
-        raise ValueError("images need at least one frame")
 
 
 # Content of the page

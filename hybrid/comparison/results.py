@@ -99,8 +99,6 @@ CHART_METRICS = ("psnr", "temporal_psnr", "relmse", "flip")  # in the order of t
 
 def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
     """Summarize values, one per frame: mean over the shots' means, range, and 95 % bootstrap interval of the mean."""
-    if len(values) == 0:
-        raise ValueError("values must hold at least one frame, is empty")
     data = np.asarray(values, np.float64)
     low, high = bootstrap_interval(data, shots=shots)
     mean, frames = mean_over_shots(data, shots), tuple(float(v) for v in data)

@@ -462,16 +462,14 @@ def write_exr(
     Channels that are not replaced keep their values exactly: a part with such channels whose compression loses a little
     each time it is written (DWA, B44) is written with ZIP. Deep parts are kept.
 
-    Raises ExrError if the source has no such channel; ValueError if an array has the wrong shape, an added layer exists
-    already, or an attribute would replace one that is not a string; OSError if the file cannot be written; no partial
-    file is left.
+    Raises ExrError if the source has no such channel, or an added layer already; ValueError if such a layer has more
+    than four channels, or an attribute would replace one that is not a string; OSError if the file cannot be written;
+    no partial file is left.
     """
     by_part: list[dict[str, OpenEXR.Channel]] = [dict(part.channels) for part in source.parts]
     clamped = 0
     for name, values in replaced.items():
         old = source.channel(name)
-        if values.shape != old.shape:
-            raise ValueError(f"channel {name!r} has shape {values.shape}, expected {old.shape}")
         at, own = source._origin[name]
         pixels, count = _convert(values, old.dtype)
         clamped += count
@@ -480,10 +478,7 @@ def write_exr(
 
     added: list[OpenEXR.Part] = []
     for name, values in (extra or {}).items():
-        fitting = (i for i, p in enumerate(source.parts) if p.shape == values.shape[:2] and not p.deep)
-        over = next(fitting, None)
-        if over is None:
-            raise ValueError(f"layer {name!r} has shape {values.shape}, expected {source.parts[0].shape}")
+        over = next(i for i, p in enumerate(source.parts) if p.shape == values.shape[:2] and not p.deep)
         channels = {n: OpenEXR.Channel(n, np.ascontiguousarray(v)) for n, v in _named(name, values).items()}
         if there := [n for n in channels if n in source.channel_names]:
             raise ExrError(f"{source.path}: channel {there[0]!r} is to be added, and is there already")

@@ -63,10 +63,8 @@ def write_clips(
     Of each frame `tiles` clips of `tile` pixels a side (0: the whole frame) are placed by
     `network.training.clips.importance` with a seed. `estimate` is the source of the first passes
     (`hybrid.first_pass.find_first_pass`); not "none". Raises ValueError if the levels have no frame in common, frames
-    are smaller than a tile, there is no first pass, or both a reference and a target.
+    are smaller than a tile, or there is no first pass.
     """
-    if source.reference is not None and source.target is not None:
-        raise ValueError("target: expected none beside a reference, which is the target")
     shots, numbers = list(source.levels.values()), source.numbers()
     rendered = [*shots, *([] if source.target is None else [source.target])]
     first_passes = [find_first_pass(estimate, shot) for shot in rendered]

@@ -196,8 +196,6 @@ def shots_of(
 
     One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` and `test` into `out/NAME`.
     """
-    if count < 1:
-        raise ValueError(f"shots: got {count}, expected at least 1")
     kind, _, name = scene.partition(":")
     if kind in FIXED:
         if count > 1:

@@ -48,10 +48,6 @@ class ShotSettings:
     effects: Annotated[Literal["auto", "all"], "auto: the effects that the scene needs; all: every effect"] = "auto"
 
     def __post_init__(self) -> None:
-        if not self.frames:
-            raise ValueError("frames: got none, expected at least one")
-        if not self.levels:
-            raise ValueError("levels: got none, expected at least one")
         for name, spp in {**self.levels, "reference": self.reference}.items():
             if spp < (name != "reference"):
                 raise ValueError(f"level {name}: got {spp} samples per pixel, expected at least 1")
@@ -66,10 +62,6 @@ class ShotSettings:
         for frame in self.reference_frames or ():
             if frame not in self.frames:
                 raise ValueError(f"reference frames: got {frame}, expected one of {self.frames[0]}-{self.frames[-1]}")
-        if self.motion not in ("auto", "keep", "add"):
-            raise ValueError(f"motion: got {self.motion!r}, expected auto, keep or add")
-        if self.effects not in ("auto", "all"):
-            raise ValueError(f"effects: got {self.effects!r}, expected auto or all")
 
     @property
     def middle(self) -> int:

@@ -28,15 +28,10 @@ def network_inputs(window: KernelWindow) -> Tensor:
     """``(N, T, 10, H, W)``: ``log1p(color / exposure)``, ``log1p(albedo)``, normal, confidence; 0 for missing guides.
 
     The logarithm keeps a firefly of 1e6 at 14; negative radiance (bicubic warping makes some) counts as zero here,
-    though not in the frames that kernels are applied to. Raises ValueError if shapes do not fit each other.
+    though not in the frames that kernels are applied to.
     """
     color, confidence, exposure, albedo, normal = window
     n, t, _, h, w = color.shape
-    for name, value, depth in (("albedo", albedo, 3), ("normal", normal, 3), ("confidence", confidence, 1)):
-        if value is not None and value.shape != (n, t, depth, h, w):
-            raise ValueError(f"{name}: expected shape {(n, t, depth, h, w)}, got {tuple(value.shape)}")
-    if exposure.shape != (n,):
-        raise ValueError(f"exposure: expected shape {(n,)}, got {tuple(exposure.shape)}")
     scale = exposure.reciprocal().view(n, 1, 1, 1, 1)
     missing = color.new_zeros(()).expand(n, t, 3, h, w)
     # In place: these are passes over memory.

@@ -29,7 +29,7 @@ def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *
 
     ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)``. ``t < 1/K``, by default ``1 / (2K)``, keeps a normalised
     kernel of equal weights alive. Where no weight exceeds it, the kernel is the identity: all weight on the tap
-    `centre`, gradient 0. Raises ValueError if a float threshold is outside ``[0, 1/K)``, or the centre is no tap.
+    `centre`, gradient 0.
     """
     return _activate(weights, threshold, centre, relative=False)
 
@@ -63,20 +63,9 @@ def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
     Returns numerators ``(N, T, C, H, W)``, ``S_t(x) = Σ_d k_{t,d}(x) · frame_t(x + d)``, and denominators ``(N, T, 1,
     H, W)``, ``N_t(x) = Σ_d k_{t,d}(x)``, both over the taps inside the image, so that dividing renormalises the rest of
     a kernel at the border. Both directions accumulate in place, in float32 or float64: unfolding would write each frame
-    K·K times. Raises ValueError if the shapes do not fit together.
+    K·K times.
     """
-    if frames.ndim != 5 or kernels.ndim != 4 or kernels.shape[0] != frames.shape[0]:
-        raise ValueError(
-            f"kernels, frames: expected (N, T·K·K, H, W) and (N, T, C, H, W), got {tuple(kernels.shape)} "
-            f"and {tuple(frames.shape)}"
-        )
     size = math.isqrt(kernels.shape[1] // frames.shape[1])
-    if size % 2 == 0 or size * size * frames.shape[1] != kernels.shape[1]:
-        raise ValueError(f"kernels: expected T·K·K taps with K odd for T = {frames.shape[1]}, got {kernels.shape[1]}")
-    if kernels.shape[2:] != frames.shape[3:]:
-        raise ValueError(
-            f"kernels: expected the frames' size {tuple(frames.shape[3:])}, got {tuple(kernels.shape[2:])}"
-        )
     dtype = torch.promote_types(kernels.dtype, frames.dtype)
     working = dtype if dtype == torch.float64 else torch.float32
     # The numerators of a further channel of ones are the denominators; the margin around the image is zero.
@@ -197,14 +186,7 @@ def double(image: Tensor) -> Tensor:
 
 
 def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:
-    """Check the arguments of the activations, and run them."""
-    taps = weights.shape[1]
-    if not 0 <= centre < taps:
-        raise ValueError(f"centre: expected a tap from 0 to {taps - 1}, got {centre}")
-    if threshold is None:
-        threshold = 0.5 / taps
-    if not isinstance(threshold, Tensor) and not 0 <= threshold < 1 / taps:
-        raise ValueError(f"threshold: expected 0 <= t < 1/K = {1 / taps:.6g} for K = {taps}, got {threshold}")
+    threshold = 0.5 / weights.shape[1] if threshold is None else threshold
     kernel: Tensor = _Threshold.apply(weights, threshold, centre, relative)  # type: ignore[no-untyped-call]
     return kernel
 

@@ -186,9 +186,7 @@ class KernelNetwork(nn.Module):
         raise NotImplementedError
 
     def _enter(self, features: Tensor) -> Tensor:
-        """Check each axis of ``(N, T, C, H, W)`` by itself, and run the first convolution: ``(T·N, width, H, W)``."""
-        if features.ndim != 5 or tuple(features.shape[1:3]) != (self.frames, CHANNELS):
-            raise ValueError(f"features: expected (N, {self.frames}, {CHANNELS}, H, W), got {tuple(features.shape)}")
+        """Run the first convolution on ``(N, T, C, H, W)``: ``(T·N, width, H, W)``."""
         check_size("features", features, self.multiple)
         x = features.transpose(0, 1).flatten(0, 1)
         return cast(Tensor, self.stem(x.to(dtype=self.stem.weight.dtype, memory_format=torch.channels_last)))

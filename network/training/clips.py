@@ -47,11 +47,6 @@ class Layout(NamedTuple):
     window: bool = False  # whether there is one for each frame of the window
 
     @property
-    def is_radiance(self) -> bool:
-        """Whether values scale with the light."""
-        return self.kind in ("radiance", "irradiance")
-
-    @property
     def is_number(self) -> bool:
         """Whether it is one number per level, of a whole frame."""
         return self.channels == 0
@@ -68,8 +63,8 @@ class Clip:
     """A frame of a shot, or a tile of it, at L noise levels, each with its aligned window of T frames.
 
     Windows are ``(L, T, C, H, W)``, images of the centre ``(L, C, H, W)``, numbers ``(L,)``. A clip without an
-    independent reference has a pseudo-reference. Raises ValueError if shapes do not fit together, a value is not
-    finite, or there is no target.
+    independent reference has a pseudo-reference. Raises ValueError if shapes do not fit together, or a value is not
+    finite.
     """
 
     # aligned, side frames mixed with the centre where not trusted
@@ -98,12 +93,7 @@ class Clip:
     rendered: Annotated[Tensor | None, Layout("radiance")] = None
 
     def __post_init__(self) -> None:
-        shape = tuple(self.color.shape)
-        if len(shape) != 5 or shape[1] % 2 == 0 or shape[2] != 3:
-            raise ValueError(f"color: expected shape (L, T, 3, H, W) with T odd, got {shape}")
-        if self.pseudo_reference is None and self.reference is None:
-            raise ValueError("reference: expected one where there is no pseudo-reference, got none")
-        levels, frames, _, height, width = shape
+        levels, frames, _, height, width = self.color.shape
         for name, value in self.values().items():
             expected = FIELDS[name].shape(levels, frames, height, width)
             if tuple(value.shape) != expected:
@@ -221,7 +211,7 @@ def write_shards(
     """Write the clips of a shot, all of one shape, as ``SHOT.0000.safetensors``, ``SHOT.0001.safetensors`` and so on.
 
     `samples` are the samples per pixel of each level; clips are drawn from as they are written. The shards appear
-    together when the last is finished. Raises ValueError if there are no clips, or they differ in shape.
+    together when the last is finished.
     """
     folder = Path(folder)
     partial: list[Path] = []
@@ -237,16 +227,11 @@ def write_shards(
     try:
         for clip in clips:
             packed = _pack(clip)
-            if waiting and packed["color"].shape != waiting[0]["color"].shape:
-                found, expected = (tuple(values["color"].shape) for values in (packed, waiting[0]))
-                raise ValueError(f"clips: expected color of shape {expected} as in those before, got {found}")
             waiting.append(packed)
             if len(waiting) * sum(value.nbytes for value in packed.values()) > SHARD_BYTES:
                 flush()
         if waiting:
             flush()
-        if not partial:
-            raise ValueError(f"clips: expected at least one of shot {shot!r}, got none")
         finished = [path.with_suffix("") for path in partial]
         for path, final in zip(partial, finished, strict=True):
             os.replace(path, final)
@@ -262,7 +247,7 @@ def _pack(clip: Clip) -> dict[str, Tensor]:
     packed = {}
     for name, value in clip.values().items():
         layout = FIELDS[name]
-        if layout.is_radiance:
+        if layout.kind in ("radiance", "irradiance"):
             value = (value / scale).clamp(-HALF_MAX, HALF_MAX)
         numbers = {"exposure": value / scale, "gain": value * scale}
         packed[name] = numbers[name].float() if name in numbers else value.to(torch.float16).contiguous()
@@ -459,8 +444,6 @@ class Samples(Dataset[Sample]):
         *,
         neighbours: bool = False,
     ) -> None:
-        if len(clips) == 0:
-            raise ValueError("clips: expected at least one, got none")
         if clips.size < config.crop:
             raise ValueError(f"clips: expected at least {config.crop} pixels each way, got {clips.size}")
         self.clips, self.config, self.seed, self.loss = clips, config, seed, loss

@@ -135,10 +135,6 @@ class TestDenoise:
         with pytest.raises(RuntimeError, match="OIDN: unsupported combination"):
             oidn._execute({"color": scene[1], "normal": scene[3]}, "high", "cpu", hdr=True)
 
-    def test_unknown_quality_is_an_error(self, scene) -> None:
-        with pytest.raises(ValueError, match="quality must be one of high, balanced, fast"):
-            denoise_oidn(scene[1], quality="best")  # type: ignore[arg-type]
-
 
 def test_bad_images_are_errors(scene) -> None:
     _, color, albedo, normal = scene
@@ -146,8 +142,6 @@ def test_bad_images_are_errors(scene) -> None:
         denoise_oidn(color, albedo[1:], normal)
     with pytest.raises(ValueError, match="color must be"):
         denoise_oidn(color[..., :2])
-    with pytest.raises(ValueError, match="normal without albedo"):
-        denoise_oidn(color, None, normal)
     color[1, 2, 0] = np.inf
     with pytest.raises(ValueError, match="color must be finite, 1 of"):
         denoise_oidn(color, albedo, normal)

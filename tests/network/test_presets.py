@@ -31,8 +31,3 @@ def test_presets_are_reproducible_and_leave_the_global_generator_alone() -> None
 
 def test_without_a_length_windows_are_as_long_as_usual() -> None:
     assert [build_preset(name).frames for name in ("fast", "quality")] == [5, 7]
-
-
-def test_a_preset_that_there_is_not_is_an_error() -> None:
-    with pytest.raises(ValueError, match="preset is 'slow', expected one of fast, balanced"):
-        build_preset("slow")

@@ -79,10 +79,3 @@ def test_what_is_left_out_is_said_and_the_limit_kept(monkeypatch: pytest.MonkeyP
     assert info["width"] == 160
     assert len(info["frames"]) < 3
     assert "of 8 to 10" in info["extent"]
-
-
-def test_pictures_of_another_shape_are_refused() -> None:
-    maps = {"M": lambda n: np.ones((6, 7), np.float32)}
-    method = MethodImages("a", lambda n: np.ones((6, 8, 3), np.float32), maps)
-    with pytest.raises(ValueError, match=r"a, M has the shape \(6, 7\), expected \(6, 8\)"):
-        embed_pictures(ShotImages([method], lambda n: np.ones((6, 8, 3), np.float32), [1]))

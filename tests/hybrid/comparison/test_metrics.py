@@ -174,11 +174,6 @@ def test_bad_references_are_errors(measure, rng: np.random.Generator) -> None:
         measure(image, image[1:])
 
 
-def test_trim_out_of_range_is_an_error(rng: np.random.Generator) -> None:
-    with pytest.raises(ValueError, match="trim must be in"):
-        relmse(texture(rng), texture(rng), trim=1.0)
-
-
 def test_black_reference_has_no_bias() -> None:
     black = np.zeros((*SIZE, 3), np.float32)
     assert np.isnan(mean_bias(black + 1, black))
@@ -298,10 +293,6 @@ def test_series_that_do_not_belong_together_are_errors(rng: np.random.Generator)
         temporal_psnr([image] * 3, [image] * 2, flows, masks)
     with pytest.raises(ValueError, match="longer"):
         temporal_psnr([image] * 2, [image] * 2, flows, masks)
-    with pytest.raises(ValueError, match="valid must have the shape"):
-        temporal_psnr([image] * 2, [image] * 2, flows[:1], [np.ones((2, 2), bool)])
-    with pytest.raises(ValueError, match="static must have the shape"):
-        static_std([image] * 2, np.ones((2, 2), bool))
 
 
 # Intervals
@@ -321,10 +312,6 @@ def test_bootstrap_interval_of_special_values() -> None:
     assert bootstrap_interval([2.5]) == (2.5, 2.5)
     assert bootstrap_interval([np.inf, np.inf]) == (np.inf, np.inf)
     assert np.isnan(bootstrap_interval([1.0, np.nan])).all()
-    with pytest.raises(ValueError, match="not empty"):
-        bootstrap_interval([])
-    with pytest.raises(ValueError, match="shots must add up to the 3 values"):
-        bootstrap_interval([1.0, 2.0, 3.0], shots=(2, 2))
 
 
 def test_bootstrap_over_shots_is_as_wide_as_they_differ(rng: np.random.Generator) -> None:

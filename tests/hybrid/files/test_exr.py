@@ -339,8 +339,6 @@ def test_layers_and_attributes_can_be_added(tmp_path):
         assert again.parts[0].header["comment"] == "after"
     with pytest.raises(ValueError, match=r"'frame'.*not a string"):
         write_exr(tmp_path / "out.exr", read_exr(single), {}, None, {"frame": "4"})
-    with pytest.raises(ValueError, match=r"layer 'c' has shape \(5, 8\), expected \(5, 7\)"):
-        write_exr(tmp_path / "out.exr", read_exr(single), {}, {"c": np.zeros((5, 8), np.float32)})
 
 
 def test_source_may_be_written_over(tmp_path):
@@ -352,12 +350,10 @@ def test_source_may_be_written_over(tmp_path):
     assert not again.channel("R").any()
 
 
-def test_wrong_channel_or_shape_leaves_no_file(tmp_path):
+def test_wrong_channel_leaves_no_file(tmp_path):
     source = read_exr(save(tmp_path / "a.exr", planes(["R"])))
     with pytest.raises(ExrError, match="no channel 'G'; it has R"):
         write_exr(tmp_path / "b.exr", source, {"G": np.zeros((5, 7), np.float32)})
-    with pytest.raises(ValueError, match=r"'R' has shape \(7, 5\), expected \(5, 7\)"):
-        write_exr(tmp_path / "b.exr", source, {"R": np.zeros((7, 5), np.float32)})
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 

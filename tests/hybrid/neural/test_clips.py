@@ -156,8 +156,6 @@ def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, 
     assert len(clip.reference) == len(clip.noisy) == 1
     np.testing.assert_array_equal(clip.reference[0].permute(1, 2, 0).numpy(), gated_average(window))
     np.testing.assert_array_equal(clip.rendered[0].permute(1, 2, 0).numpy(), target.read(MIDDLE).color)
-    with pytest.raises(ValueError, match="target: expected none beside a reference"):
-        prepare(shot, monkeypatch, tmp_path, target=target, reference=target)
 
 
 def test_clips_of_whole_frames_know_the_way_to_the_next(tmp_path, monkeypatch):

@@ -106,12 +106,6 @@ def test_every_decision_says_its_figure_threshold_and_reason():
             assert str(decision.threshold) in text
 
 
-@pytest.mark.parametrize("wrong", [{"glossy": -1}, {"motion_pixels": -0.5}, {"world": "ocean"}])
-def test_impossible_facts_are_refused_by_name(wrong):
-    with pytest.raises(ValueError, match=f"SceneFacts.{next(iter(wrong))}"):
-        SceneFacts(**wrong)
-
-
 class Renderer:
     """Stands in for Cycles: a picture is the sum of what each depth of each kind brings, plus noise of the seed."""
 

@@ -55,19 +55,6 @@ def test_extreme_radiance_stays_finite_and_moderate() -> None:
     assert float(features[:, :, :3].min()) == 0
 
 
-@pytest.mark.parametrize("name", ["albedo", "normal", "confidence"])
-def test_inputs_of_other_shapes_are_an_error(name: str) -> None:
-    data = window()
-    data[name] = data[name][..., :-1]
-    with pytest.raises(ValueError, match=f"{name}: expected shape"):
-        network_inputs(KernelWindow(**data, exposure=torch.ones(1)))
-
-
-def test_an_exposure_of_another_shape_is_an_error() -> None:
-    with pytest.raises(ValueError, match=r"exposure: expected shape \(1,\)"):
-        network_inputs(KernelWindow(**window(), exposure=torch.ones(2)))
-
-
 def test_numbers_of_channels_are_what_the_models_count_on() -> None:
     data = window()
     assert network_inputs(KernelWindow(**data, exposure=torch.ones(1))).shape[2] == CHANNELS

@@ -96,18 +96,6 @@ def test_equal_weights_survive_every_threshold_that_is_allowed() -> None:
     torch.testing.assert_close(kernel, torch.full_like(kernel, 1 / 25))
 
 
-@pytest.mark.parametrize("t", [1 / 9, 0.2, -0.01, float("nan")])
-def test_a_threshold_of_one_over_k_or_more_is_an_error(t: float) -> None:
-    for activation in (threshold_kernel, predict_kernel, softmax_kernel):
-        with pytest.raises(ValueError, match=r"threshold: expected 0 <= t < 1/K"):
-            activation(torch.ones(1, 9, 1, 1), t, centre=4)
-
-
-def test_a_centre_that_is_no_tap_is_an_error() -> None:
-    with pytest.raises(ValueError, match="centre: expected a tap from 0 to 8, got 9"):
-        predict_kernel(torch.ones(1, 9, 1, 1), centre=9)
-
-
 def test_nothing_above_the_threshold_gives_the_identity_and_no_gradient() -> None:
     weights = torch.full((1, 9, 1, 2), -1.0, dtype=torch.float64)
     weights[0, :, 0, 1] = 1
@@ -231,21 +219,6 @@ def test_without_any_weight_the_image_is_the_fallback() -> None:
     fallback = uniform(1, 3, 4, 4)
     image = mean_of(torch.zeros(1, 2, 3, 4, 4), torch.zeros(1, 2, 1, 4, 4), fallback)
     torch.testing.assert_close(image, fallback)
-
-
-@pytest.mark.parametrize(
-    ("kernels", "frames", "message"),
-    [
-        ((1, 27, 4, 4), (1, 3, 4, 4), r"expected \(N, T·K·K, H, W\)"),
-        ((2, 27, 4, 4), (1, 3, 1, 4, 4), r"expected \(N, T·K·K, H, W\)"),
-        ((1, 26, 4, 4), (1, 3, 1, 4, 4), "kernels: expected T·K·K taps with K odd for T = 3, got 26"),
-        ((1, 12, 4, 4), (1, 3, 1, 4, 4), "kernels: expected T·K·K taps with K odd for T = 3, got 12"),
-        ((1, 27, 4, 5), (1, 3, 1, 4, 4), "kernels: expected the frames' size"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_an_error(kernels, frames, message) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=message):
-        apply_kernels(torch.zeros(kernels), torch.zeros(frames))
 
 
 # Several resolutions

@@ -292,12 +292,6 @@ def test_each_side_must_be_a_multiple(height: int, width: int, axis: str) -> Non
         model(torch.zeros(1, 3, 10, height, width), torch.ones(1, 3, 1, height, width))
 
 
-@pytest.mark.parametrize("shape", [(1, 5, 10, 8, 8), (1, 3, 16, 8, 8), (3, 10, 8, 8)])
-def test_features_that_are_not_the_models_are_an_error(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"features: expected \(N, 3, 10, H, W\)"):
-        small_unet()(torch.zeros(shape), torch.ones(1, 3, 1, 8, 8))
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

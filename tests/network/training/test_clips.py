@@ -114,11 +114,6 @@ def test_a_level_without_an_independent_one_is_trained_towards_its_own_pseudo_re
     assert noise_pairs((16, 4))[0] == [(0, "pseudo_reference")]
 
 
-def test_a_clip_needs_something_to_be_trained_towards() -> None:
-    with pytest.raises(ValueError, match="reference: expected one where there is no pseudo-reference"):
-        replace(make_clip(), pseudo_reference=None)
-
-
 def test_one_table_has_every_field_and_samples_have_those_that_are_inputs() -> None:
     clip = make_clip()
     assert set(FIELDS) == {field.name for field in fields(Clip)}
@@ -213,18 +208,12 @@ def test_an_interrupted_shot_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
     assert not list(tmp_path.iterdir())
 
 
-def test_clips_that_do_not_fit_are_an_error(tmp_path: Path) -> None:
+def test_clips_that_do_not_fit_are_an_error() -> None:
     clip = make_clip()
     with pytest.raises(ValueError, match=r"confidence: expected shape \(3, 3, 1, 16, 16\)"):
         replace(clip, confidence=clip.confidence[:, :2])
     with pytest.raises(ValueError, match="noisy: expected finite values"):
         replace(clip, noisy=clip.noisy * torch.inf)
-    with pytest.raises(ValueError, match="color: expected shape"):
-        replace(clip, color=clip.color[0])
-    with pytest.raises(ValueError, match="expected at least one of shot 's', got none"):
-        write_shards(tmp_path, "s", SPP, [])
-    with pytest.raises(ValueError, match="expected color of shape"):
-        write_shards(tmp_path, "s", SPP, [clip, make_clip(size=(24, 16))])
 
 
 def test_files_that_are_no_clips_are_an_error(tmp_path: Path) -> None:
@@ -448,8 +437,6 @@ def test_clips_that_cannot_be_sampled_are_an_error(tmp_path: Path) -> None:
     clips = folder_of(tmp_path, {"a": 1})
     with pytest.raises(ValueError, match="expected at least 17 pixels each way, got 16"):
         Samples(clips, replace(PLAIN, crop=17), 0)
-    with pytest.raises(ValueError, match="expected at least one, got none"):
-        Samples(clips.of([]), PLAIN, 0)
 
 
 def test_whole_frames_are_every_level_towards_the_cleanest(tmp_path: Path) -> None:
