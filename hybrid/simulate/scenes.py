@@ -15,8 +15,8 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from hybrid.simulate import evaluation, validation
 from hybrid.simulate.effects import visible_points
+from hybrid.simulate.fixed_shots import FIXED_SHOTS
 from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera, set_crop
 from hybrid.simulate.random_assets import (
     add_bulb_sphere,
@@ -261,7 +261,6 @@ SURFACES: dict[str, tuple[str | None, ...]] = {
     "lens": (None,),
 }
 FILMS = {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18}  # 0x0: no more than is rendered
-FIXED_SHOTS = {"validation": validation.SHOTS, "test": evaluation.SHOTS}
 CREDIT = ("title", "author", "licence", "licence_url", "original")
 
 
