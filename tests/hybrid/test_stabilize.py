@@ -434,7 +434,7 @@ class TestInFiles:
         shot = open_shot(folder, frames=f"{MOVING.first}-{MIDDLE}")
         given = open_shot(replace(MOVING, frames=4).write(tmp_path / "given", clean=True))
         estimates = PerFrame(
-            lambda frame: given.read(frame.number).color if given.has(frame.number) else None, 0, given
+            lambda frame: given.read(frame.number).color if given.has(frame.number) else None, files=given
         )
         *_, last = self.run(shot, tmp_path / "out", nearly(MOVING), first_pass=estimates)
         assert read_exr(last.path).parts[0].header[BESIDE] == f"{MIDDLE - 1}"
