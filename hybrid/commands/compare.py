@@ -17,7 +17,7 @@ from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import ShotInput, log_cuts, validate_renders
 from hybrid.comparison.animations import file_name
-from hybrid.comparison.compare import CompareOptions, compare_shot
+from hybrid.comparison.compare import CompareOptions, compare_shot, count_steps
 from hybrid.comparison.ladder import join_ladders
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
@@ -211,9 +211,10 @@ def compare(
         maps=report.output is not None,
     )
     reuse_freed_memory()
+    bar = Progress("compare", count_steps(chosen, options), "steps")
     with tempfile.TemporaryDirectory() as folder:
         halves = clean[0] if len(clean) == 1 else (clean[0], clean[1])
-        comparison = compare_shot(noisy, halves, chosen, options, folder=Path(folder), on_step=_ProgressBar().show)
+        comparison = compare_shot(noisy, halves, chosen, options, folder=Path(folder), on_step=partial(bar.advance, 1))
         if report.output is not None:
             from hybrid.comparison.report import report_images
 
@@ -224,20 +225,6 @@ def compare(
             if report.keep_frames:
                 _write_frames(report.output / FRAMES, noisy, images)
     report.show([comparison, *report.read_others()], comparison)
-
-
-class _ProgressBar:
-    """A progress bar that appears with the first step."""
-
-    def __init__(self) -> None:
-        self._bar: Progress | None = None
-
-    def show(self, what: str, done: float, total: float) -> None:
-        """Show a step."""
-        if self._bar is None:
-            self._bar = Progress(what, total, "steps")
-        else:
-            self._bar.advance(done - self._bar.done, what)
 
 
 def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:

@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from hybrid.commands import options as opt
 from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
@@ -315,10 +313,8 @@ class _Report:
         if self.fireflies:
             frames = format_frames(sorted(self.fireflies))
             summarize("Note", f"fireflies removed: {sum(self.fireflies.values())} (frames {frames})")
-        table = Table("stage", "seconds", "s per megapixel-frame", "peak memory")
-        for row in timings.rows(self.pixels):
-            table.add_row(*row)
-        print_table(table, stages={name: asdict(stage) for name, stage in timings.stages.items()})
+        stages = {name: asdict(stage) for name, stage in timings.stages.items()}
+        LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": stages}})
 
 
 def _run(job: Job, record: Record) -> None:
@@ -355,10 +351,7 @@ def _print_weights(job: Job) -> None:
         return
     if job.breakdown.pixels:
         title = "Weights in the frames made by this run"
-        table = Table("frame", "average weight", "minimum", "maximum", title=title, title_justify="left")
-        for row in job.breakdown.rows():
-            table.add_row(*row)
-        Console().print(table)
+        print_table(("frame", "average weight", "minimum", "maximum"), job.breakdown.rows(), title)
     else:
         LOG.info("no weights to print: all frames were finished already")
     LOG.info(f"wrote {job.options.breakdown}")

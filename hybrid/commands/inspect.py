@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from hybrid.commands import options as opt
-from hybrid.commands.log import LOG, Progress, printable
+from hybrid.commands.log import LOG, Progress, print_table, printable
 from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, split_stages, views_of
 from hybrid.files.layers import Layers, describe_layers
 from hybrid.job import validate_views
@@ -85,18 +81,18 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
     console.print(profile_line, highlight=False, markup=False)
     names = [f" of {printable(str(found.color))}" if len(views) > 1 else "" for found in layers]
     for found, name in zip(layers, names, strict=True):
-        _show(console, f"Layers{name}", ("role", "layer", "note"), describe_layers(found))
+        print_table(("role", "layer", "note"), describe_layers(found), f"Layers{name}")
     for finding in report.findings:
         if not finding.warning:
             console.print(f"{printable(finding.message)}\n", highlight=False, markup=False)
     if readings := report.readings():
         compared = "surfaces" if report.motion is not None and report.motion.by_surfaces else "picture"
-        _show(console, "Motion: unexplained by the vectors", ("", "convention", f"of the {compared}"), readings)
+        print_table(("", "convention", f"of the {compared}"), readings, "Motion: unexplained by the vectors")
     for plan, name in zip(plans, names, strict=True):
         rows = [
             ("on" if x.on else "off", x.stage, _measured(x), f"{x.reason} ({STAGES[x.stage]})") for x in plan.decisions
         ]
-        _show(console, f"Plan{name}", ("", "stage", "measured", "why"), rows)
+        print_table(("", "stage", "measured", "why"), rows, f"Plan{name}")
 
 
 def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
@@ -105,14 +101,6 @@ def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
         "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in describe_layers(layers)],
         "plan": [asdict(decision) for decision in plan.decisions],
     }
-
-
-def _show(console: Console, title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table."""
-    table = Table(*heads, title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for row in rows:
-        table.add_row(*(Text(printable(words)) for words in row))  # names from a file are no markup
-    console.print(table)
 
 
 def _measured(decision: Decision) -> str:

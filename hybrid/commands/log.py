@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
@@ -137,9 +137,17 @@ def end_log() -> None:
         handler.close()
 
 
-def print_table(table: Any, **facts: object) -> None:
-    """Log a rich table as a detail: as a table, or as `facts` in JSON."""
-    LOG.debug("", extra={"table": table, "facts": facts})
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    """Print a table of results; names from files are no markup."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*heads, title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(printable(words)) for words in row))
+    Console().print(table)
 
 
 # Most characters of a message, which may quote a file.
@@ -211,8 +219,6 @@ class _TextLine(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         text = _message(record)
-        if (table := getattr(record, "table", None)) is not None:
-            text = _plain_table(table)
         facts = getattr(record, "facts", {})
         if (progress := getattr(record, "progress", None)) is not None:
             left = f", about {duration(facts['seconds_left'])} left" if "seconds_left" in facts else ""
@@ -249,9 +255,6 @@ class _Terminal(logging.Handler):
         progress = getattr(record, "progress", None)
         if progress is not None:
             self._show(progress, record.getMessage())
-        elif (table := getattr(record, "table", None)) is not None:
-            self._stop()
-            self._console.print(table)
         else:
             if self._progress is not None and self._progress.done >= self._progress.total:
                 self._stop()  # lines about the result stand below the bar
@@ -289,15 +292,6 @@ def _message(record: logging.LogRecord) -> str:
     if (label := getattr(record, "label", None)) is not None:
         before = f"{label:<{LABEL_WIDTH}}"
     return before + record.getMessage()
-
-
-def _plain_table(table: Any) -> str:
-    from rich.console import Console
-
-    console = Console(width=min(Console().width, 100), color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(table)
-    return capture.get().rstrip("\n")
 
 
 def _time(record: logging.LogRecord) -> str:

@@ -8,12 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from hybrid.commands.log import duration, printable
+from hybrid.commands.log import duration, print_table, printable
 from hybrid.commands.options import FramesOption, of_output, usage
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
 from hybrid.records import Status, gather_status, is_running, sequence_name
@@ -78,18 +74,18 @@ def status(
 
 def _show(found: Status) -> None:
     """Print one row for each run."""
-    heads = "frames", "state", "made", "s a frame", "peak", "host", "last update"
-    table = Table(*heads, box=SIMPLE_HEAD, pad_edge=False)
+    rows = []
     for record in found.records:
         made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]
         state = record["state"] if record["state"] != "running" or is_running(record) else "died"
-        table.add_row(
+        row = (
             format_frames(record["asked"]),
             state,
             f"{len(made)} of {len(record['asked'])}",
             f"{sum(made) / len(made):.2f}" if made else "–",
             f"{record.get('peak_bytes', 0) / 2**20:.0f} MiB",
-            Text(printable(str(record["host"]))),
+            str(record["host"]),
             time.strftime("%m-%d %H:%M:%S", time.localtime(record.get("updated", record["started"]))),
         )
-    Console().print(table)
+        rows.append(row)
+    print_table(("frames", "state", "made", "s a frame", "peak", "host", "last update"), rows)

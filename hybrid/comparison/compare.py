@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from hybrid.comparison.evaluation import Evaluator, Level, error_of, find_static_pixels, store_flows, store_reference
+from hybrid.comparison.evaluation import Evaluator, Level, find_static_pixels, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.results import Comparison, Ladder, MethodResult, Statistic
@@ -54,14 +54,14 @@ def compare_shot(
     options: CompareOptions | None = None,
     *,
     folder: Path | None = None,
-    on_step: OnStep | None = None,
+    on_step: OnStep = lambda what: None,
 ) -> Comparison:
     """Run every method on a shot and evaluate its frames against the reference; one result per method, in their order.
 
     Frames without a reference are not evaluated. Two independent renders as reference remove its noise from PSNR,
     relMSE and temporal PSNR (`hybrid.comparison.metrics`). That noise matters: 512 samples per pixel of a bathroom had
     half of the squared error that OIDN's best mode showed against them. The new or empty `folder`, or a temporary one,
-    receives frames and maps for a `FrameStore`. Steps of `on_step` that turn out to be unnecessary are skipped. A
+    receives frames and maps for a `FrameStore`. `on_step` is told each step as it starts (`count_steps`). A
     method that is not installed, or whose process died, has an `absent_reason` instead of measurements.
 
     Raises ValueError before any method runs: if shot and reference have no frame in common; if another input lacks a
@@ -73,8 +73,7 @@ def compare_shot(
     numbers = _common_frames(shot, halves)
     _check_levels(numbers, methods, options)
     inputs = _inputs(numbers, halves, methods, options.levels)
-    steps = _Steps(on_step, _count_steps(methods, options))
-    steps.start("read the shot, its motion and the reference")
+    on_step("read the shot, its motion and the reference")
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         store = FrameStore(Path(kept))
         with ThreadPoolExecutor(1) as background:
@@ -86,8 +85,8 @@ def compare_shot(
             findings = [*options.findings, *(check.result() if check is not None else ())]
         evaluator = Evaluator(store, numbers, pairs, options.exposure, static)
         load = load_average()
-        timed = time_methods(methods, shot, options.rounds, store, steps.start)
-        statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, steps)
+        timed = time_methods(methods, shot, options.rounds, store, on_step)
+        statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, on_step)
         law, law_facts = _noise_law(evaluator, statistics, options)
         results = [
             replace(_result_of(name, method), absent_reason=timed.absent[name])
@@ -95,36 +94,17 @@ def compare_shot(
             else _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             for name, method in methods.items()
         ]
-        ladder = _measure_ladder(evaluator, methods, statistics, options, steps)
+        ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
         mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
-        map_facts = _store_all_maps(store, shot, mapped, evaluator, steps)
-        steps.end()
+        map_facts = _store_all_maps(store, shot, mapped, evaluator, on_step)
     facts = _facts_of_frames(evaluator) | law_facts
     if findings:
         facts["Layers"] = "; ".join(findings)
     return Comparison(options.title, tuple(results), facts | map_facts | _facts_of_runs(options, load), ladder)
 
 
-class _Steps:
-    """Counts the steps of a comparison, and reports each as it starts."""
-
-    def __init__(self, on_step: OnStep | None, total: int) -> None:
-        self._on_step, self._total, self._done = on_step, total, 0
-
-    def start(self, what: str) -> None:
-        """Report the next step."""
-        if self._on_step is not None:
-            self._on_step(what, self._done, self._total)
-        self._done += 1
-
-    def end(self) -> None:
-        """Report the end; steps that turned out to be unnecessary are skipped."""
-        self._done = self._total
-        self.start("done")
-
-
-def _count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:
-    """Steps of a comparison: reading, runs, FLIP, measuring, levels, maps."""
+def count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:
+    """Return the most steps of a comparison: reading, runs, FLIP, measuring, levels, maps."""
     levels = len(options.levels) * (1 + len(_methods_of_levels(methods))) if options.ladder else 0
     maps = sum(method.maps is not None for method in methods.values()) if options.maps else 0
     return 1 + options.rounds * len(methods) + 1 + len(methods) + levels + maps
@@ -204,14 +184,14 @@ def _span(numbers: Sequence[int]) -> str:
 # Results of the runs
 
 
-def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], steps: _Steps) -> dict[str, dict[str, Statistic]]:
+def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], on_step: OnStep) -> dict[str, dict[str, Statistic]]:
     """Measures of each method; without FLIP for points of a sweep."""
-    steps.start("FLIP of all methods")
+    on_step("FLIP of all methods")
     evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
     evaluator.map_reference_changes()
     statistics = {}
     for name, method in methods.items():
-        steps.start(f"measure {name}")
+        on_step(f"measure {name}")
         statistics[name] = evaluator.measure(name, flip=not method.sweep, change=not method.sweep)
     return statistics
 
@@ -238,7 +218,7 @@ def _measure_ladder(
     methods: Mapping[str, Method],
     statistics: Mapping[str, Mapping[str, Statistic]],
     options: CompareOptions,
-    steps: _Steps,
+    on_step: OnStep,
 ) -> Ladder:
     """The errors of the methods on the shot and on every level; frames of a level have names of their own."""
     if not options.ladder or options.samples is None:
@@ -248,8 +228,8 @@ def _measure_ladder(
     for level, samples in options.levels:
         names = {f"{name} at {samples:g} samples": name for name in chosen if name in statistics}
         at_level = {long: chosen[name] for long, name in names.items()}
-        timed = time_methods(at_level, level, 1, evaluator.store, steps.start)
-        steps.start(f"measure the level of {samples:g} samples")
+        timed = time_methods(at_level, level, 1, evaluator.store, on_step)
+        on_step(f"measure the level of {samples:g} samples")
         evaluator.map_flip(list(timed.runs))
         measured[samples] = {names[long]: evaluator.measure(long, flip=True, change=False) for long in timed.runs}
     return build_ladder(measured)
@@ -279,7 +259,7 @@ def _measured(
         cpu_seconds_per_megapixel=seconds.cpu if seconds else unmeasured,
         peak_bytes=None if method.cost == "unknown" else max(run.peak_bytes for run in runs),
         metrics=metrics,
-        worth=None if law is None or name == "noisy" else law.worth(error_of(metrics["psnr"])),
+        worth=None if law is None or name == "noisy" else law.worth(mean_error(metrics["psnr"].values)),
     )
 
 
@@ -292,12 +272,12 @@ def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
 
 
 def _store_all_maps(
-    store: FrameStore, shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, steps: _Steps
+    store: FrameStore, shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep
 ) -> dict[str, str]:
     """Store the maps of methods; return a fact if some frames are left out."""
     numbers = mapped_frames(evaluator.numbers, evaluator.static.size)
     for name, method in methods.items():
-        steps.start(f"maps of {name}")
+        on_step(f"maps of {name}")
         run_in_process(_store_maps, method, shot, numbers, name, store)
     if methods and len(numbers) < len(evaluator.numbers):
         return {"Maps": f"confidence and contribution of frame {numbers[0]} only, because the frames are large"}

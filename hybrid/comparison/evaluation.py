@@ -151,12 +151,12 @@ class Evaluator:
         From the PSNR of the noisy frames and of renders at other samples per pixel. If the samples of the noisy frames
         are unknown, `worth` is a ratio without a scale in samples.
         """
-        errors = [(samples or 1.0, error_of(noisy))]
+        errors = [(samples or 1.0, mean_error(noisy.values))]
         for shot, count in levels:
             common = [number for number in self.numbers if shot.has(number)]
             references = map(self.store.load_reference, common)
             pairs = zip(common, references, strict=True)
-            errors.append((count, _mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
+            errors.append((count, mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
         errors.sort()
         floor, words = self._find_floor(errors, samples, reference_samples)
         return NoiseLaw(tuple(errors), samples or 1.0, floor), words
@@ -189,12 +189,8 @@ class Evaluator:
         )
 
 
-def error_of(statistic: Statistic) -> float:
+def mean_error(scores: Sequence[float]) -> float:
     """Mean squared error from the PSNR of frames."""
-    return _mean_error(statistic.values)
-
-
-def _mean_error(scores: Sequence[float]) -> float:
     return float(np.mean([float(10 ** (-score / 10)) for score in scores]))
 
 

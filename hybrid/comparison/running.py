@@ -18,7 +18,7 @@ from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import peak_memory, start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
 
-OnStep = Callable[[str, int, int], None]  # description of the step, steps done, steps in total
+OnStep = Callable[[str], None]  # gets a description of each step as it starts
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -124,7 +124,7 @@ def time_methods(
     shot: Frames,
     rounds: int,
     store: FrameStore | None = None,
-    on_step: Callable[[str], None] = lambda what: None,
+    on_step: OnStep = lambda what: None,
 ) -> TimedRuns:
     """Run the methods in turns, so that other load of the machine affects all of them.
 

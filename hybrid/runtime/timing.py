@@ -75,15 +75,10 @@ class Timings:
             entry.calls += calls
             entry.peak_bytes = max(entry.peak_bytes, peak_memory())
 
-    def rows(self, pixels: int) -> list[tuple[str, str, str, str]]:
-        """Return rows (stage, seconds, seconds per megapixel, peak memory); `pixels` is the number in all frames."""
-        megapixels = max(pixels, 1) / 1e6
-        return [
-            (
-                name,
-                f"{stage.seconds:.2f}",
-                f"{stage.seconds / megapixels:.2f}",
-                f"{stage.peak_bytes / 2**20:.0f} MiB",
-            )
-            for name, stage in self.stages.items()
-        ]
+    def table(self, pixels: int) -> str:
+        """Return a line of seconds and memory for each stage; `pixels` is the number in all frames."""
+        lines = [f"{'stage':<12}{'seconds':>10}{'s per megapixel-frame':>24}{'peak memory':>14}"]
+        for name, stage in self.stages.items():
+            each, peak = stage.seconds / max(pixels, 1) * 1e6, f"{stage.peak_bytes / 2**20:.0f} MiB"
+            lines.append(f"{name:<12}{stage.seconds:>10.2f}{each:>24.2f}{peak:>14}")
+        return "\n".join(lines)
