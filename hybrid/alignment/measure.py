@@ -29,8 +29,11 @@ SHORT_SIDE = 270
 CROP = 512
 # Pixels of motion below which a pixel is static, and above which its noise is that of another pixel.
 STILL_NOISE, MOVED_NOISE = 0.05, 1.5
-# Half floats are rounded by 2^-11 of their value: values that differ by less are the same sample.
-SAME = 2.0**-10
+# Neighbouring half floats differ by at least 2^-11 of their value, and by at most 2^-10: values that differ by less
+# than the first are the same sample, those up to the second are so near by chance.
+SAME, NEAR = 2.0**-12, 2.0**-10
+# Pixels that differ from their surroundings by less have neither noise nor detail.
+GRAIN = 4 * NEAR
 # Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
@@ -199,7 +202,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     Detail correlates at equal pixels as fixed noise does, so it is removed first. In moving parts each frame is
     compared with the other one, warped to it: d_a = a - b(x + v), d_b = b - a(x - v). With a seed for each frame their
     covariance at equal pixels is 0, with and without detail; with one seed it is half of their variance. In static
-    parts samples of one seed are equal to the bit, and samples of two seeds are not. Both are relative to the light,
+    parts samples of one seed are equal to the bit, and samples of two seeds by chance. Both are relative to the light,
     without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
     block = _middle(here.irradiance.shape[:2])
@@ -207,7 +210,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
-    grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > 4 * SAME
+    grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > GRAIN
     forth, back, slowest = rendered_flow(here, there), rendered_flow(there, here), STILL_NOISE
     if (forth is None or back is None) and moves:
         # Optical flow is exact to some tenths of a pixel: slower motion may be none, and static pixels must be equal.
@@ -222,9 +225,11 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     shares, figures = [], []
     compared = still & grainy
     if compared.any():
-        equal = np.abs(a - b) <= SAME * np.maximum(np.abs(a), np.abs(b))
-        shares.append(int(compared.sum()))
-        figures.append(float(np.mean(equal[compared])))
+        distance = np.abs(a - b)[compared] / np.maximum(np.abs(a), np.abs(b))[compared]
+        same, near = (np.count_nonzero(distance <= most) for most in (SAME, NEAR))
+        shares.append(distance.size)
+        # Noise of a thousandth makes as many halves equal by chance as half of those one step apart.
+        figures.append((same - (near - same) / 2) / distance.size)
     if moved.sum() > CROP and forth is not None and back is not None:
         d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
         d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
@@ -237,13 +242,13 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
 def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
     """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
 
-    The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than the rounding of half floats, else
-    0; the second is 1 where their values also agree to that rounding.
+    The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, else 0; the
+    second is 1 where they are also equal, as half floats.
     """
     a, b = channel_mean(here), channel_mean(there)
     most = np.maximum(np.abs(a), np.abs(b))
     grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
-    grainy = grain > 4 * SAME * most
+    grainy = grain > GRAIN * most
     return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= SAME * most)).astype(np.float32)
 
 

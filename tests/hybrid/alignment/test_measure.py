@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid.alignment.measure import FEW, REPEATED, equal_noise, repeats
+from hybrid.alignment.measure import FEW, FIXED_NOISE_ABOVE, REPEATED, equal_noise, fixed_noise, repeats
+from hybrid.alignment.prepare import prepare
+from hybrid.files.frame import Frame
 
 
 @pytest.mark.parametrize("changed", [0.0, 0.005, 0.009, 0.02, 0.05, 1.0])
@@ -24,3 +26,19 @@ def test_strips_find_what_the_whole_picture_shows(changed, top):
 
 def test_pictures_without_noise_repeat_nothing():
     assert not repeats(np.ones((70, 20, 3), np.float32), np.ones((70, 20, 3), np.float32))
+
+
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("noise", [0.0005, 0.001, 0.003])
+def test_noise_of_a_thousandth_is_not_taken_for_the_noise_of_one_seed(noise, half):
+    """Every second sample lay within 0.1 % of its neighbour's: still shots next to convergence lost their window."""
+    rng = np.random.default_rng(1)
+    detail = rng.uniform(0.2, 0.8, (96, 128, 3))
+
+    def frame(number, grain):
+        color = (detail * grain).astype(np.float16 if half else np.float32)
+        return prepare(Frame(number=number, color=color.astype(np.float32)))
+
+    grains = rng.normal(1, noise, (2, 96, 128, 1))
+    assert abs(fixed_noise(frame(1, grains[0]), frame(2, grains[1]), moves=False)) < 0.6 * FIXED_NOISE_ABOVE
+    assert fixed_noise(frame(1, grains[0]), frame(2, grains[0]), moves=False) == pytest.approx(1, abs=0.01)
