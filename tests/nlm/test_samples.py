@@ -149,6 +149,21 @@ def test_lines_at_a_rim_that_no_frame_shows_are_no_noise_where_there_is_next_to_
     assert error(result, truth) < 1.02 * error(frames[2], truth) + 1e-5
 
 
+@pytest.mark.parametrize("noise", [0.001, 0.01])
+def test_the_rim_of_an_object_on_black_is_no_noise(noise: float) -> None:
+    """The object's own noise is known, and black has none: a rim that no frame shows was blurred by 10 %."""
+    y, x = np.mgrid[:96, :128]
+    inside = np.hypot(y - 48, x - 64) < 16
+    truth = lines() * inside[..., None]
+    frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
+    known = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    confidence = np.broadcast_to(known.astype(np.float32), frames.shape[:3]).copy()
+    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
+    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
+    result = blend_samples(smooth, frames[2], sides, 0.1)
+    assert error(result, truth) < 1.02 * error(frames[2], truth) + 0.05 * error(smooth, truth)
+
+
 def test_a_firefly_of_one_frame_is_no_reason() -> None:
     truth = lines()
     own, sides = window(truth, 0.05, firefly=(40, 50))
