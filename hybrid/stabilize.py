@@ -7,7 +7,7 @@ samples restore both last, as far as they are certain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
 from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
-from nlm.moving_lights import LEAST, confirmed_by_neighbour, find_bright
+from nlm.moving_lights import CONTENT, LEAST, confirmed_by_neighbour, find_bright, passing_lights, trail_of
 from nlm.parts import limit_change
 from nlm.samples import SampleMean, beside_lamps, blend_samples, limit_lamps, restore_mean
 
@@ -37,8 +37,6 @@ Mask = NDArray[np.bool_]
 MOST, CORRECTED = 2.0, 1e4
 # Layers of the trust in the frame before, and of that in the frame after.
 NEIGHBOURS = "before", "after"
-# Where this share of a frame's bright pixels move together, the others are content too: hidden, or leaving the frame.
-CONTENT = 0.6
 
 
 @dataclass(frozen=True)
@@ -84,6 +82,7 @@ class WindowResult:
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
     excess: Excess | None  # of the centre; with "blend-samples"
+    passing: Excess | None  # the same over the neighbours' samples, where these are darker than the picture
     # as `AlignedWindow` has them, over all bands
     repaired: int
     fireflies: int
@@ -164,8 +163,8 @@ class FrameDenoiser:
                 # Before it counts as a fault: what leaks into black between lit frames is no more than an error.
                 denoised = _changed(denoised, np.zeros_like(denoised.color), CORRECTED)
             self._check_light(denoised.color, frame, result.brightest)
-            lights = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
-            denoised = self._correct(denoised, frame, result, lights)
+            moving = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
+            denoised = self._correct(denoised, frame, result, moving)
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
@@ -219,10 +218,12 @@ class FrameDenoiser:
             stream.keeper.release()
         samples = layers.named("sides")
         color = layers.named("color")[""]
-        frame, excess = stream.frame(number), None
+        frame, excess, passing = stream.frame(number), None, None
         if "blend-samples" in plan.stages and frame is not None:
             with stream.timings.stage("blend-samples"):
                 excess = _excess(frame, color)
+                if samples:
+                    passing = _excess(frame, color, SampleMean(**samples))
         return WindowResult(
             Denoised(color, layers.named("aovs"), layers.named("extra"), parts),
             replace(plan, shares=shares),
@@ -232,6 +233,7 @@ class FrameDenoiser:
             exposure,
             brightest,
             excess,
+            passing,
             repaired,
             fireflies,
             outliers,
@@ -261,7 +263,9 @@ class FrameDenoiser:
             if fault := find_lost_light(color, frame.radiance, frame.valid, lambda: brightest):
                 raise ValueError(f"frame {frame.number}: {fault}; it was not written")
 
-    def _correct(self, denoised: Denoised, frame: PreparedFrame, result: WindowResult, lights: Mask | None) -> Denoised:
+    def _correct(
+        self, denoised: Denoised, frame: PreparedFrame, result: WindowResult, moving: tuple[Mask, Mask] | None
+    ) -> Denoised:
         """The denoised frame with the means of its samples, and with the samples where they are certain.
 
         Moving lights are as rendered, and their light belongs to no other pixel.
@@ -270,7 +274,7 @@ class FrameDenoiser:
         exposure, sides = measure_exposure(color), result.neighbour_samples
         shown = [frame.rendered] if sides is None else [frame.rendered, sides.mean]
         color = limit_lamps(color, shown, exposure)
-        counted = frame.valid if lights is None else frame.valid & ~lights
+        counted = frame.valid if moving is None else frame.valid & ~moving[0]
         if "restore-mean" in result.plan.stages:
             with timings.stage("restore-mean"):
                 # What is wrong beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
@@ -282,37 +286,54 @@ class FrameDenoiser:
             with timings.stage("blend-samples"):
                 noisy = _where(counted, frame.radiance, color)
                 if not counted.all():
-                    sides = sides._replace(nearest=sides.nearest * counted)
+                    fresh = counted if moving is None else counted & ~moving[1]
+                    sides = sides._replace(nearest=sides.nearest * fresh)
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
         color = limit_lamps(color, shown, exposure)
-        if lights is not None:
-            color = _where(~lights, color, frame.rendered)
+        if moving is not None:
+            color = _where(~moving[0], color, frame.rendered)
         return _changed(denoised, color, CORRECTED)
 
-    def _moving_lights(self, frame: PreparedFrame) -> Mask | None:
-        """The bright pixels (H, W) that the neighbouring frames show to move together, if there are any."""
-        step = self.stream.shot.step
-        others = [n for n in (frame.number - step, frame.number + step) if self.stream.shot.has(n)]
+    def _moving_lights(self, frame: PreparedFrame) -> tuple[Mask, Mask] | None:
+        """The bright pixels (H, W) that the neighbouring frames show to move together, if there are any.
+
+        With them the pixels at which aligned neighbours show lights that pass.
+        """
+        number, step = frame.number, self.stream.shot.step
+        others = [n for n in (number - step, number + step) if self.stream.shot.has(n)]
         with self.stream.timings.stage("blend-samples"):
-            excess = self._results[frame.number].excess
-            assert excess is not None
-            if not (others and excess.bright.any()):
-                return None
-            shown = [np.zeros_like(excess.bright)]
-            for n in others:
-                if (other := self._excess_of(n, frame.number)) is None:
-                    continue
-                flow = self.stream.flow(frame.number, n)
-                shown.append(confirmed_by_neighbour(*excess, *other, None if flow is None else flow.vectors))
-            if "stabilize" in self.stream.rules.allowed:
-                seen = np.logical_or.reduce(shown)
-            else:
-                # One picture beside all frames lets parts of a reflection pass for lights, 0.4 dB of a shot.
-                seen = np.logical_and.reduce(shown[1:] or shown)
-                seen &= np.count_nonzero(seen) >= LEAST
-            if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(excess.bright):
-                seen = excess.bright
-        return seen if seen.any() else None
+            seen, trail = self._lights_beyond_picture(number, others), np.zeros(self.stream.shot.shape, bool)
+            own, passing = self._results[number].passing, {}
+            for time in (-1, 1):
+                there = self._results.get(number + time * step)
+                if there is not None and there.passing is not None:
+                    passing[time] = there.passing, self._vectors(number, number + time * step)
+            if own is not None and passing:
+                lights, (down, right) = passing_lights(*own, passing)
+                seen = seen | lights
+                for time, ((_, bright), flow) in passing.items() if lights.any() else ():
+                    trail |= trail_of(bright, (time * down, time * right), flow, self.stream.radius)
+        return (seen, trail) if seen.any() else None
+
+    def _lights_beyond_picture(self, number: int, others: Sequence[int]) -> Mask:
+        """The bright pixels (H, W) that the picture lacks."""
+        excess = self._results[number].excess
+        assert excess is not None
+        shown = [np.zeros_like(excess.bright)]
+        for n in others if excess.bright.any() else ():
+            if (other := self._excess_of(n, number)) is not None:
+                shown.append(confirmed_by_neighbour(*excess, *other, self._vectors(number, n)))
+        if "stabilize" in self.stream.rules.allowed:
+            seen = np.logical_or.reduce(shown)
+        else:
+            # One picture beside all frames lets parts of a reflection pass for lights, 0.4 dB of a shot.
+            seen = np.logical_and.reduce(shown[1:] or shown)
+            seen &= np.count_nonzero(seen) >= LEAST
+        return excess.bright if np.count_nonzero(seen) >= CONTENT * np.count_nonzero(excess.bright) else seen
+
+    def _vectors(self, number: int, to: int) -> Array | None:
+        flow = self.stream.flow(number, to)
+        return None if flow is None else flow.vectors
 
     def _excess_of(self, number: int, beside: int) -> Excess | None:
         """The excess of a neighbour: over the frame's own result where a classical preset has no other."""
@@ -354,10 +375,13 @@ class _Layers:
         return {name: layer for (other, name), layer in self._layers.items() if other == kind}
 
 
-def _excess(frame: PreparedFrame, picture: Array) -> Excess:
-    """By how much a frame as rendered exceeds its picture."""
-    light = channel_mean(picture) + np.float32(measure_exposure(picture))
-    relative = np.asarray(channel_mean(frame.rendered - picture) / light * frame.valid, np.float32)
+def _excess(frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None) -> Excess:
+    """By how much a frame as rendered exceeds its picture, or its neighbours' samples where these are darker."""
+    shown = channel_mean(picture)
+    light = shown + np.float32(measure_exposure(picture))
+    if neighbours is not None:
+        shown = np.where(neighbours.trust < 1, shown, np.minimum(shown, channel_mean(neighbours.mean)))
+    relative = np.asarray((channel_mean(frame.rendered) - shown) / light * frame.valid, np.float32)
     return Excess(relative, find_bright(relative))
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +24,11 @@ _SHARE, _SIGMAS, _MORE = 0.2, 6.0, 8
 _APART = 2.5
 # The same light differs by a factor of two at most.
 _ALIKE = 2.0
+# Where this share of the bright pixels move together, the others are content too: hidden, or leaving the frame.
+CONTENT = 0.6
+# Motions to the frames before and after are opposite but for so many pixels. A drop three pixels long has five motions
+# from one frame to the next, the edges of a thing hundreds.
+_STEADY, _FEW = 1, 9
 
 
 def find_bright(excess: Floats) -> Mask:
@@ -67,21 +75,89 @@ def confirmed_by_neighbour(
         Motion of surfaces to the other frame, pixels, x first; None: nothing moves.
     """
     found = np.zeros_like(bright)
-    height, width = bright.shape
-    rows, columns = np.nonzero(bright)
-    for down, right in shared_motions(bright, other_bright):
-        y, x = rows + down, columns + right
-        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-        if flow is not None:
-            moved = flow[rows, columns] - np.array([right, down], np.float32)
-            inside &= np.hypot(moved[:, 0], moved[:, 1]) > _APART
-        elif np.hypot(down, right) <= _APART:
-            continue
-        y, x, from_y, from_x = y[inside], x[inside], rows[inside], columns[inside]
-        here, there = excess[from_y, from_x], other_excess[y, x]
-        alike = other_bright[y, x] & (there <= _ALIKE * here) & (here <= _ALIKE * there)
-        found[from_y[alike], from_x[alike]] = True
+    for motion in shared_motions(bright, other_bright):
+        found |= _confirmed(excess, bright, other_excess, other_bright, flow, motion)[0]
     return found
+
+
+def passing_lights(
+    excess: Floats, bright: Mask, others: Mapping[int, tuple[tuple[Floats, Mask], Floats | None]]
+) -> tuple[Mask, tuple[int, int]]:
+    """Find the bright pixels that the frames before and after show along one steady motion.
+
+    As `confirmed_by_neighbour`, for an excess that edges of moving things have too: motions must be few, as those
+    between two edges are not, and opposite in both frames, unless the pixel leaves the frame: noise is seldom confirmed
+    twice.
+
+    Parameters
+    ----------
+    excess, bright : (H, W) array, of the frame
+    others : mapping of −1 (the frame before) and 1, or one of these, to (`excess`, `bright`) there, and `flow` to it
+
+    Returns
+    -------
+    (H, W) bool
+        The pixels.
+    (int, int)
+        The motion to the frame after that most of them share, rows and columns.
+    """
+    motions = {
+        time: [(time * y, time * x) for y, x in shared_motions(bright, other_bright)]
+        for time, ((_, other_bright), _) in others.items()
+    }
+    if max(map(len, motions.values())) > _FEW:
+        return np.zeros_like(bright), (0, 0)
+    found, most, greatest = np.zeros_like(bright), (0, 0), 0
+    for motion in dict.fromkeys(itertools.chain(*motions.values())):
+        if any(all(np.abs(np.subtract(motion, other)).max() > _STEADY for other in some) for some in motions.values()):
+            continue
+        ends = ((*other, flow, (time * motion[0], time * motion[1])) for time, (other, flow) in others.items())
+        seen = np.array([_confirmed(excess, bright, *end) for end in ends])
+        lights = seen[:, 0].any(axis=0) & seen.any(axis=1).all(axis=0)
+        found |= lights
+        if (count := int(np.count_nonzero(lights))) > greatest:
+            greatest, most = count, motion
+    return bright if np.count_nonzero(found) >= CONTENT * np.count_nonzero(bright) else found, most
+
+
+def trail_of(lights: Mask, motion: tuple[int, int], flow: Floats | None, reach: int) -> Mask:
+    """Return the pixels (H, W) of a frame at which neighbours that are aligned with it show lights.
+
+    Parameters
+    ----------
+    lights : (H, W) bool, in the next neighbour
+    motion : (int, int), of the lights from the frame to that neighbour, rows and columns
+    flow : (H, W, 2) float32 or None, of the surfaces from the frame to that neighbour, x first
+    reach : int, how many neighbours there are in that direction
+    """
+    trail = np.zeros_like(lights)
+    rows, columns = np.nonzero(lights)
+    own = np.zeros((1, 2), np.float32) if flow is None else flow[rows, columns]
+    for time in range(1, reach + 1):
+        y = np.rint(rows + (time - 1) * motion[0] - time * own[:, 1])
+        x = np.rint(columns + (time - 1) * motion[1] - time * own[:, 0])
+        inside = (y >= 0) & (y < lights.shape[0]) & (x >= 0) & (x < lights.shape[1])
+        trail[y[inside].astype(int), x[inside].astype(int)] = True
+    return trail
+
+
+def _confirmed(
+    excess: Floats, bright: Mask, other_excess: Floats, other_bright: Mask, flow: Floats | None, motion: tuple[int, int]
+) -> tuple[Mask, Mask]:
+    """Return the bright pixels that another frame shows at the end of a motion (rows, columns), and those leaving."""
+    (down, right), (height, width) = motion, bright.shape
+    found, left = np.zeros((2, *bright.shape), bool)
+    rows, columns = np.nonzero(bright)
+    y, x = rows + down, columns + right
+    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+    left[rows[~inside], columns[~inside]] = True
+    own = np.zeros((1, 2), np.float32) if flow is None else flow[rows, columns]
+    inside &= np.hypot(*(own - np.array([right, down], np.float32)).T) > _APART
+    y, x, from_y, from_x = y[inside], x[inside], rows[inside], columns[inside]
+    here, there = excess[from_y, from_x], other_excess[y, x]
+    alike = other_bright[y, x] & (there <= _ALIKE * here) & (here <= _ALIKE * there)
+    found[from_y[alike], from_x[alike]] = True
+    return found, left
 
 
 def _busiest(counts: NDArray[np.intp]) -> slice:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.moving_lights import confirmed_by_neighbour, find_bright, shared_motions
+from nlm.moving_lights import confirmed_by_neighbour, find_bright, passing_lights, shared_motions, trail_of
 
 SHAPE = (96, 128)
 
@@ -70,3 +70,51 @@ def test_highlights_that_move_with_their_surfaces_are_left_to_the_denoiser(flake
     assert shared_motions(*bright) == [(2, 9)]
     assert not confirmed_by_neighbour(here, bright[0], there, bright[1], flow).any()
     assert confirmed_by_neighbour(here, bright[0], there, bright[1], -flow).any()
+
+
+def neighbour(image: np.ndarray, flow: np.ndarray | None = None):
+    return (image, find_bright(image)), flow
+
+
+@pytest.mark.parametrize("times", [(-1, 1), (1,), (-1,)])
+@pytest.mark.parametrize("motion", [(9, 0), (-3, 14)])
+def test_lights_that_pass_steadily_are_found_with_their_motion(flakes, motion, times) -> None:
+    here = excess(flakes)
+    others = {t: neighbour(excess(flakes + t * np.array(motion), seed=5 + t)) for t in times}
+    found, shared = passing_lights(here, find_bright(here), others)
+    assert shared == motion
+    assert (found == find_bright(here)).all()  # those that leave the frame too
+
+
+def test_lights_that_turn_back_do_not_pass(flakes) -> None:
+    here, there = excess(flakes), neighbour(excess(flakes + np.array([9, 0]), seed=3))
+    assert not passing_lights(here, find_bright(here), {-1: there, 1: there})[0].any()
+
+
+def test_noise_that_one_frame_confirms_by_chance_does_not_pass(flakes) -> None:
+    """A third of the pixels move on, and the frame before shows others."""
+    rng = np.random.default_rng(8)
+    after = np.concatenate([flakes[:40] + np.array([9, 0]), rng.integers(0, SHAPE, (80, 2))])
+    here, before = excess(flakes), rng.integers(0, SHAPE, (120, 2))
+    others = {-1: neighbour(excess(before, seed=4)), 1: neighbour(excess(after, seed=3))}
+    assert shared_motions(find_bright(here), others[1][0][1]) == [(9, 0)]
+    assert not passing_lights(here, find_bright(here), others)[0].any()
+
+
+@pytest.mark.parametrize("times", [(-1, 1), (1,)])
+def test_the_edges_of_a_thing_do_not_pass(times) -> None:
+    """Blocks of bright pixels have hundreds of motions from one to the other."""
+    block = np.argwhere(np.ones((18, 18)))
+    here = excess(block + np.array([40, 50]))
+    others = {t: neighbour(excess(block + np.array([40 + 5 * t, 50]), seed=5 + t)) for t in times}
+    assert not passing_lights(here, find_bright(here), others)[0].any()
+
+
+def test_a_trail_is_where_aligned_neighbours_show_the_lights() -> None:
+    """Surfaces move by (1, 2), rows and columns, a light by (4, 0): the second neighbour shows it once more."""
+    lights = np.zeros(SHAPE, bool)
+    lights[20, 30] = lights[94, 3] = True
+    flow = np.full((*SHAPE, 2), (2, 1), np.float32)
+    trail = np.argwhere(trail_of(lights, (4, 0), flow, 2))
+    assert trail.tolist() == [[19, 28], [22, 26], [93, 1]]
+    assert np.argwhere(trail_of(lights, (4, 0), None, 1)).tolist() == [[20, 30], [94, 3]]
