@@ -5,7 +5,7 @@ Noise of 20 %, that of a path tracer, over a wall whose truth is known, for a ne
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -133,10 +133,19 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 }
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("preset", ["fast", "draft"])
-@pytest.mark.parametrize("name", CASES)
-def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str) -> None:
+# Worse than their input by 1.5 to 20 dB where the noise is 1 %: frames without a neighbour of like light, snow and rain
+# at the ends of a shot, and pixels whose guides contradict their color.
+OPEN = {
+    "every second frame black", "a fade from black", "lights go out", "a white flash", "exposure grows",
+    "exposure alternates by 8", "a sun without vectors", "snow", "rain", "vectors NaN over nothing",
+    "vectors of 1e10 over nothing", "emitters of black albedo",
+}  # fmt: skip
+
+
+def denoised(
+    folder: Path, name: str, noise: float, preset: str
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Denoise a case; number, truth, noisy and denoised color of each frame."""
     scene, edit = CASES[name]
     truths = []
 
@@ -145,20 +154,34 @@ def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str
         truths.append(layers[COLOR].copy())
         # A sun has no noise; what is as bright on the whole has.
         lamp = (truths[-1] > 1000) & (np.median(truths[-1]) < 1000)
-        layers[COLOR] = np.where(lamp, layers[COLOR], grained(layers[COLOR], (2, index), NOISE))
+        layers[COLOR] = np.where(lamp, layers[COLOR], grained(layers[COLOR], (2, index), noise))
 
-    shot = open_shot(scene.write(tmp_path / "in", clean=True, edit=with_noise))
-    frames = sorted(denoise_shot(shot, tmp_path / "out", preset=preset), key=lambda frame: frame.number)
+    shot = open_shot(scene.write(folder / "in", clean=True, edit=with_noise))
+    frames = sorted(denoise_shot(shot, folder / "out", preset=preset), key=lambda frame: frame.number)
     for frame, truth in zip(frames, truths, strict=True):
-        noisy, made = shot.read(frame.number).color, open_shot(frame.path).read(frame.number).color
-        assert psnr(made, truth) >= psnr(noisy, truth) - 0.05, frame.number
+        yield frame.number, truth, shot.read(frame.number).color, open_shot(frame.path).read(frame.number).color
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("preset", ["fast", "draft"])
+@pytest.mark.parametrize("name", CASES)
+def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str) -> None:
+    for number, truth, noisy, made in denoised(tmp_path, name, NOISE, preset):
+        assert psnr(made, truth) >= psnr(noisy, truth) - 0.05, number
         if not truth.any():
             assert not made.any()
             continue
         # The sun covers 45 pixels, of which 24 are edges.
         lit, error = (0.06, 0) if name == "a sun without vectors" else (0.01, NOISE * truth.std() / truth.mean())
         off = made.mean() / truth.mean() - 1
-        assert abs(off) < lit + 4 * (error + NOISE) / np.sqrt(np.count_nonzero(truth.any(axis=-1))), frame.number
+        assert abs(off) < lit + 4 * (error + NOISE) / np.sqrt(np.count_nonzero(truth.any(axis=-1))), number
+
+
+@pytest.mark.parametrize("preset", ["fast", "draft"])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in OPEN])
+def test_next_to_no_noise_costs_no_frame_a_decibel(tmp_path: Path, name: str, preset: str) -> None:
+    for number, truth, noisy, made in denoised(tmp_path, name, 0.01, preset):
+        assert psnr(made, truth) >= psnr(noisy, truth) - 1, number
 
 
 @pytest.mark.parametrize("tint", [(1, 1, 1), (1, 0.6, 0.3)])
