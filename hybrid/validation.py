@@ -405,8 +405,11 @@ def _edges_of(colors: Sequence[Array]) -> list[Array]:
 
 
 def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
-    """Correlate edges that were found with those of two frames."""
-    centre = (_correlate(found[0], shown[0]) + _correlate(found[1], shown[1])) / 2
+    """Correlate edges that were found with those of two frames.
+
+    The better of both frames counts as the own one: a black or dim frame matches nothing, the other one anything still.
+    """
+    centre = max(_correlate(found[0], shown[0]), _correlate(found[1], shown[1]))
     return _EdgeMatch(centre, _correlate(found[1], shown[0]), _correlate(found[0], shown[1]))
 
 

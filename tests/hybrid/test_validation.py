@@ -20,6 +20,7 @@ from hybrid.stream import plan_shot
 from hybrid.validation import _check_alpha, _check_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
+from tests.scenes import Scene
 
 FRAMES = truths()
 REFERENCE = open_shot(SHOT / "reference.0010.exr").read(10).color
@@ -228,6 +229,18 @@ def test_a_denoised_picture_that_is_the_noisy_one_is_no_estimate(tmp_path) -> No
     layers = judgement.apply(shot).layers(10)
     assert layers.estimate is None
     assert str(layers.target) == "ViewLayer.Combined.RGB"  # which the denoised picture replaces all the same
+
+
+@pytest.mark.parametrize("light", [lambda i: i != 2, lambda i: i % 2, lambda i: 0.003**i, lambda i: i == 2])
+@pytest.mark.parametrize("step", [(0, 0), (2, 1)])
+def test_a_black_frame_is_no_reason_to_leave_out_the_albedo(tmp_path, step, light) -> None:
+    """The albedo of a still shot fits the lit frame beside a black one as well as its own."""
+
+    def lit(index: int, layers: dict[str, np.ndarray]) -> None:
+        layers[LIGHT] = layers[LIGHT] * np.float32(light(index))
+
+    shot = open_shot(Scene(height=64, width=96, frames=4, step=step).write(tmp_path, edit=lit))
+    assert not [line for line in validate_layers(shot).warnings if "albedo" in line]
 
 
 def test_equal_zeros_are_no_evidence() -> None:

@@ -136,7 +136,7 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 # Worse than their input by 1.5 to 20 dB where the noise is 1 %: frames without a neighbour of like light, snow and rain
 # at the ends of a shot, and pixels whose guides contradict their color.
 OPEN = {
-    "every second frame black", "a fade from black", "lights go out", "a white flash", "exposure grows",
+    "a fade from black", "lights go out", "a white flash", "exposure grows",
     "exposure alternates by 8", "a sun without vectors", "snow", "rain", "vectors NaN over nothing",
     "vectors of 1e10 over nothing", "emitters of black albedo",
 }  # fmt: skip
