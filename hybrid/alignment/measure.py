@@ -225,8 +225,8 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     shares, figures = [], []
     compared = still & grainy
     if compared.any():
-        distance = np.abs(a - b)[compared] / np.maximum(np.abs(a), np.abs(b))[compared]
-        same, near = (np.count_nonzero(distance <= most) for most in (SAME, NEAR))
+        distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
+        same, near = (np.count_nonzero(distance <= share * greater) for share in (SAME, NEAR))
         shares.append(distance.size)
         # Noise of a thousandth makes as many halves equal by chance as half of those one step apart.
         figures.append((same - (near - same) / 2) / distance.size)
