@@ -20,8 +20,8 @@ HANDLERS = (
     ("load_pre", jobs.stop_current),
     ("load_post", jobs.restore_all),
     ("render_init", jobs.protect),
-    ("render_complete", jobs.protected),
-    ("render_cancel", jobs.protected),
+    ("render_complete", jobs.completed),
+    ("render_cancel", jobs.cancelled),
 )
 _command = []  # the handle that unregisters the command line
 

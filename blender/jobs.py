@@ -33,7 +33,6 @@ class Job:
         self.rendered = False
         self.cancelled = False
         self.error = ""
-        self.remove_handlers: Callable[[], None] = lambda: None  # removes the handlers that wait for the render
 
     @property
     def scene(self) -> bpy.types.Scene | None:
@@ -108,7 +107,6 @@ class Job:
 
     def conclude(self, report: Report) -> bool:
         """Restore the scene's settings and report the result; return whether all frames are made."""
-        self.remove_handlers()
         self._restore()
         if self.run is None:
             if self.error:
@@ -174,9 +172,6 @@ class Install:
     def cancel(self) -> None:
         """Stop pip; an earlier installation stays."""
         self.run.stop()
-
-    def remove_handlers(self) -> None:
-        """An installation has no handlers."""
 
     @property
     def ended(self) -> bool:
@@ -268,36 +263,12 @@ def begin_install(wheel: str) -> Install:
     return current
 
 
-def start_when_rendered(job: Job) -> None:
-    """Let the timer start `ravg` when Blender has rendered the animation; end the job if the render is cancelled."""
-
-    # Handlers run in another thread while Blender still reads the scene, so they only set flags for the timer.
-    def rendered(*_: Any) -> None:
-        remove_handlers()
-        job.rendered = True
-
-    def cancelled(*_: Any) -> None:
-        remove_handlers()
-        job.cancel()
-
-    def remove_handlers() -> None:
-        for handlers, handler in pairs:
-            if handler in handlers:
-                handlers.remove(handler)
-
-    pairs = ((bpy.app.handlers.render_complete, rendered), (bpy.app.handlers.render_cancel, cancelled))
-    job.remove_handlers = remove_handlers
-    for handlers, handler in pairs:
-        handlers.append(handler)
-
-
 @bpy.app.handlers.persistent
 def stop_current(*_: Any) -> None:
     """End the current job, as its file or the extension is closed."""
     global current
     if current is not None:
         current.cancel()
-        current.remove_handlers()
         if current.run is not None:
             current.run.wait()
         current.conclude(lambda *_: None)
@@ -319,11 +290,23 @@ def protect(scene: bpy.types.Scene, *_: Any) -> None:
             print(f"ravg: {message}")
 
 
+# Handlers run in another thread while Blender still reads the scene, so they only set flags for the timer.
 @bpy.app.handlers.persistent
-def protected(scene: bpy.types.Scene, *_: Any) -> None:
-    """Restore the settings that `protect` has changed."""
+def completed(scene: bpy.types.Scene, *_: Any) -> None:
+    """Let the timer start `ravg` where a job waits for this render; else restore what `protect` has changed."""
     if current is None or current.scene != scene:
         scenes.restore(scene)
+    elif current.run is None:
+        current.rendered = True
+
+
+@bpy.app.handlers.persistent
+def cancelled(scene: bpy.types.Scene, *_: Any) -> None:
+    """End the job that waits for this render; else restore what `protect` has changed."""
+    if current is None or current.scene != scene:
+        scenes.restore(scene)
+    elif current.run is None:
+        current.cancel()
 
 
 def redraw() -> None:

@@ -84,7 +84,6 @@ class Denoise(_WhenIdle, bpy.types.Operator):
             raise FileExistsError(f"{which}: render with existing='KEEP' or 'REPLACE', or denoise them")
         scenes.set_up(scene)
         scenes.override(scene, replace=self.existing == "REPLACE")
-        jobs.start_when_rendered(job)
         bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
 
 

@@ -421,7 +421,6 @@ def test_it_starts_when_blender_has_rendered(blender, shot):
     count = len(bpy.app.handlers.render_complete)
     job = jobs.begin(scene)
     scenes.override(scene, replace=True)
-    jobs.start_when_rendered(job)
     waiting = [job.text, job.ended, jobs.follow() is not None]
     bpy.ops.render.render(animation=True)
     jobs.follow()
@@ -669,7 +668,6 @@ ENDS = {
     "cancelled": """
 job = jobs.begin(scene)
 scenes.override(scene, replace=True)
-jobs.start_when_rendered(job)
 assert settings_of(scene) != before
 for handler in list(bpy.app.handlers.render_cancel): handler(scene)
 job.advance()
