@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import ParamSpec, Self, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
@@ -15,8 +14,9 @@ from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frame import Frame, Frames, cut_middle
 from hybrid.runtime.allocator import reuse_freed_memory
-from hybrid.runtime.system import peak_memory, start_context
+from hybrid.runtime.system import start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
+from hybrid.runtime.timing import Stage, Timings
 
 OnStep = Callable[[str], None]  # gets a description of each step as it starts
 P = ParamSpec("P")
@@ -58,33 +58,16 @@ def run_in_process(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) 
         return pool.submit(function, *args, **kwargs).result()
 
 
-class _Clock:
-    """Accumulates the wall and the CPU seconds of ``with`` blocks."""
-
-    def __init__(self) -> None:
-        self.seconds = self.cpu_seconds = 0.0
-
-    def __enter__(self) -> Self:
-        self._start = time.perf_counter(), time.process_time()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        wall, cpu = self._start
-        self.seconds += time.perf_counter() - wall
-        self.cpu_seconds += time.process_time() - cpu
-
-
 class _TimedFrames:
-    """The frames of a shot; `clock` accumulates the time of reading."""
+    """The frames of a shot; reading them is the stage "read"."""
 
-    def __init__(self, shot: Frames) -> None:
+    def __init__(self, shot: Frames, timings: Timings) -> None:
         self.numbers, self.step, self.shape, self.has = shot.numbers, shot.step, shot.shape, shot.has
-        self.clock = _Clock()
-        self._shot = shot
+        self._shot, self._timings = shot, timings
 
     def read(self, number: int) -> Frame:
         """A frame of the shot."""
-        with self.clock:
+        with self._timings.stage("read"):
             return self._shot.read(number)
 
 
@@ -96,10 +79,10 @@ def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore |
     if method.threads:
         limit_threads(method.threads)
     next(method.run(cut_middle(shot, WARM_UP)), None)
-    clock, pixels, timed = _Clock(), 0, _TimedFrames(shot)
-    frames = method.run(timed)
+    pixels, timings = 0, Timings()
+    frames = method.run(_TimedFrames(shot, timings))
     while True:
-        with clock:
+        with timings.stage("run"):
             done = next(frames, None)
         if done is None:
             break
@@ -107,8 +90,8 @@ def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore |
         pixels += image.shape[0] * image.shape[1]
         if store is not None:
             store.save(name, number, image)
-    seconds, cpu_seconds = clock.seconds - timed.clock.seconds, clock.cpu_seconds - timed.clock.cpu_seconds
-    return RunCost(pixels / 1e6, seconds, cpu_seconds, peak_memory())
+    run, read = timings.stages["run"], timings.stages.get("read", Stage())
+    return RunCost(pixels / 1e6, run.seconds - read.seconds, run.cpu_seconds - read.cpu_seconds, run.peak_bytes)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class Stage:
 
 
 class Timings:
-    """Adds up the cost of named stages, which may not nest."""
+    """Adds up the cost of named stages; a stage within another counts in both."""
 
     def __init__(self) -> None:
         self.stages: dict[str, Stage] = {}

@@ -18,6 +18,7 @@ from hybrid.comparison.running import RunCost, Seconds, run_method, summarize_ru
 from hybrid.comparison.store import FrameStore
 from hybrid.files.frame import Frame
 from hybrid.oidn import denoise_oidn
+from hybrid.runtime import timing
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 
 needs_oidn = [
@@ -67,7 +68,7 @@ def test_reading_and_warming_up_are_not_counted(monkeypatch: pytest.MonkeyPatch)
         process_time = perf_counter
 
     clock = Clock()
-    monkeypatch.setattr(running, "time", clock)
+    monkeypatch.setattr(timing, "time", clock)
     shot, _ = make_shots()
 
     class SlowShot(MemoryShot):
