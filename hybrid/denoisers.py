@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,14 @@ Array = NDArray[np.float32]
 class WindowDenoiser(Protocol):
     """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
 
+    needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
+    pools: ClassVar[bool] = False  # whether samples of the window are pooled and denoised by OIDN
+    packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
+
     @property
     def radius(self) -> int:
         """Frames on each side of the centre."""
         return 2
-
-    @property
-    def needs_first_pass(self) -> bool:
-        """Whether windows must hold a first pass."""
-        return True
-
-    @property
-    def pools(self) -> bool:
-        """Whether samples of the window are pooled and denoised by OIDN."""
-        return False
 
     @property
     def settings(self) -> Mapping[str, object]:
@@ -45,11 +39,6 @@ class WindowDenoiser(Protocol):
     def devices(self) -> Mapping[str, str]:
         """Library → the device that it computes on."""
         return {}
-
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """Packages that pixels depend on."""
-        return ()
 
     @property
     def backends(self) -> Backends:

@@ -62,26 +62,15 @@ class Record:
             "frames": {},
         }
 
-    @property
-    def done(self) -> list[int]:
-        """The finished frames, made by this run or before it, in the order in which they were added."""
-        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] != "failed"]
-
-    @property
-    def made(self) -> list[int]:
-        """The frames that this run made."""
-        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "made"]
+    def numbers(self, *states: str) -> list[int]:
+        """Return the frames in one of these states (`add`), in the order in which they were added."""
+        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] in states]
 
     @property
     def files(self) -> list[Path]:
         """The files of the frames that this run made, in the order of their names."""
         entries = self._document["frames"].values()
         return sorted(self.path.parent.parent / entry["file"] for entry in entries if entry["state"] == "made")
-
-    @property
-    def failed(self) -> list[int]:
-        """The frames that failed."""
-        return [int(n) for n, entry in self._document["frames"].items() if entry["state"] == "failed"]
 
     def add(self, number: int, state: str, **facts: object) -> None:
         """Add a frame, whose state is "made", "there" (made by an earlier run) or "failed"."""

@@ -172,8 +172,9 @@ def _denoise(request: Request) -> None:
         record.add(number, "failed", error="there is no such frame")
 
     def report() -> None:
-        count = f"{len(record.done)} of {len(shot)} frames are finished"
-        last = f", the last is {record.done[-1]}" if record.done else ""
+        done = record.numbers("made", "there")
+        count = f"{len(done)} of {len(shot)} frames are finished"
+        last = f", the last is {done[-1]}" if done else ""
         LOG.error(f"stopped: {count}{last}; --resume goes on from there")
         record.write(job.timings, "stopped")
 
@@ -187,11 +188,11 @@ def _denoise(request: Request) -> None:
             record.write(job.timings, "failed", error=one_line(error))
         raise
     record.write(job.timings, "finished")
-    if there := len(record.done) - len(record.made):
-        summarize("Note", f"{there} of {len(shot)} frames were finished already")
+    if there := record.numbers("there"):
+        summarize("Note", f"{len(there)} of {len(shot)} frames were finished already")
     _summarize_result(request, record, time.monotonic() - start)
-    if record.failed:
-        LOG.error(f"{len(record.failed)} frames could not be made: {format_frames(record.failed)}")
+    if failed := record.numbers("failed"):
+        LOG.error(f"{len(failed)} frames could not be made: {format_frames(failed)}")
         raise typer.Exit(1)
     _write_pictures(request, job.views[0])
     _print_weights(job)

@@ -129,7 +129,10 @@ class Sequence:
         _refuse_large_display(image)
         if pixels is None:
             pixels = image.pixels(layer.channels)
-            self._cache_pixels(key, pixels)
+            with self._lock:
+                self._cache[key] = pixels
+                while len(self._cache) > 1 and sum(cached.nbytes for cached in self._cache.values()) > CACHE_BYTES:
+                    self._cache.popitem(last=False)
         return image, layer, pixels
 
     def facts(self, number: int) -> dict[str, Any]:
@@ -159,12 +162,6 @@ class Sequence:
 
     def _path(self, number: int) -> Path:
         return self._files[number] if number in self._files else self.files()[number]
-
-    def _cache_pixels(self, key: Hashable, pixels: NDArray[Any]) -> None:
-        with self._lock:
-            self._cache[key] = pixels
-            while len(self._cache) > 1 and sum(cached.nbytes for cached in self._cache.values()) > CACHE_BYTES:
-                self._cache.popitem(last=False)
 
     def _encode(self, pixels: NDArray[Any], layer: Layer, taken: Layers, gain: float, ev: float) -> Image8:
         components = [component_of(channel) for channel in layer.channels]
