@@ -150,7 +150,8 @@ def _pull(first: int, last: int, estimates: Floats, confidence: Floats, weight: 
             for t in range(T):
                 total += confidence[t, y, x]
                 left += confidence[t, y, x] * weight[t, y, x]
-            if left == total:
+            # Where drift leaves nothing of the only frames that are trusted, they count as before.
+            if left == total or not left > 0:
                 continue
             for t in range(T):
                 share = weight[t, y, x] * total / left

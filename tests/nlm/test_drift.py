@@ -111,3 +111,12 @@ def test_pulling_is_averaging_with_other_weights(rng):
 def test_arguments_are_checked(name, arguments):
     with pytest.raises(ValueError, match=name):
         drift_weights(*arguments)
+
+
+def test_estimates_stay_where_the_only_trusted_frames_have_no_weight() -> None:
+    """As where the centre is not finite, and its neighbours drift."""
+    estimates = np.random.default_rng(3).random((5, 4, 6, 3)).astype(np.float32)
+    kept, confidence, weight = estimates.copy(), np.ones((5, 4, 6), np.float32), np.zeros((5, 4, 6), np.float32)
+    confidence[2], weight[2] = 0, 1
+    pull_to_centre(estimates, confidence, weight)
+    np.testing.assert_array_equal(estimates, kept)
