@@ -22,6 +22,7 @@ class WindowDenoiser(Protocol):
     """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
 
     needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
+    clamps: ClassVar[bool] = False  # whether results are clamped to `AlignedWindow.sample_range`
     pools: ClassVar[bool] = False  # whether samples of the window are pooled and denoised by OIDN
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
 

@@ -142,14 +142,12 @@ class FrameDenoiser:
         """
         averaged = self.neighbours(number)
         # Of the frame before only what the average reads is left.
-        self._results = {
-            n: result if n >= number else result.as_neighbour() for n, result in self._results.items() if n in averaged
-        }
+        self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}
         for n in averaged:
             if n not in self._results or (n == number and not self._results[n].trust):
                 self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
                 try:
-                    self._results[n] = self.stream.keeper.keep(self._denoise_window(n))
+                    self._results[n] = self.stream.keeper.keep(_needed(self._denoise_window(n), n >= number))
                 except (ValueError, OSError):
                     if n == number or not self.keep_going:
                         raise
@@ -199,7 +197,9 @@ class FrameDenoiser:
         outliers = 0
         for band in bands:
             assert window is not None
-            aligned = align(window, band, timings=stream.timings)
+            # A function may stand for a denoiser.
+            ranged = getattr(self.denoise, "clamps", False)
+            aligned = align(window, band, ranged=ranged, timings=stream.timings)
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
             denoised = self.denoise(aligned)
@@ -373,6 +373,11 @@ class _Layers:
     def named(self, kind: str) -> dict[str, Any]:
         """The layers of a kind."""
         return {name: layer for (other, name), layer in self._layers.items() if other == kind}
+
+
+def _needed(result: WindowResult, whole: bool) -> WindowResult:
+    """The whole result, or what only the average with another frame's reads."""
+    return result if whole else result.as_neighbour()
 
 
 def _excess(frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None) -> Excess:

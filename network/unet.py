@@ -95,19 +95,23 @@ class OidnUNet(nn.Module):
     def decode(self, x: Tensor, skips: Sequence[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
         """Run the decoder, and a head on its finest features. Returns the head's outputs.
 
-        `x` and `skips` are those of `encode`; the first skip is the input of the network, not rounded. The head maps
-        ``(N, width, H, W)`` features, or some of their rows, to outputs that depend on one further row at most.
+        `x` and `skips` are those of `encode`; the first skip is the input of the network, not rounded, or its
+        `input_skip`. The head maps ``(N, width, H, W)`` features, or some of their rows, to outputs that depend on one
+        further row at most.
         """
         stages = (cast(Stage, stage) for stage in self.decoder)
         *coarse, (finest, network_input) = zip(stages, reversed(skips), strict=True)
         for stage, skip in coarse:
             (x,) = in_strips(lambda x, skip, stage=stage: [stage.upsample(x, skip)], 2, x, skip)
-        return in_strips(lambda x, skip: head(finest.upsample(x, self._input_skip(skip))), 3, x, network_input)
+        return in_strips(lambda x, skip: head(finest.upsample(x, self.input_skip(skip))), 3, x, network_input)
 
-    def _input_skip(self, x: Tensor) -> Tensor:
-        """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
+    def input_skip(self, x: Tensor) -> Tensor:
+        """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`).
+
+        Returns a skip connection itself.
+        """
         if self.first.weight.dtype == torch.bfloat16:
-            return with_low_bits(x.float(), 3)
+            return x if x.dtype == torch.bfloat16 else with_low_bits(x, 3)
         return x.to(self.first.weight.dtype, memory_format=torch.channels_last)
 
     def project(self, x: Tensor) -> Tensor:

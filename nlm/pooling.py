@@ -66,18 +66,39 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     return pooled
 
 
-def clamp_to_window(picture: Floats, estimates: Floats, residuals: Iterable[tuple[int, Floats]]) -> Floats:
-    """Clamp each channel of a picture (H, W, 3) to the range of estimates and samples within 3×3 pixels of any frame.
+class SampleRange(NamedTuple):
+    """Least and greatest of the estimates and the samples of all frames of a window, (H, W, 3) each."""
 
-    Estimates and residuals are those of `pool_samples`, the residuals in strips of rows, with the first row of each;
-    non-finite values do not count.
-    """
-    low, high = np.empty(picture.shape, np.float32), np.empty(picture.shape, np.float32)
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> SampleRange:
+        """Make the range of a picture of this shape, to be filled by `add`."""
+        return cls(np.empty(shape, np.float32), np.empty(shape, np.float32))
+
+    def add(self, estimates: Floats, residuals: Floats, top: int) -> None:
+        """Fill the rows from `top` on by residuals (T, h, W, 3) of these and all estimates, those of `pool_samples`.
+
+        Non-finite values do not count.
+        """
+        check_strip(residuals, estimates, top)
+        run_bands(_range, residuals.shape[1], estimates, residuals, *self, top)
+
+
+def find_range(estimates: Floats, residuals: Iterable[tuple[int, Floats]]) -> SampleRange:
+    """Find the range of a window from its residuals in strips of rows, with the first row of each."""
+    found = SampleRange.empty(estimates.shape[1:])
     for top, strip in residuals:
-        check_strip(strip, estimates, top)
-        run_bands(_range, strip.shape[1], estimates, strip, low, high, top)
+        found.add(estimates, strip, top)
+    return found
+
+
+def clamp_to_range(picture: Floats, found: SampleRange) -> Floats:
+    """Clamp each channel of a picture (H, W, 3) to the range of a window within 3×3 pixels."""
     box = np.ones((3, 3), np.uint8)
-    return np.clip(picture, cv2.erode(low, box).reshape(low.shape), cv2.dilate(high, box).reshape(low.shape))
+    low, high = cv2.erode(found.low, box), cv2.dilate(found.high, box)
+    return np.clip(picture, low.reshape(picture.shape), high.reshape(picture.shape))
 
 
 @njit(cache=True, nogil=True)

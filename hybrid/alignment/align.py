@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import agreement_weight, color_gate, color_gates
+from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import average_neighbours
 
@@ -72,11 +73,14 @@ def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
     return padded, slice(rows.start - padded.start, rows.stop - padded.start)
 
 
-def align(window: Window, rows: slice | None = None, *, timings: Timings | None = None) -> AlignedWindow:
+def align(
+    window: Window, rows: slice | None = None, *, ranged: bool = False, timings: Timings | None = None
+) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
-    With `rows` only these rows of the frame, and `MARGIN` around them. All frames have the same layers
-    (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
+    With `rows` only these rows of the frame, and `MARGIN` around them. With `ranged` the range of the samples is found
+    while they are averaged. All frames have the same layers (`expect_equal_layers`). Raises ValueError if the centre
+    has no first pass and others do.
     """
     timings = timings or Timings()
     centre, stages, given = window.centre, window.stages, window.first_pass is not None
@@ -109,24 +113,25 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
             estimates /= modulation
-            gate = color_gate(estimates, own, bright.exposure)
-            confidence = trust_light(confidence, warped.coverage, gate, stages)
+            confidence = trust_light(confidence, warped.coverage, color_gate(estimates, own, bright.exposure), stages)
             if "gate" in stages:
                 confidence[np.arange(len(confidence)) != middle] *= agreement_weight(
                     estimates, own, confidence, bright.exposure
                 )
         elif "gate" in stages:
             confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
-        sides = None
-        if "blend-samples" in stages:
-            # Before the first pass is pulled to the centre's: the samples stay as they are.
-            pictures, residual = (color, None) if estimates is None else (estimates, sources.residual_strips())
-            assert pictures is not None
-            noisy = centre.radiance[padded]
-            sides = average_neighbours(pictures, residual, confidence, warped.confidence, modulation, noisy)
-        weight = None
+        weight = sides = found = residuals = None
         if estimates is not None and "drift" in stages:
             weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)
+        if "blend-samples" in stages:
+            if estimates is not None:
+                found = SampleRange.empty(own.shape) if ranged else None
+                residuals = _pull_behind(sources.residual_strips(), estimates, confidence, weight, found)
+            pictures = color if estimates is None else estimates
+            assert pictures is not None
+            noisy = centre.radiance[padded]
+            sides = average_neighbours(pictures, residuals, confidence, warped.confidence, modulation, noisy)
+        elif estimates is not None and weight is not None:
             pull_to_centre(estimates, confidence, weight)
     return AlignedWindow(
         number=centre.number,
@@ -154,6 +159,7 @@ def align(window: Window, rows: slice | None = None, *, timings: Timings | None 
         neighbour_samples=sides,
         neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
         # A copy: a view would keep the weights of all frames in memory.
+        known_range=found,
         drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1].copy(),
         passes=centre.passes,
     )
@@ -321,6 +327,25 @@ def _warp_first_pass(
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])
     return warped
+
+
+def _pull_behind(
+    residuals: Iterable[tuple[int, Array]],
+    estimates: Array,
+    confidence: Array,
+    weight: Array | None,
+    found: SampleRange | None,
+) -> Iterator[tuple[int, Array]]:
+    """Yield strips of residuals; when one has been used, pull its estimates to the centre's and add to the range.
+
+    Neighbours are averaged before that: the samples stay as they are.
+    """
+    for top, strip in residuals:
+        yield top, strip
+        if weight is not None:
+            pull_to_centre(estimates, confidence, weight, slice(top, top + strip.shape[1]))
+        if found is not None:
+            found.add(estimates, strip, top)
 
 
 def _fill_centre(

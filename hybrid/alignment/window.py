@@ -16,6 +16,7 @@ from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.passes import NO_PASSES, Passes
+from nlm.pooling import SampleRange, find_range
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
 
@@ -160,6 +161,7 @@ class AlignedWindow:
     neighbour_trust: tuple[Trust | None, Trust | None] = (None, None)
     # (H, W): the weight of the frame after the centre by its drift; with the stage "drift"
     drift_weight: Array | None = None
+    known_range: SampleRange | None = None  # `sample_range`, where it was found along the way
     passes: Passes = NO_PASSES  # the relation of `aovs` to the color
 
     @cached_property
@@ -206,6 +208,12 @@ class AlignedWindow:
         Made at each access.
         """
         return None if self.first_pass is None else self.sources.residual(limited=True)
+
+    @property
+    def sample_range(self) -> SampleRange:
+        """Range of the first passes and the samples of all frames; of windows with a first pass."""
+        assert self.first_pass is not None
+        return self.known_range or find_range(self.first_pass, self.sources.residual_strips())
 
     @property
     def centre(self) -> int:

@@ -18,7 +18,7 @@ from hybrid.neural.tiling import Block, tensor_of
 from hybrid.stabilize import Denoised
 from network.robust_unet import MIRRORED, Borders, RobustUNet, denoise_window, for_inference
 from network.windows import UNetWindow
-from nlm.pooling import clamp_to_window
+from nlm.pooling import clamp_to_range
 
 Array = NDArray[np.float32]
 
@@ -29,7 +29,7 @@ SCRATCH = {"small": 100, "base": 100, "large": 500}
 class UNetDenoiser(NetworkDenoiser):
     """Runs a `network.robust_unet.RobustUNet` on aligned windows that have a first pass; from `open_network`."""
 
-    needs_first_pass = True
+    needs_first_pass = clamps = True
     halo = HALO
     default_tile = 2048  # 1920×1080 is one tile
 
@@ -45,7 +45,7 @@ class UNetDenoiser(NetworkDenoiser):
             black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
             nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, self._window(aligned), nothing, bool(black))
-            limited = clamp_to_window(result.irradiance, aligned.first_pass, aligned.sources.residual_strips())
+            limited = clamp_to_range(result.irradiance, aligned.sample_range)
             result = result._replace(irradiance=limited)
             filtered = filter_aovs(aligned, limited)
             shared = share_out(aligned, filtered, limited, add=self.setup.add_layers)

@@ -9,11 +9,13 @@ from tests.scenes import Scene, only
 
 torch = pytest.importorskip("torch")
 
+from hybrid.alignment.window import WarpSources  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural import open_network, unet_denoiser  # noqa: E402
 from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.stabilize import FrameDenoiser  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
 from network.checkpoint import shipped_weights  # noqa: E402
 
@@ -73,3 +75,17 @@ def test_the_network_gets_limited_residuals():
     block = slice(10, 50), slice(0, 30)
     unet_denoiser._residual_rows(SimpleNamespace(sources=Sources()), block, slice(2, 7))
     assert asked == [((slice(12, 17), block[1]), True)]
+
+
+def test_residuals_are_made_once_for_the_samples_and_once_for_the_network(tmp_path, monkeypatch):
+    """The range that the result is clamped to is found with the former."""
+    made, residual = [], WarpSources.residual
+
+    def count(sources, *part, limited=False):
+        made.append(limited)
+        return residual(sources, *part, limited=limited)
+
+    monkeypatch.setattr(WarpSources, "residual", count)
+    stream = FrameStream(open_shot(SCENE.write(tmp_path)), only({"warp", "blend-samples"}), first_pass=Classical(DRAFT))
+    FrameDenoiser(stream, open_network(shipped_weights("fast"))).make(SCENE.first + 2)
+    assert sorted(made) == [False, True]
