@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-#: Rows of the finest layer in a strip, even.
-ROWS = 96
+#: Rows of the finest layer in a strip, even: with 96 rows the networks take 5 % more time, with 288 no less.
+ROWS = 192
 
 
 def in_strips(

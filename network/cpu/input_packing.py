@@ -64,6 +64,7 @@ def packer(
     whole = None if window.residual is None else _pixels(window.residual)
     missing = np.empty((batch, 0, 0, 3), np.float32)
     guides = [missing if guide is None else _pixels(guide) for guide in (window.albedo, window.normal)]
+    each = tuple(range(count))
     scales = np.stack([window.exposure.numpy(), window.gain.numpy()], axis=1)
 
     def pack(rows: Indices) -> PackedInputs:
@@ -80,7 +81,7 @@ def packer(
         for n in range(batch):
             source = _Source(first_pass[n], strips[n], confidence[n], modulation[n], *(guide[n] for guide in guides))
             target = _Target(frames[:, n], shared[n], static[n], average[n])
-            run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table(), top)
+            run_bands(_pack, size[0], source, scales[n], rows, columns, target, encoding_table(), top, each)
         flat = frames.reshape(count * batch, *size, FRAME_CHANNELS)
         return PackedInputs(
             *(torch.from_numpy(pixels).permute(0, 3, 1, 2) for pixels in (flat, shared, static, average))
@@ -94,24 +95,25 @@ def _pixels(layer: Tensor) -> Floats:
     return layer.movedim(-3, -1).contiguous().numpy()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _pack(
     first: int, last: int, source: _Source, scales: Floats, rows: Indices, columns: Indices, target: _Target,
-    curve: Floats, top: int,
+    curve: Floats, top: int, each: tuple[int, ...],
 ) -> None:  # fmt: skip
+    # `each` has a number for each frame: the compiler knows the length of a tuple, and unrolls loops over frames.
     first_pass, residual, confidence, modulation, albedo, normal = source
     frames, shared, static, average = target
     exposure, gain = scales[0], scales[1]
-    T, zero, one, half = len(first_pass), np.float32(0), np.float32(1), np.float32(0.5)
+    T, zero, one, half = len(each), np.float32(0), np.float32(1), np.float32(0.5)
     centre = T // 2
     trust, share, held = np.empty(T, np.float32), np.empty(T, np.float32), np.empty((T, 3), np.float32)
     value = np.empty(1, np.float32)
     bits = value.view(np.uint32)  # of the same four bytes
-    for y in range(first, last):
-        row = rows[y]
-        strip = row - top
-        for x in range(len(columns)):
-            column = columns[x]
+    for y in range(np.uintp(first), np.uintp(last)):
+        row = np.uintp(rows[y])
+        strip = np.uintp(rows[y] - top)
+        for x in range(np.uintp(len(columns))):
+            column = np.uintp(columns[x])
             total = zero
             for t in range(T):
                 trust[t] = confidence[t, row, column, 0]
