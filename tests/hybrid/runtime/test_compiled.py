@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -48,27 +50,30 @@ def run(folder: Path, **environment: str) -> tuple[str, Path, int, str]:
 
 
 @pytest.fixture
-def installed(tmp_path_factory):
+def shared() -> Iterator[Path]:
+    """A folder that every user may enter, unlike pytest's, which another run of pytest closes again."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o777)
+        yield Path(name)
+
+
+@pytest.fixture
+def installed(shared: Path) -> Iterator[Path]:
     """A folder with a loop in it, read-only as an installation of root's is to a farm's user."""
-    folder = tmp_path_factory.mktemp("installed")
+    folder = shared / "installed"
+    folder.mkdir()
     (folder / "loop.py").write_text(LOOP)
     folder.chmod(0o555)
-    for parent in [folder, *folder.parents]:
-        if parent.owner() == folder.owner() and not parent.stat().st_mode & 0o005 and parent != Path("/"):
-            parent.chmod(parent.stat().st_mode | 0o055)
     yield folder
     folder.chmod(0o755)
 
 
 @pytest.fixture
-def temporary(tmp_path):
+def temporary(shared: Path) -> Path:
     """A folder for temporary files that everybody may write to."""
-    folder = tmp_path / "tmp"
+    folder = shared / "tmp"
     folder.mkdir()
     folder.chmod(0o777)
-    for parent in folder.parents:
-        if parent.name.startswith(("pytest-", "popen-", "test_")):
-            parent.chmod(0o755)
     return folder
 
 
@@ -108,22 +113,18 @@ def test_a_folder_that_somebody_else_has_made_is_not_trusted(installed, temporar
 @pytest.mark.posix
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("share", [0, 0.5, 0.99])
-def test_a_damaged_file_is_made_again(tmp_path, kind, share):
+def test_a_damaged_file_is_made_again(shared, kind, share):
     """A process killed on a full disk left half a file, and all later ones a traceback."""
-    (tmp_path / "loop.py").write_text(LOOP)
-    home = {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
-    tmp_path.chmod(0o777)
-    for parent in tmp_path.parents:
-        if parent.name.startswith(("pytest-", "popen-", "test_")):
-            parent.chmod(0o755)
-    assert run(tmp_path, **home)[2] == 0
-    assert run(tmp_path, **home)[2] == 1
-    (file,) = (tmp_path / "kept").rglob(f"*.{kind}")
+    (shared / "loop.py").write_text(LOOP)
+    home = {"NUMBA_CACHE_DIR": str(shared / "kept")}
+    assert run(shared, **home)[2] == 0
+    assert run(shared, **home)[2] == 1
+    (file,) = (shared / "kept").rglob(f"*.{kind}")
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
-    value, _, found, _ = run(tmp_path, **home)
+    value, _, found, _ = run(shared, **home)
     assert (value, found) == ("42", 0)
-    assert run(tmp_path, **home)[2] == 1
+    assert run(shared, **home)[2] == 1
 
 
 COUNT = """
