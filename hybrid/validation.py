@@ -48,8 +48,9 @@ BRIGHT = 2.0
 # Averages over a pixel are shorter than 1, rounding makes them longer by less than this.
 LENGTH = 1.1
 # Correlation of edges, of a guide with the colors of two frames: on the bundled shot an albedo has 0.61 with its own
-# frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35.
-EDGES = 0.05
+# frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35. Below the second nothing matches: an albedo in which
+# lamps light single objects has 0.00 and 0.05.
+EDGES, MATCH = 0.05, 0.15
 # The variance may differ from that of the picture by this factor: the third quartile of their ratio was 1.3 to 1.7.
 VARIANCE = 4.0
 # The mean of a denoised picture may differ from that of the noisy one by this factor. The light of single bright
@@ -416,7 +417,7 @@ def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
 def _other_frame(edges: Sequence[_EdgeMatch]) -> str | None:
     """Name the frame, other than their own, whose edges pairs have; None if there is none."""
     centre, late, early = np.mean(edges, axis=0)
-    if max(late, early) <= centre + EDGES:
+    if max(late, early) <= max(centre + EDGES, MATCH):
         return None
     figures = f"their edges correlate {max(late, early):.2f}, with its own frame's {centre:.2f}"
     return f"the {'previous' if late > early else 'next'} frame ({figures})"

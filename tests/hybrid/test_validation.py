@@ -17,7 +17,16 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import Shot, open_shot
 from hybrid.stream import plan_shot
-from hybrid.validation import _check_alpha, _check_estimate, find_cut, find_lost_light, find_nonfinite, validate_layers
+from hybrid.validation import (
+    _check_alpha,
+    _check_estimate,
+    _match_edges,
+    _other_frame,
+    find_cut,
+    find_lost_light,
+    find_nonfinite,
+    validate_layers,
+)
 from tests.hybrid.test_renderers import denoised
 from tests.renderers import RENDERERS, SAMPLES, SHOT, Channels, Truth, cycles_vector, layer, save, truths
 from tests.scenes import Scene
@@ -241,6 +250,19 @@ def test_a_black_frame_is_no_reason_to_leave_out_the_albedo(tmp_path, step, ligh
 
     shot = open_shot(Scene(height=64, width=96, frames=4, step=step).write(tmp_path, edit=lit))
     assert not [line for line in validate_layers(shot).warnings if "albedo" in line]
+
+
+def test_edges_that_match_no_frame_belong_to_none() -> None:
+    """The albedo of a room where lamps light single objects correlates with the next frame by chance."""
+    rng = np.random.default_rng(6)
+    shown = [rng.normal(size=(108, 192)).astype(np.float32) for _ in range(2)]
+    found = [rng.normal(size=(108, 192)).astype(np.float32) for _ in range(2)]
+    found[0] += np.float32(0.08) * shown[1]
+    match = _match_edges(found, shown)
+    assert match.early > match.centre + 0.05
+    assert _other_frame([match]) is None
+    found[0] += np.float32(0.4) * shown[1]
+    assert "the next frame" in _other_frame([_match_edges(found, shown)])
 
 
 def test_equal_zeros_are_no_evidence() -> None:
