@@ -261,7 +261,7 @@ def test_edges_that_match_no_frame_belong_to_none() -> None:
     match = _match_edges(found, shown)
     assert match.early > match.centre + 0.05
     assert _other_frame([match]) is None
-    found[0] += np.float32(0.4) * shown[1]
+    found[0] += np.float32(0.5) * shown[1]
     assert "the next frame" in _other_frame([_match_edges(found, shown)])
 
 
