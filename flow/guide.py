@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -10,32 +11,42 @@ import numpy as np
 _REC709 = np.array([0.2126, 0.7152, 0.0722], np.float32)
 # Of the guided filter that the luminance goes through, pixels.
 _RADIUS = 2
+# Rows whose luminance is made at a time.
+_STRIP = 128
 
 
-def _luminance(image: np.ndarray) -> np.ndarray:
-    """Luminance of (H, W, 3), not negative; NaN is 0."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        luminance = np.asarray(image, np.float32) @ _REC709
-    # No more than 1e30: the median of two of the largest floats is infinite, and so is an exposure made of it.
-    return np.asarray(np.clip(np.nan_to_num(luminance, nan=0.0, posinf=1e30), 0, np.float32(1e30)))
+def _luminance(
+    image: np.ndarray, lift: float = 0.0, finish: Callable[[np.ndarray], np.ndarray] = np.asarray
+) -> np.ndarray:
+    """Luminance of (H, W, 3) + lift, not negative, and a function of it; NaN is 0. In strips: one plane is made."""
+    found = np.empty(image.shape[:2], np.float32)
+    for top in range(0, len(found), _STRIP):
+        rows = slice(top, top + _STRIP)
+        with np.errstate(invalid="ignore", over="ignore"):
+            strip = np.asarray(image[rows], np.float32)
+            luminance = (strip + np.float32(lift) if lift else strip) @ _REC709
+        # No more than 1e30: the median of two of the largest floats is infinite, and so is an exposure made of it.
+        luminance = np.clip(np.nan_to_num(luminance, copy=False, nan=0.0, posinf=1e30), 0, np.float32(1e30))
+        found[rows] = finish(luminance)
+    return found
 
 
-def median_luminance(color: np.ndarray) -> float:
-    """Median of the positive luminances of linear radiance (H, W, 3); 1 without any. NaN is 0, Inf very bright."""
-    luminance = _luminance(color)
+def median_luminance(color: np.ndarray, lift: float = 0.0) -> float:
+    """Median of the positive luminances of radiance (H, W, 3) + lift; 1 without any. NaN is 0, Inf very bright."""
+    luminance = _luminance(color, lift)
     positive = luminance[luminance > 0]
     return float(np.median(positive)) if positive.size else 1.0
 
 
-def tone_map(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Luminance on Reinhard's curve, L / (L + exposure), (H, W) float32 in [0, 1].
+def tone_map(color: np.ndarray, exposure: float, lift: float = 0.0) -> np.ndarray:
+    """Luminance L of color + lift on Reinhard's curve, L / (L + exposure), (H, W) float32 in [0, 1].
 
     Negative and NaN count as 0, Inf as white.
     """
     if not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a positive number")
     # As 1 − e / (L + e), which is 1 and not NaN for the largest float.
-    return 1 - np.float32(exposure) / (_luminance(color) + np.float32(exposure))
+    return _luminance(color, lift, lambda luminance: 1 - np.float32(exposure) / (luminance + np.float32(exposure)))
 
 
 def estimate_noise(image: np.ndarray, *, spacing: int = 1) -> np.ndarray:

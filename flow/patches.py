@@ -42,6 +42,7 @@ class FramePair:
     later_vectors: np.ndarray
     resolution: tuple[int, int]  # height and width, pixels, of the whole picture
     frames: int = 1  # from the earlier to the later; vectors span one
+    lift: float = 0.0  # added to both pictures, so that no value of a normal is negative
 
 
 ONE_PIXEL = np.ones(2, np.float32)
@@ -53,9 +54,9 @@ class Patches:
 
     def __init__(self, pair: FramePair) -> None:
         self.resolution, self.frames = pair.resolution, pair.frames
-        exposure = median_luminance(pair.earlier)
-        pictures = [tone_map(color, exposure) for color in (pair.earlier, pair.later)]
-        box = _lit_box(np.maximum(*pictures) > 0)
+        exposure = median_luminance(pair.earlier, pair.lift)
+        pictures = [tone_map(color, exposure, pair.lift) for color in (pair.earlier, pair.later)]
+        box = _lit_box(np.logical_or(*(picture > 0 for picture in pictures)))
         self.pictures = tuple(np.ascontiguousarray(picture[box]) for picture in pictures)
         layers = pair.earlier_vectors[box], pair.later_vectors[box]
         # Closed: noise leaves single pixels of a lit area black.
@@ -87,7 +88,10 @@ class Patches:
         height, width = self.pictures[0].shape
         spacing = max(self.size, int(np.ceil(np.sqrt(height * width / MOST_PATCHES))))
         lit = np.logical_or(*self.shown)
-        known = lit & np.logical_or.reduce([plane != 0 for layer in layers for plane in np.moveaxis(layer, -1, 0)])
+        known = np.zeros_like(lit)
+        for plane in (plane for layer in layers for plane in np.moveaxis(layer, -1, 0)):
+            known |= plane != 0
+        known &= lit
         rows, columns, kept = self._grid(spacing, known if known.any() else lit)
         if kept.any() and not kept.all():
             # As many patches as the kept part of the picture holds, so that an object of 1 % of it has enough.

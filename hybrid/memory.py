@@ -32,8 +32,8 @@ SHARE = 0.94
 # Temporary planes while rows of a window are filtered, while a network reads them, and while samples correct a finished
 # picture.
 FILTERING, GIVING, FINISHING = 40, 30, 38
-# Planes that exist while pairs of frames are compared before a run: 8.4 GiB at 7680×4320.
-VALIDATING = 65
+# Planes that exist while pairs of frames are compared before a run: 4.9 GiB at 7680×4320, while the second is read.
+VALIDATING = 38
 # Temporary planes while TV-L1 solves for a flow.
 REFINING = 38
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}

@@ -199,18 +199,23 @@ def _validate_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationR
     light: list[Patches] = []
     surfaces: list[Patches] = []
 
-    def add_surfaces(earlier: Frame, later: Frame, roles: Collection[str]) -> list[Patches]:
-        surfaces.extend(Patches(pair) for pair in _surface_pairs(earlier, later, roles, shot.step))
-        return surfaces
-
-    # Pairs of frames this large lie in files, as all are compared until no question is left.
+    # Pairs of frames this large lie in files, as all are compared until no question is left. Each check reads other
+    # layers: those of the one before are released.
     height, width = shot.shape
     keeper = Keeper(in_files=height * width > LARGE)
+
+    def add_surfaces(earlier: Frame, later: Frame, roles: Collection[str]) -> list[Patches]:
+        for pair in _surface_pairs(earlier, later, roles, shot.step):
+            surfaces.append(Patches(pair))
+            keeper.release()
+        return surfaces
+
     for a, b in pairs:
         earlier, later = keeper.keep(shot.read(a)), keeper.keep(shot.read(b))
-        checks.add(earlier, later)
+        checks.add(earlier, later, done=keeper.release)
         if (pair := _pair_of(earlier, later, earlier.color, later.color, shot.step)) is not None:
             light.append(Patches(pair))
+        keeper.release()
         report = checks.report(light, partial(add_surfaces, earlier, later))
         if not report.warnings and (report.motion is None or report.motion.certain):
             break  # no question is left
@@ -229,10 +234,8 @@ def _surface_pairs(earlier: Frame, later: Frame, roles: Collection[str], step: i
     """Guides of two frames as pictures of their surfaces."""
     for role in roles:
         here, there = getattr(earlier, role), getattr(later, role)
-        if here is not None and there is not None:
-            lift = np.float32(role == "normal")  # so that no value is negative
-            if (pair := _pair_of(earlier, later, here + lift, there + lift, step)) is not None:
-                yield pair
+        if here is not None and there is not None and (pair := _pair_of(earlier, later, here, there, step)) is not None:
+            yield replace(pair, lift=float(role == "normal"))
 
 
 def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
@@ -262,8 +265,8 @@ class _Checks:
         self.passes: list[Frame] = []
         self.pictures: list[tuple[Array, Array]] = []
 
-    def add(self, *frames: Frame) -> None:
-        """Check one frame, or two neighbours."""
+    def add(self, *frames: Frame, done: Callable[[], object] = lambda: None) -> None:
+        """Check one frame, or two neighbours; `done` is called when a layer has been read."""
         for frame in frames:
             thin = _thin(frame)
             if frame.aovs:
@@ -275,13 +278,16 @@ class _Checks:
                 self.pictures.append((frame.estimate, frame.color))
             if frame.variance is not None:
                 self.variances.append(_variance_ratios(frame.variance, frame.color))
+            done()
         if len(frames) == 2:
             shown = _edges_of([frame.color for frame in frames])
+            done()
             for role in ("albedo", "normal"):
                 guides = [getattr(frame, role) for frame in frames]
                 if all(guide is not None for guide in guides):
                     slopes = [_slope(_shrink(guide)) for guide in guides]
                     self.edges.setdefault(role, []).append(_match_edges(slopes, shown))
+                    done()
 
     def report(
         self, light: Sequence[Patches], surfaces: Callable[[Collection[str]], Sequence[Patches]]
@@ -388,12 +394,15 @@ def _thin(frame: Frame) -> Frame:
 def _shrink(layer: Array) -> Array:
     """A layer (H, W, C) reduced by a whole factor to about `EDGE_ROWS` rows; non-finite values count as 0."""
     factor = max(1, min(layer.shape[:2]) // EDGE_ROWS)
-    clean = np.where(np.isfinite(layer), layer, np.float32(0))
-    if factor == 1:
-        return np.asarray(clean, np.float32)
-    size = layer.shape[1] // factor, layer.shape[0] // factor
-    cut = clean[: size[1] * factor, : size[0] * factor]
-    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.float32)
+    width, height = layer.shape[1] // factor, layer.shape[0] // factor
+    small = np.empty((height, width, layer.shape[2]), np.float32)
+    for top in range(0, height, THIN):  # in strips: frames are large
+        rows = layer[top * factor : min(top + THIN, height) * factor, : width * factor]
+        clean = np.where(np.isfinite(rows), rows, np.float32(0))
+        size = width, len(rows) // factor
+        reduced = clean if factor == 1 else cv2.resize(clean, size, interpolation=cv2.INTER_AREA)
+        small[top : top + THIN] = reduced.reshape(-1, width, layer.shape[2])
+    return small
 
 
 def _edges_of(colors: Sequence[Array]) -> list[Array]:

@@ -116,5 +116,7 @@ def decode_frame(
 
 def _limited(layer: np.ndarray, largest: float) -> np.ndarray:
     """Set values beyond ±`largest` to NaN: they are as lost as those that are not finite."""
+    if -largest <= layer.min() and layer.max() <= largest:  # not so where a value is NaN
+        return layer
     beyond = (layer > largest) | (layer < -largest)
     return np.where(beyond, np.float32(np.nan), layer) if beyond.any() else layer

@@ -16,6 +16,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import Shot, open_shot
+from hybrid.runtime.kept import Keeper
 from hybrid.stream import plan_shot
 from hybrid.validation import (
     _check_alpha,
@@ -310,7 +311,12 @@ def test_pairs_of_large_frames_lie_in_files_and_are_judged_alike(tmp_path, monke
     expected = validate_layers(open_shot(wrong))
     monkeypatch.setattr("hybrid.validation.LARGE", 0)
     monkeypatch.setattr("hybrid.runtime.kept.SMALLEST", 1)
+    released: list[int] = []
+    release = Keeper.release
+    monkeypatch.setattr(Keeper, "release", lambda keeper: released.append(1) or release(keeper))
     found = validate_layers(open_shot(wrong))
+    # For each of two pairs: two frames kept, two checked, three edges, light, albedo and normal.
+    assert len(released) == 2 * 10
     assert found.findings == expected.findings
     assert found.motion == expected.motion
 
