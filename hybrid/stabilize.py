@@ -221,9 +221,7 @@ class FrameDenoiser:
         frame, excess, passing = stream.frame(number), None, None
         if "blend-samples" in plan.stages and frame is not None:
             with stream.timings.stage("blend-samples"):
-                excess = _excess(frame, color)
-                if samples:
-                    passing = _excess(frame, color, SampleMean(**samples))
+                excess, passing = _excess(frame, color, SampleMean(**samples) if samples else None)
         return WindowResult(
             Denoised(color, layers.named("aovs"), layers.named("extra"), parts),
             replace(plan, shares=shares),
@@ -271,8 +269,9 @@ class FrameDenoiser:
         Moving lights are as rendered, and their light belongs to no other pixel.
         """
         color, timings = denoised.color, self.stream.timings
-        exposure, sides = measure_exposure(color), result.neighbour_samples
-        shown = [frame.rendered] if sides is None else [frame.rendered, sides.mean]
+        exposure, sides, rendered = measure_exposure(color), result.neighbour_samples, frame.rendered
+        self.stream.keeper.release()  # the frame's own layers, of which this is made
+        shown = [rendered] if sides is None else [rendered, sides.mean]
         color = limit_lamps(color, shown, exposure)
         counted = frame.valid if moving is None else frame.valid & ~moving[0]
         if "restore-mean" in result.plan.stages:
@@ -280,18 +279,18 @@ class FrameDenoiser:
                 # What is wrong beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
                 far = counted & ~beside_lamps(color, exposure)
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
-                for noisy in (frame.radiance, *([frame.rendered] if frame.removed_samples else [])):
+                for noisy in (frame.radiance, rendered) if frame.removed_samples else (rendered,):
                     color = restore_mean(color, _where(far, noisy, color), exposure)
         if sides is not None:
             with timings.stage("blend-samples"):
-                noisy = _where(counted, frame.radiance, color)
+                noisy = _where(counted, frame.radiance if frame.removed_samples else rendered, color)
                 if not counted.all():
                     fresh = counted if moving is None else counted & ~moving[1]
                     sides = sides._replace(nearest=sides.nearest * fresh)
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
         color = limit_lamps(color, shown, exposure)
         if moving is not None:
-            color = _where(~moving[0], color, frame.rendered)
+            color = _where(~moving[0], color, rendered)
         return _changed(denoised, color, CORRECTED)
 
     def _moving_lights(self, frame: PreparedFrame) -> tuple[Mask, Mask] | None:
@@ -343,7 +342,7 @@ class FrameDenoiser:
         if there is None or flow is None:
             return None
         picture, shown = warp(self._results[beside].denoised.color, flow.vectors)
-        relative = _excess(there, picture).relative * shown
+        relative = _excess(there, picture)[0].relative * shown
         return Excess(relative, find_bright(relative))
 
     def _bands(self) -> list[slice]:
@@ -380,14 +379,19 @@ def _needed(result: WindowResult, whole: bool) -> WindowResult:
     return result if whole else result.as_neighbour()
 
 
-def _excess(frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None) -> Excess:
-    """By how much a frame as rendered exceeds its picture, or its neighbours' samples where these are darker."""
-    shown = channel_mean(picture)
+def _excess(frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None) -> tuple[Excess, Excess | None]:
+    """By how much a frame as rendered exceeds its picture, and also its neighbours' samples where these are darker."""
+    shown, rendered = channel_mean(picture), channel_mean(frame.rendered)
     light = shown + np.float32(measure_exposure(picture))
-    if neighbours is not None:
-        shown = np.where(neighbours.trust < 1, shown, np.minimum(shown, channel_mean(neighbours.mean)))
-    relative = np.asarray((channel_mean(frame.rendered) - shown) / light * frame.valid, np.float32)
-    return Excess(relative, find_bright(relative))
+
+    def exceed(shown: Array) -> Excess:
+        relative = np.asarray((rendered - shown) / light * frame.valid, np.float32)
+        return Excess(relative, find_bright(relative))
+
+    if neighbours is None:
+        return exceed(shown), None
+    darker = np.where(neighbours.trust < 1, shown, np.minimum(shown, channel_mean(neighbours.mean)))
+    return exceed(shown), exceed(darker)
 
 
 def _where(counted: Mask, noisy: Array, picture: Array) -> Array:

@@ -21,7 +21,6 @@ from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure
 from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
 from hybrid.alignment.residual import Limited, measure_limited
-from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
 from hybrid.files.frame import Frame, Frames
@@ -285,7 +284,7 @@ class FrameStream:
         def measure(_: int) -> Limited | None:
             with self.timings.stage("plan"):
                 albedo = frame.albedo if frame.demodulated else None
-                return measure_limited(frame.irradiance, denoised, albedo, measure_exposure(frame.irradiance))
+                return measure_limited(frame.irradiance, denoised, albedo, frame.as_rendered.exposure)
 
         return self._cached("limited", (number,), measure)
 

@@ -93,9 +93,11 @@ def color_gates(
     # The running sums of a box filter round to a little below 0 where nothing differs.
     noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
     rates = [1 / np.square(np.float32(share) * noise + np.float32(floor)) for share in shares]
-    weights = [np.ones(estimates.shape[:3], np.float32) for _ in shares]
+    weights = [np.empty(estimates.shape[:3], np.float32) for _ in shares]
     for t, estimate in enumerate(estimates):
         if t == centre_index:
+            for weight in weights:
+                weight[t] = 1
             continue
         run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))

@@ -79,6 +79,8 @@ _SECOND, _FEW = 0.33, 0.28
 # changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
+# Rows whose second differences are made at a time.
+_STRIP = 64
 # Cells per deviation of a mean.
 _CELLS = 4
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
@@ -166,16 +168,19 @@ def blend_samples(
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     # Radiance per unit of relative error.
     light = gaussian_mean(channel_mean(picture), 2.0) + np.float32(_DARK * exposure)
-    rate = np.divide(1, light, out=np.zeros_like(light), where=light > 0)
-    (factor, near), sums = _relative_light(noisy, neighbours, rate), np.zeros((5, *light.shape), np.float32)
-    run_bands(_compare, len(light), picture, noisy, neighbours, factor, near, rate, sums)
+    rate, height = np.divide(1, light, out=np.zeros_like(light), where=light > 0), len(picture)
+    factor, near = _relative_light(noisy, neighbours, rate)
+    sums = tuple(np.zeros_like(light) for _ in range(5))
+    run_bands(_compare, height, picture, noisy, neighbours, factor, near, rate, sums)
     together, squares, products, temporal, nearest = sums
+    del light, near, sums  # frames are large
     # Where no bright sample is near, the noise is greater than it seems: by two deviations of its own estimate.
     scatter = np.sqrt(gaussian_mean(np.square(products), _SIGMA) / _PIXELS)
     noise = (gaussian_mean(products, _SIGMA) + np.float32(_SCATTER) * scatter) / _PIXELS
     blended = np.empty_like(picture)
     means = gaussian_mean(together, _SIGMA), gaussian_mean(squares, _SIGMA), noise
-    run_bands(_blend_shared, len(light), picture, neighbours, factor, means, blended)
+    run_bands(_blend_shared, height, picture, neighbours, factor, means, blended)
+    del together, squares, products, scatter, noise, means, factor
     around, nearest = gaussian_mean(temporal, _SIGMA), gaussian_mean(nearest, _SIGMA)
     temporal *= np.divide(np.minimum(nearest, around), around, out=np.ones_like(around), where=around > 0)
     spatial = spatial_variance(noisy, blended, rate)
@@ -188,11 +193,11 @@ def blend_samples(
             alone = np.minimum(alone, _GREATEST * greatest * (1 + greatest / _SMALL))
     else:
         alone = np.asarray(variance.sum(axis=-1) * np.square(rate), np.float32)
-    error = np.empty_like(light)
-    run_bands(_compare_blended, len(light), blended, noisy, neighbours.trust, rate, temporal, error, alone)
+    error = np.empty_like(rate)
+    run_bands(_compare_blended, height, blended, noisy, neighbours.trust, rate, temporal, error, alone)
     fourth = gaussian_mean(np.square(error), _SIGMA)
     certainty = gaussian_mean(error, _SIGMA), fourth, gaussian_mean(alone, _SIGMA)
-    run_bands(_blend_centre, len(light), noisy, certainty, spatial, neighbours.trust, blended)
+    run_bands(_blend_centre, height, noisy, certainty, spatial, neighbours.trust, blended)
     return blended
 
 
@@ -215,19 +220,27 @@ def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
     A renderer's pixel filter makes noise smooth, and these energies up to 150 times too small; the median over the
     frame of the same energies at pixels 6 apart, over these, is the factor.
     """
-    images, some = (noisy, noisy - picture), np.s_[::_APART, ::_APART]
-    near = np.minimum(*(gaussian_mean(_energy_of(image, rate), _SIGMA) for image in images))
-    far = np.minimum(*(gaussian_mean(_energy_of(image[some], rate[some]), 2.0) for image in images))
+    some, less = np.s_[::_APART, ::_APART], (None, picture)
+    near = np.minimum(*(gaussian_mean(_energy_of(noisy, rate, part), _SIGMA) for part in less))
+    few = noisy[some], np.ascontiguousarray(rate[some])
+    far = np.minimum(*(gaussian_mean(_energy_of(*few, part), 2.0) for part in (None, picture[some])))
     around = gaussian_mean(near[some], 2.0)
     factors = np.divide(far, around, out=np.zeros_like(far), where=around > 0)
     return near * np.float32(max(np.median(factors[factors > 0]), 1) if factors.any() else 1)
 
 
-def _energy_of(image: Floats, rate: Floats) -> Floats:
-    """Squares of second differences relative to the light, summed over channels: of white noise its variance."""
-    image, rate = np.ascontiguousarray(image), np.ascontiguousarray(rate)
+def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None) -> Floats:
+    """Squares of second differences relative to the light, summed over channels: of white noise its variance.
+
+    Of an image, or of its difference from a picture; in strips, which stay in the caches.
+    """
     energy = np.empty(rate.shape, np.float32)
-    run_bands(_energy, len(rate), second_differences(image), rate, energy)
+    for top in range(0, len(rate), _STRIP):
+        rows, bottom = slice(top, top + _STRIP), min(top + _STRIP, len(rate))
+        outer = slice(max(top - 1, 0), bottom + 1)
+        strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
+        found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
+        run_bands(_energy, bottom - top, found, rate[rows], energy[rows])
     return energy
 
 
@@ -246,9 +259,28 @@ def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> 
     lamp = (light > _LAMP * exposure) & np.isfinite(light)  # what is not finite is refused, and not mended
     if not lamp.any():
         return picture
-    brightest = cv2.dilate(np.maximum.reduce(samples), np.ones((5, 5), np.uint8))
-    held = np.minimum(picture, np.maximum(brightest, np.float32(_LAMP * exposure)))
-    return np.where(lamp[..., None], held, picture)
+    held = picture.copy()
+    shown = [np.ascontiguousarray(image, np.float32) for image in (samples[0], samples[-1])]
+    run_bands(_limit_lamps, len(held), lamp, *shown, np.float32(_LAMP * exposure), held)
+    return held
+
+
+@njit(cache=True, nogil=True)
+def _limit_lamps(
+    first: int, last: int, lamp: NDArray[np.bool_], samples: Floats, others: Floats, least: np.float32, held: Floats
+) -> None:
+    """Clamp a picture in place, where there are lamps, to the brightest of two samples within two pixels."""
+    height, width, channels = held.shape
+    for y in range(first, last):
+        for x in range(width):
+            if not lamp[y, x]:
+                continue
+            for c in range(channels):
+                brightest = least
+                for row in range(max(y - 2, 0), min(y + 3, height)):
+                    for column in range(max(x - 2, 0), min(x + 3, width)):
+                        brightest = max(brightest, max(samples[row, column, c], others[row, column, c]))
+                held[y, x, c] = min(held[y, x, c], brightest)
 
 
 def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
@@ -476,10 +508,11 @@ def _energy(first: int, last: int, residual: Floats, rate: Floats, energy: Float
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
     first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, near: Floats,
-    rate: Floats, sums: Floats,
+    rate: Floats, sums: tuple[Floats, ...],
 ) -> None:  # fmt: skip
     """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², two variances."""
     _, W, C = picture.shape
+    together, squares, products, temporal, nearest = sums
     for y in range(first, last):
         for x in range(W):
             if not neighbours.trust[y, x] > 0:
@@ -490,14 +523,14 @@ def _compare(
                 n_p = min(max(scale * (n - p), -_LIMIT), _LIMIT)
                 m_p = min(max(scale * (m - p), -_LIMIT), _LIMIT)
                 n_m = min(max(scale * (n - m), -_LIMIT), _LIMIT)
-                sums[0, y, x] += n_p * m_p
-                sums[1, y, x] += m_p * m_p
+                together[y, x] += n_p * m_p
+                squares[y, x] += m_p * m_p
                 product += n_m * m_p
                 n_m = scale * (n - neighbours.mean[y, x, c] * near[y, x])
                 n_m = min(max(n_m, -_LIMIT), _LIMIT)
-                sums[3, y, x] += n_m * n_m / (_LEFT * (1 + _WARPED / neighbours.frames[y, x]))
-            sums[4, y, x] = min(scale * neighbours.nearest[y, x] * scale, np.float32(3) * _LIMIT * _LIMIT)
-            sums[2, y, x] = product * product
+                temporal[y, x] += n_m * n_m / (_LEFT * (1 + _WARPED / neighbours.frames[y, x]))
+            nearest[y, x] = min(scale * neighbours.nearest[y, x] * scale, np.float32(3) * _LIMIT * _LIMIT)
+            products[y, x] = product * product
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
