@@ -55,6 +55,8 @@ class Frame:
         for name, array in self.aovs.items():
             if array.ndim != 3 or array.shape[:2] != size:
                 raise ValueError(f"aov {name!r} has shape {array.shape}, expected {(*size, 'C')}")
+        if (self.motion is None) != (self.motion_convention is None):
+            raise ValueError(f"motion_convention is {self.motion_convention!r}, expected one with motion only")
 
     def flows(self) -> Motion | None:
         """Return the motion in our own convention; None without motion."""

@@ -462,7 +462,7 @@ def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size
 
 
 def test_a_frame_of_8k_fits_6_gibibytes(tmp_path, monkeypatch):
-    """The comparison of pairs alone took 8.4 GiB. Measured: 5.2 GiB, of which the network takes 0.5."""
+    """The comparison of pairs alone took 8.4 GiB. The peak of such a run was 5.6 GiB."""
     shot = open_shot(Scene(frames=3).write(tmp_path))
     monkeypatch.setattr(type(shot), "shape", (4320, 7680))
     first_pass = PerFrame(lambda frame: frame.color)
