@@ -13,6 +13,8 @@ Mask = NDArray[np.bool_]
 
 # A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
+# Rows, about, whose median is taken: that of all of a large frame costs 20 ms and is the same to a hundredth.
+_ROWS = 256
 # Fewer bright pixels show no motion; a greater share of all pixels is noise.
 LEAST, _MOST = 20, 0.05
 # Search radius, pixels a frame, and side of the searched block.
@@ -36,7 +38,8 @@ def find_bright(excess: Floats) -> Mask:
 
     `excess` (H, W) is what the frame shows beyond its denoised picture, relative to the light.
     """
-    bulk = 1.4826 * float(np.median(np.abs(excess)))
+    rows = excess[:: max(len(excess) // _ROWS, 1)]
+    bulk = 1.4826 * float(np.median(np.abs(rows)))
     bright = excess > max(_ABOVE, _DEVIATIONS * bulk)
     count = np.count_nonzero(bright)
     return bright if LEAST <= count <= _MOST * bright.size else np.zeros_like(bright)
