@@ -13,7 +13,7 @@ Mask = NDArray[np.bool_]
 
 # A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
-# Rows, about, whose median is taken: that of all of a large frame costs 20 ms and is the same to a hundredth.
+# About so many rows are taken for the median: all rows of 1920×1080 pixels cost 20 ms.
 _ROWS = 256
 # Fewer bright pixels show no motion; a greater share of all pixels is noise.
 LEAST, _MOST = 20, 0.05

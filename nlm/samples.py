@@ -253,8 +253,11 @@ def beside_lamps(picture: Floats, exposure: float) -> NDArray[np.bool_]:
 def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> Floats:
     """Clamp light beyond four exposures (H, W, 3), in each channel, to the brightest of the samples within two pixels.
 
-    A denoiser makes up to three times the light of a lamp of 10,000 exposures, which no mean of few samples corrects.
+    `samples` are one or two images; ValueError for more. A denoiser makes up to three times the light of a lamp of
+    10,000 exposures, which no mean of few samples corrects.
     """
+    if not 1 <= len(samples) <= 2:
+        raise ValueError(f"samples: expected one or two images, got {len(samples)}")
     light = channel_mean(picture)
     lamp = (light > _LAMP * exposure) & np.isfinite(light)  # what is not finite is refused, and not mended
     if not lamp.any():

@@ -158,8 +158,8 @@ def align(
         pass_colors={name: tint[padded] for name, tint in centre.pass_colors.items()},
         neighbour_samples=sides,
         neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
-        # A copy: a view would keep the weights of all frames in memory.
         known_range=found,
+        # A copy: a view would keep the weights of all frames in memory.
         drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1].copy(),
         passes=centre.passes,
     )

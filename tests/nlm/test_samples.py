@@ -344,6 +344,8 @@ def test_a_lamp_is_no_brighter_than_its_samples(lamp: float) -> None:
     # Light below four exposures may be in the picture alone.
     assert held[0, 0].min() == pytest.approx(0.9)
     np.testing.assert_array_equal(limit_lamps(own, [other], 10 * lamp), own)
+    with pytest.raises(ValueError, match="one or two images, got 3"):
+        limit_lamps(own, [own, other, own], 0.3)
 
 
 def test_the_halo_of_a_lamp_is_told_from_the_room() -> None:
