@@ -5,8 +5,6 @@ and `DenoiseOptions` describes how; `denoise_arrays` denoises arrays without fil
 first used, so that ``import hybrid`` is quick.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

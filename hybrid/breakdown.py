@@ -1,7 +1,5 @@
 """Contribution of each frame of the window to a result: layers, statistics, and an image."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which preset of the network fits a time per frame: measured on a part of the shot, on this machine."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator

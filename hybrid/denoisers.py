@@ -1,7 +1,5 @@
 """The interface of every denoiser of aligned windows, and the denoisers that need no network."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol

@@ -1,7 +1,5 @@
 """Color grade of denoised pictures: factors that bring them to the level of their samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Frames of a window lie in memory, or in temporary files; the planes of alignment
 frame is read, prepared and finished as a whole: memory therefore has a lower bound, below which a run is refused.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection

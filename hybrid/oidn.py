@@ -3,8 +3,6 @@
 Needs the optional package ``pyoidn`` (extra ``compare``), imported at the first call.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Classification of AOVs: parts that add up to the beauty, light of their own, or layers without noise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

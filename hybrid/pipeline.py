@@ -1,7 +1,5 @@
 """Denoise the frames of a shot, and write each to its file."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -4,8 +4,6 @@ Each decision carries the measured figure, its threshold and the reason in words
 is decided here and nowhere else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Read the next frame of a shot in a thread while the current one is worked on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from concurrent.futures import Executor, Future

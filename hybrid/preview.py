@@ -1,7 +1,5 @@
 """Previews of noisy and denoised frames side by side: one frame, a movie, a contact sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

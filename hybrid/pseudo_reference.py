@@ -1,7 +1,5 @@
 """Classical denoisers of an aligned window; training targets are made by them too."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

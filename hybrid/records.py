@@ -4,8 +4,6 @@ A farm makes a shot in chunks, on many machines at once. Every run writes a file
 ``OUT/ravg/NAME.RANGE.json``, after every frame, so that nothing is overwritten and nothing is lost when a machine dies.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ Files are sometimes wrong about their content: a pass that was enabled and never
 guides of another frame. A layer that fails its check is left out, with one line that says so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

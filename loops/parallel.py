@@ -5,8 +5,6 @@ becomes a function of its own, which passes the whole compiler again. Here a pla
 run it on bands of rows.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait

@@ -1,7 +1,5 @@
 """Means over cells of pixels, and their values between the cells' centres."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

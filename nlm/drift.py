@@ -1,7 +1,5 @@
 """Lighting that drifts slowly: measured with samples that the compared estimates were made without."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numba import njit

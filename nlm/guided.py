@@ -1,7 +1,5 @@
 """Guided filter with any number of guide channels."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numba import njit

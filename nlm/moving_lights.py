@@ -1,7 +1,5 @@
 """Bright pixels that move together without motion vectors: snow, rain, sparks."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Joint non-local means over an aligned window, steered by variance and features."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

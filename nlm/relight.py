@@ -1,7 +1,5 @@
 """Neighbours in the light of the centre: the smooth difference in light is subtracted, detail is kept."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numba import njit

@@ -5,8 +5,6 @@
 that ``import ravg`` is quick.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

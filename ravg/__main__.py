@@ -1,7 +1,5 @@
 """Run the command: ``python -m ravg``, and the program ``ravg``."""
 
-from __future__ import annotations
-
 import sys
 
 from ravg import check_packages

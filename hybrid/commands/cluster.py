@@ -5,8 +5,6 @@ shared under the same paths. Dask gives the chunk of a worker that has died to a
 finished.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """`ravg denoise`."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """`ravg inspect`: which layer has which role, and which stages run."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Annotated, Any

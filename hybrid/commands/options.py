@@ -1,7 +1,5 @@
 """Options that several commands share. Importing this module loads neither numpy nor rich."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re

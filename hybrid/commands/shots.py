@@ -1,7 +1,5 @@
 """How commands open a shot, validate its layers, and report findings."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace

@@ -1,7 +1,5 @@
 """`ravg simulate`: render shots with Cycles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any

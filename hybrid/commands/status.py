@@ -1,7 +1,5 @@
 """`ravg status`: the frames that runs have finished, and that are left."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

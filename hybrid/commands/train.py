@@ -1,7 +1,5 @@
 """The commands that make training clips and train a network on them."""
 
-from __future__ import annotations
-
 import glob
 from functools import partial
 from pathlib import Path

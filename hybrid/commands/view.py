@@ -1,7 +1,5 @@
 """`ravg view`: a local page that plays frames, also while others are still being written."""
 
-from __future__ import annotations
-
 import os
 import sys
 import webbrowser

@@ -1,7 +1,5 @@
 """Whole frames of every method at playing speed: small WebP sheets inside the page, movies next to the page."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Chart of a measure against a cost, drawn by matplotlib: SVG for the page, PNG for papers."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -1,7 +1,5 @@
 """Comparison of denoisers: run every method on a shot and evaluate its frames against a reference."""
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence

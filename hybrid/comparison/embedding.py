@@ -1,7 +1,5 @@
 """Frames and maps as text inside the page: compact, without visible loss."""
 
-from __future__ import annotations
-
 import base64
 import math
 import zlib

@@ -1,7 +1,5 @@
 """Evaluation of the methods' frames against the reference: per frame, per pair of frames, and over time."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -7,8 +7,6 @@ Andersson et al. 2020, FLIP: A Difference Evaluator for Alternating Images, doi:
 2021, Visualizing Errors in Rendered High Dynamic Range Images, doi:10.2312/egs.20211015.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Error against samples per pixel: how many times its samples a rival needs to be as good."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

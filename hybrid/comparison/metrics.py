@@ -9,8 +9,6 @@ T(x) = e·x / (1 + e·x) for PSNR, SSIM and the temporal measures, on the radian
   comparison of other methods. A non-finite *reference* is the caller's mistake and raises ValueError.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 

@@ -4,8 +4,6 @@ The page is one file that holds all it shows and requests nothing; a content sec
 templates are in `hybrid.comparison.page`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Results of a comparison: methods, measures, best and ties, Pareto fronts, and JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Timed runs of methods over a shot, in turns, each in a process of its own for a peak memory of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool

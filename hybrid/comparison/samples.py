@@ -1,7 +1,5 @@
 """The worth of a denoiser in samples per pixel: error of the noisy render against its number of samples."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

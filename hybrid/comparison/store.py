@@ -3,8 +3,6 @@
 The frames of a long shot do not fit into the memory of the comparing process.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

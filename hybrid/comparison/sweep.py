@@ -1,7 +1,5 @@
 """Variants of methods for `ravg compare --sweep`: one setting varied at a time."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Frames from pixels: the layers of a file on the canvas of its shot, scaled and limited as their profile says."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple

@@ -7,8 +7,6 @@ Channels have *qualified* names: the name in the file, preceded in a multi-part 
 channel already starts with it, so that one scheme covers both kinds (``ViewLayer.Combined.R``).
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

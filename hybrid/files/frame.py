@@ -1,7 +1,5 @@
 """A frame: the arrays that were read for one number, and where frames come from."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

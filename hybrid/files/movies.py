@@ -1,7 +1,5 @@
 """Movies: MP4 by PyAV, animated WebP by Pillow."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterable, Iterator
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """PNG files, and the sRGB encoding of their pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

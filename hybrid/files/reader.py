@@ -1,7 +1,5 @@
 """Reading the files of a shot: each header and source once, and a few frames held in memory."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress

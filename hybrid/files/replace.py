@@ -3,8 +3,6 @@
 All that a command writes is checked by `check_outputs` at its start, and written by `replace_file`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import secrets

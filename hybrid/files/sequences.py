@@ -1,7 +1,5 @@
 """Numbered files: patterns such as ``shot.####.exr`` in the notation of any program, folders, and frame ranges."""
 
-from __future__ import annotations
-
 import glob
 import os
 import re

@@ -1,7 +1,5 @@
 """Sidecar sequences that hold one layer each: a file or a folder for each AOV, RenderMan's variance file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress

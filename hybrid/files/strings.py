@@ -5,8 +5,6 @@ which each byte that is not UTF-8 is a question mark; the bytes themselves are k
 Python keeps such names of files.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Iterator, Sequence

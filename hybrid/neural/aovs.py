@@ -1,7 +1,5 @@
 """Light passes and other AOVs of a window: filtered, and kept consistent with the denoised color."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

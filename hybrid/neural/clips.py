@@ -1,7 +1,5 @@
 """Training clips: aligned windows at several noise levels, from shots to files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run a kernel-predicting network of the paper on aligned windows, from noisy frames alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

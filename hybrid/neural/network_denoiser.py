@@ -1,7 +1,5 @@
 """Shared parts of running networks on aligned windows: device, precision, tiles, breakdown."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 On processors without bfloat16 they run in float32, in 0.7 (high) to 0.9 (fast) of the time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import cast

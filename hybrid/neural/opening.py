@@ -1,7 +1,5 @@
 """Open the denoiser that a file of weights belongs to."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hybrid.breakdown import Breakdown

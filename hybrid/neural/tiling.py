@@ -1,7 +1,5 @@
 """From arrays to tensors and back, and an image as tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

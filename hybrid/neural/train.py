@@ -1,7 +1,5 @@
 """Training on the clips of a folder."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Callable, Sequence

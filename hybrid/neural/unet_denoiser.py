@@ -1,7 +1,5 @@
 """Run the final stage on aligned windows: images from the frames' samples and first passes."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The script that the report of `ravg compare` and the page of `ravg view` share: a player of two pictures."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 

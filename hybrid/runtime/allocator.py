@@ -1,7 +1,5 @@
 """Memory allocator: whether freed memory is reused or returned to the system."""
 
-from __future__ import annotations
-
 import ctypes
 import sys
 

@@ -1,7 +1,5 @@
 """Ctrl-C that ends the process within a second, also during a long computation."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

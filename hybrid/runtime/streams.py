@@ -1,7 +1,5 @@
 """The standard streams of the process: descriptors 0, 1 and 2."""
 
-from __future__ import annotations
-
 import os
 
 

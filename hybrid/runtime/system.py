@@ -1,7 +1,5 @@
 """The differences between Linux, macOS and Windows: locks, open files, processes and their memory."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import platform

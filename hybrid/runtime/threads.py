@@ -3,8 +3,6 @@
 numba and torch (OpenMP), OpenCV and OIDN (TBB) each have a pool of their own.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

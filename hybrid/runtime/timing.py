@@ -1,7 +1,5 @@
 """Time and peak memory of each stage of a run."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ Blender keeps state between scenes and can crash, so each shot is rendered in a 
 first the plan (unless the job brings one), then one line per finished render.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -5,8 +5,6 @@ figure, threshold and reason, and `needed_bounces` measures with a few samples h
 `facts_of` needs Blender: the rules are functions of plain data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any

@@ -13,8 +13,6 @@ a camera of 1920×1080 pixels, of which the middle is rendered.
 Lengths are metres, z is up. Materials, outlines and whatever stands alone are in the files of ``shots``.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

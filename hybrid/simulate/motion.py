@@ -3,8 +3,6 @@
 Speeds are drawn in film pixels per frame, and turned into keys by measuring what the camera sees.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -3,8 +3,6 @@
 Lengths are metres, z is up. Brightness is only relative: the exposure of a shot is chosen when it is planned.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -3,8 +3,6 @@
 Nothing here imports Blender, so that the command's help works without it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -3,8 +3,6 @@
 Lengths are metres, z is up. Textures use object coordinates, so that they follow a moving object.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

@@ -6,8 +6,6 @@ material say its kind: `grain` (wood), `glow`, `glass`, `dark` and `light` (`two
 with a motion. Other keys are parameters of functions in `hybrid.simulate.scene_assets` and `hybrid.simulate.motion`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from importlib.resources import files
 from typing import Any

@@ -4,8 +4,6 @@ A random shot is a *set* (room, studio, outdoors, night, wall), objects in it, l
 of its film-size image. Lengths are metres, z is up. Brightness is left to `exposure`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A sequence of EXR files for the viewer: frames as they appear, and their layers as 8-bit images."""
 
-from __future__ import annotations
-
 import math
 import os
 import threading

@@ -5,8 +5,6 @@ in the browser can request an image. A request with a foreign ``Host`` is refuse
 path: a sequence is given by its position, a frame by its number, a layer by its name in the file's header.
 """
 
-from __future__ import annotations
-
 import json
 import secrets
 import socket

@@ -1,7 +1,5 @@
 """Blocks of the paper's networks: residual, Robust Average with a weight per pixel, temporal module."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import torch

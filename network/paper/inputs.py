@@ -1,7 +1,5 @@
 """Feature channels of the kernel-predicting networks, for training and for running."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

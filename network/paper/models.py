@@ -3,8 +3,6 @@
 All of their convolutions are shared over the frames; only Robust Average blocks, or a temporal module, connect these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise

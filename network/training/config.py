@@ -1,7 +1,5 @@
 """Settings of a training, with defaults and help texts for options of `ravg train`; importing this needs no torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

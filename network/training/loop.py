@@ -7,8 +7,6 @@ Set ``OMP_WAIT_POLICY=PASSIVE`` in the environment (it is read when torch is imp
 otherwise spin while they wait, and a step takes ten times as long on a machine that has other work.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

@@ -8,8 +8,6 @@ as well, where the noise is strong. `relmse` with a limit on outliers stays betw
 light beyond the limit.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import Protocol
 

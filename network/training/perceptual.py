@@ -1,7 +1,5 @@
 """The paper's perceptual loss: distances in the latent space of VGG19, times SMAPE."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Jinja2 fills the templates and escapes names. Style sheet and scripts are put into the page, which is one file.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
