@@ -9,7 +9,8 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from hybrid.commands.log import LOG, RENAMED, end_log, logged, one_line, start_log, tolerant_streams
+from hybrid.commands.log import LOG, RENAMED, end_log, one_line, start_log, tolerant_streams
+from hybrid.option_texts import TEXTS
 from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
 from hybrid.runtime.system import expand_home
 from hybrid.runtime.threads import check_thread_counts, prepare_libraries
@@ -23,34 +24,7 @@ class Entry(NamedTuple):
     summary: str
 
 
-COMMANDS = {
-    "inspect": Entry(
-        "inspect:inspect",
-        "Frames",
-        "Check a shot before denoising: its layers, motion vectors, and the stages that it needs.",
-    ),
-    "denoise": Entry(
-        "denoise:denoise",
-        "Frames",
-        "Denoise the frames of a shot, and write each as an EXR file with all its other layers.",
-    ),
-    "view": Entry(
-        "view:view", "Frames", "Play denoised frames beside noisy ones in a browser, also while they are being made."
-    ),
-    "status": Entry("status:status", "Frames", "Show which frames are finished, running, missing and failed."),
-    "compare": Entry(
-        "compare:compare",
-        "Frames",
-        "Compare denoisers with a reference: accuracy, stability and time, as a table and a page.",
-    ),
-    "make-clips": Entry("train:make_clips", "Networks", "Make training clips of shots at several noise levels."),
-    "train": Entry("train:train", "Networks", "Train a network on clips."),
-    "simulate": Entry(
-        "simulate:simulate",
-        "Networks",
-        "Render shots with Cycles for training and comparison: several noise levels, and references.",
-    ),
-}
+COMMANDS = {name: Entry(**entry) for name, entry in TEXTS["commands"].items()}
 # Old name → new name, and options that stand for the old defaults; accepted for one release.
 OLD_COMMANDS = {"pseudoref": ("denoise", ["--preset=standard"]), "prepare": ("make-clips", [])}
 OLD_OPTIONS = {
@@ -105,7 +79,7 @@ class LazyCommand(TyperCommand):
         module, _, function = self._entry.function.partition(":")
         command = getattr(import_module(f"hybrid.commands.{module}"), function)
         single = typer.Typer(add_completion=False)
-        single.command(self.name, cls=Command)(logged(command))
+        single.command(self.name, cls=Command)(command)
         made: Any = typer.main.get_command(single)
         for parameter in made.params:
             if getattr(parameter, "is_flag", False):

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
@@ -28,6 +28,7 @@ from hybrid.files.sources import PACKAGES, versions
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, OIDN_MODES, SPECS, FirstPassSource, PerFrame, find_first_pass
 from hybrid.memory import MemoryPlan, parse_size, plan_memory
 from hybrid.oidn import find_device
+from hybrid.option_texts import option_texts
 from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames, sources_of, temporal_support
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
@@ -81,83 +82,24 @@ class DenoiseOptions:
         Of numba, OpenCV and torch in this process; None leaves them as they are.
     """
 
-    method: Annotated[
-        str,
-        "network: Robust Average network (needs torch); classical: non-local means, guided filter, or the average of "
-        "first passes; pooled: OIDN on the merged samples of each window (default: network, or that of --preset)",
-        {"metavar": "[network|classical|pooled]"},
-    ] = ""
-    preset: Annotated[
-        str,
-        "network: fast (default), balanced, quality, or auto (the best that fits --budget); classical: draft, "
-        "standard (default), final; pooled: pooled",
-        {"metavar": "NAME"},
-    ] = ""
-    budget: Annotated[
-        str | None,
-        "longest time per frame, such as 10s; takes the most accurate preset that fits",
-        {"metavar": "TIME"},
-    ] = None
-    weights: Annotated[Path | None, "weights file of ravg train, in place of a preset", {"metavar": "FILE"}] = None
-    threshold: Annotated[
-        float | None,
-        "for --weights that predict kernels: drop kernel taps below this share (default: as trained)",
-        {"metavar": "SHARE"},
-    ] = None
-    first_pass: Annotated[
-        str,
-        "denoised image per frame to start from: auto (layer of the file, else OIDN if installed, else bundled), "
-        "oidn, oidn-fast, oidn-clean, oidn-best, bundled (network that ships with ravg), nlm (classical), none, or "
-        "a finished sequence, OTHER.####.exr (default: auto; with --method classical: none, with pooled: oidn-fast)",
-        {"metavar": "SOURCE"},
-    ] = ""
-    keep_first_pass: Annotated[
-        str | None,
-        "keep OIDN's first pass in this sequence or folder, and read it from there if it is the same",
-        {"panel": "Output", "metavar": "OUT"},
-    ] = None
-    passes: Annotated[
-        int,
-        "runs over the shot; each denoises the result of the one before: steadier, and softer",
-        {"metavar": "N"},
-    ] = 1
-    breakdown: Annotated[
-        Path | None,
-        "write an image of how much each frame of the window contributes; adds these weights as layers",
-        {"panel": "Output", "metavar": "PNG"},
-    ] = None
-    aov_sum: Annotated[
-        Literal["layers", "beauty"],
-        "how sums are kept: layers: light passes are scaled to the beauty; beauty: it becomes their sum",
-    ] = "layers"
+    method: str = ""
+    preset: str = ""
+    budget: str | None = None
+    weights: Path | None = None
+    threshold: float | None = None
+    first_pass: str = ""
+    keep_first_pass: str | None = None
+    passes: int = 1
+    breakdown: Path | None = None
+    aov_sum: Literal["layers", "beauty"] = "layers"
     stages: Collection[str] = ()
     no_stages: Collection[str] = ()
-    tile: Annotated[
-        int | None,
-        "side of the network's tiles in pixels (default: 2048; 640 for kernels)",
-        {"panel": "Resources", "metavar": "N"},
-    ] = None
-    precision: Annotated[
-        Literal["auto", "float32", "bfloat16"],
-        "number format of the network; auto: bfloat16 on processors that have it, else float32",
-        {"panel": "Resources", "envvar": "RAVG_PRECISION"},
-    ] = "auto"
+    tile: int | None = None
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
     device: str = "auto"
-    resume: Annotated[
-        bool,
-        "skip frames that an earlier run with the same options has finished",
-        {"panel": "Output", "names": ("--resume",)},
-    ] = False
-    keep_going: Annotated[
-        bool,
-        "continue after a failed frame, and exit with 1 at the end (default: stop at the first failure)",
-        {"panel": "Output", "names": ("--keep-going",), "envvar": "RAVG_KEEP_GOING"},
-    ] = False
-    max_memory: Annotated[
-        str | None,
-        "most memory to use, such as 8G; uses temporary files and bands of rows, which is slower (default: no limit)",
-        {"panel": "Resources", "metavar": "SIZE", "envvar": "RAVG_MAX_MEMORY"},
-    ] = None
+    resume: bool = False
+    keep_going: bool = False
+    max_memory: str | None = None
     strict: bool = False
     reuse_freed_memory: bool = True
     threads: int | None = None
@@ -242,19 +184,18 @@ class DenoiseOptions:
 DEFAULTS = {entry.name: entry.default for entry in fields(DenoiseOptions)}
 
 
-def _described(options: type) -> str:
-    """Attributes of a docstring, from the help texts of fields: one text for the command and for Python."""
-    lines = []
-    for name, hint in get_type_hints(options, include_extras=True).items():
-        if texts := getattr(hint, "__metadata__", ()):
-            kind = hint.__origin__
-            chosen = ", ".join(map(repr, get_args(kind))) if get_origin(kind) is Literal else ""
-            lines += [f"    {name} : {chosen or getattr(kind, '__name__', kind)}", f"        {texts[0]}"]
+def _describe_others() -> str:
+    """Attributes of `DenoiseOptions` whose texts are those of the command's options, as its docstring has them."""
+    lines, texts = [], option_texts("denoise")
+    for name, hint in get_type_hints(DenoiseOptions).items():
+        if name in texts and f" {name} : " not in str(DenoiseOptions.__doc__):
+            chosen = ", ".join(map(repr, get_args(hint))) if get_origin(hint) is Literal else ""
+            lines += [f"    {name} : {chosen or getattr(hint, '__name__', hint)}", f"        {texts[name]['help']}"]
     return "\n".join([*lines, "    "])
 
 
 if DenoiseOptions.__doc__:  # none with python -OO
-    DenoiseOptions.__doc__ = DenoiseOptions.__doc__.rstrip() + "\n" + _described(DenoiseOptions)
+    DenoiseOptions.__doc__ = DenoiseOptions.__doc__.rstrip() + "\n" + _describe_others()
 
 
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:

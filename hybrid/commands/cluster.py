@@ -14,24 +14,14 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from uuid import uuid4
 
 import typer
 
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import of_resources
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
-SchedulerOption = Annotated[
-    str | None,
-    of_resources(
-        "Dask scheduler, such as tcp://host:8786, whose workers run the command over shared folders",
-        metavar="ADDRESS",
-        envvar="RAVG_SCHEDULER",
-    ),
-]
-ChunkOption = Annotated[int, of_resources("frames in a chunk of --scheduler", min=1, metavar="N")]
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
 # Seconds that a connection may take.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 from rich.console import Console
@@ -41,23 +41,13 @@ FRAMES = "frames"  # folder next to the page
 class _Report:
     """Options of what is written and printed."""
 
-    output: Annotated[
-        Path | None, "folder for a page with chart and pictures", {"names": ("-o", "--output"), "metavar": "REPORT"}
-    ] = None
-    clock: Annotated[Literal["wall", "cpu"], "time in chart.png and in the Markdown table"] = "wall"
-    markdown: Annotated[bool, "print the table as Markdown", {"names": ("--markdown",)}] = False
-    with_report: Annotated[
-        list[Path] | None,
-        "folder of a finished comparison of another shot, to include; may be repeated",
-        {"panel": "Input", "metavar": "REPORT"},
-    ] = None
-    fps: opt.RateOption = 24
-    movies: Annotated[
-        bool, "also write a movie of each method in full size, next to the page", {"names": ("--movies",)}
-    ] = False
-    keep_frames: Annotated[
-        bool, "also write the frames of each method as EXR, next to the page", {"names": ("--keep-frames",)}
-    ] = False
+    output: Path | None = None
+    clock: Literal["wall", "cpu"] = "wall"  # the time that is drawn and printed
+    markdown: bool = False
+    with_report: list[Path] | None = None
+    fps: float = 24
+    movies: bool = False
+    keep_frames: bool = False
 
     @property
     def cost(self) -> Cost:
@@ -116,51 +106,20 @@ class _Report:
                 Console().print("", ladder_table(rows))
 
 
-@opt.with_fields(opt.ReadOptions, _Report, title="Output")
+@opt.command("compare", opt.ReadOptions, _Report)
 def compare(
-    shot: Annotated[
-        str | None, typer.Argument(metavar="SHOT", help="shot.####.exr, shot.%04d.exr, a folder, or a file")
-    ] = None,
-    reference: Annotated[
-        list[str] | None,
-        opt.of_input(
-            "the same frames at many samples; given twice: two independent halves, whose noise cancels",
-            metavar="PATTERN",
-        ),
-    ] = None,
-    methods: Annotated[
-        str | None, opt.of_method("methods to run, with commas between (default: all)", metavar="NAMES")
-    ] = None,
-    external: Annotated[
-        list[str] | None, opt.of_input("finished frames of another denoiser; may be repeated", metavar="NAME=PATTERN")
-    ] = None,
-    external_seconds: Annotated[
-        list[str] | None,
-        opt.of_input("seconds per frame of an --external denoiser; may be repeated", metavar="NAME=SECONDS"),
-    ] = None,
-    sweep: Annotated[bool, opt.of_method("also vary stages and settings, one at a time", "--sweep")] = False,
-    rounds: Annotated[int, opt.of_method("runs of each method, in turns; the time is their median", min=1)] = 3,
-    samples: Annotated[
-        float | None,
-        opt.of_input(
-            "samples per pixel of SHOT, unless its files state them, as those of Cycles do", metavar="SPP", min=1
-        ),
-    ] = None,
-    level: Annotated[
-        list[str] | None,
-        opt.of_input(
-            "SHOT at other samples per pixel (SPP, unless its files state them), to measure how the noise falls; "
-            "may be repeated",
-            metavar="PATTERN[=SPP]",
-        ),
-    ] = None,
-    ladder: Annotated[
-        bool, opt.of_method("also run the methods on every --level: error against samples", "--ladder")
-    ] = False,
-    exposure: Annotated[float, opt.of_method("factor on radiance before the tone curve of the measures")] = 1.0,
-    name: Annotated[
-        str | None, opt.of_output("name of the shot in tables and on the page (default: its folder's name)")
-    ] = None,
+    shot: str | None = None,
+    reference: list[str] | None = None,
+    methods: str | None = None,
+    external: list[str] | None = None,
+    external_seconds: list[str] | None = None,
+    sweep: bool = False,
+    rounds: int = 3,
+    samples: float | None = None,
+    level: list[str] | None = None,
+    ladder: bool = False,
+    exposure: float = 1.0,
+    name: str | None = None,
     **how: Any,
 ) -> None:
     """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.

@@ -9,13 +9,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from hybrid.commands import options as opt
-from hybrid.commands.cluster import Chunk, ChunkOption, SchedulerOption, arguments_of, run_on_cluster
+from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
 from hybrid.commands.shots import (
     ShotInput,
@@ -68,21 +68,21 @@ class Request:
         return Paths({"profile": self.shot.profile}, writes)
 
 
-@opt.with_fields(opt.ReadOptions, DenoiseOptions, title="Method")
+@opt.command("denoise", opt.ReadOptions, DenoiseOptions)
 def denoise(
     context: typer.Context,
-    shot: opt.ShotArgument,
-    output: opt.OutputOption,
-    aov: opt.AovOption = None,
-    preview: opt.PreviewOption = None,
-    fps: opt.RateOption = 24,
-    contact_sheet: opt.SheetOption = None,
-    stages: opt.OnOption = None,
-    no_stages: opt.OffOption = None,
-    device: opt.DeviceOption = "auto",
-    max_pixels: opt.PixelsOption = None,
-    scheduler: SchedulerOption = None,
-    chunk: ChunkOption = 10,
+    shot: str,
+    output: Annotated[str, opt.check_output],
+    aov: list[str] | None = None,
+    preview: Path | None = None,
+    fps: float = 24,
+    contact_sheet: Path | None = None,
+    stages: list[str] | None = None,
+    no_stages: list[str] | None = None,
+    device: opt.Device = "auto",
+    max_pixels: int | None = None,
+    scheduler: str | None = None,
+    chunk: int = 10,
     **settings: Any,
 ) -> None:
     """Denoise the frames of a shot, and write each as an EXR file with all its other layers.

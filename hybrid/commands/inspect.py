@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -16,13 +16,13 @@ from hybrid.plan import STAGES, Decision, Plan, Rules
 from hybrid.stream import plan_shot
 
 
-@opt.with_fields(opt.ReadOptions, title="Input")
+@opt.command("inspect", opt.ReadOptions)
 def inspect(
-    shot: opt.ShotArgument,
-    stages: opt.OnOption = None,
-    no_stages: opt.OffOption = None,
-    as_json: Annotated[bool, opt.of_output("print one JSON object", "--json")] = False,
-    max_pixels: opt.PixelsOption = None,
+    shot: str,
+    stages: list[str] | None = None,
+    no_stages: list[str] | None = None,
+    as_json: bool = False,
+    max_pixels: int | None = None,
     **how: Any,
 ) -> None:
     """Check a shot before denoising: its layers, motion vectors, and the stages that it needs.

@@ -8,22 +8,16 @@ standard output.
 from __future__ import annotations
 
 import codecs
-import inspect
 import json
 import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
-
-from hybrid.commands.options import take, with_fields
 from hybrid.runtime.streams import open_standard_streams
 
 if TYPE_CHECKING:
@@ -38,45 +32,6 @@ LABEL_WIDTH = 12
 RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
-
-
-@dataclass(frozen=True)
-class LogOptions:
-    """Options of the log that every command has."""
-
-    log_format: Annotated[
-        LogFormat,
-        "text; json: an object per line; openjd: text that workers of Open Job Description read",
-        {"envvar": "RAVG_LOG_FORMAT"},
-    ] = "text"
-    log_file: Annotated[
-        Path | None, "also append messages to this file", {"envvar": "RAVG_LOG_FILE", "metavar": "FILE"}
-    ] = None
-    quiet: Annotated[bool, "only warnings and errors", {"names": ("-q", "--quiet")}] = False
-    verbose: Annotated[bool, "also details: layers, plan, cost of each stage", {"names": ("-v", "--verbose")}] = False
-
-
-def logged(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `LogOptions` to a command."""
-    signature = inspect.signature(command, eval_str=True)
-    has_context = "context" in signature.parameters
-
-    @with_fields(LogOptions, title="Logging")
-    @wraps(command)
-    def run(context: typer.Context, **arguments: Any) -> None:
-        options = LogOptions(**take(LogOptions, arguments))
-        if options.quiet and options.verbose:
-            raise typer.BadParameter("expected --quiet or --verbose, got both")
-        start_log(options.log_format, options.log_file, quiet=options.quiet, verbose=options.verbose)
-        for line in context.meta.get(RENAMED, ()):
-            LOG.warning(line)
-        command(**arguments, **({"context": context} if has_context else {}))
-
-    if not has_context:
-        added = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        signature = inspect.signature(run)
-        run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
-    return run
 
 
 def summarize(label: str, text: str) -> None:

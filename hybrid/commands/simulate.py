@@ -2,52 +2,36 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
+from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.options import of_input, of_method, of_output, of_resources, usage, with_fields
+from hybrid.commands.options import command, usage
 from hybrid.simulate.run import parse_center, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
 from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
 
 
-@with_fields(ShotSettings, title="Method")
+@command("simulate", ShotSettings)
 def simulate(
     context: typer.Context,
-    scene: Annotated[
-        str, typer.Argument(metavar="SCENE", help="a .blend file, random, hard, validation, test, or one as test:NAME")
-    ],
-    output: Annotated[Path, of_output("folder for the frames and meta.json", "-o", "--output", "--out", metavar="OUT")],
-    frames: Annotated[str, of_input("such as 1001-1010x2", "--frames", metavar="RANGE")] = "1-7",
-    size: Annotated[str, of_method("pixels of the rendered image", metavar="WxH")] = "320x180",
-    film: Annotated[
-        str | None, of_method("pixels of the whole camera, of which --size is a crop", metavar="WxH")
-    ] = None,
-    center: Annotated[
-        str | None, of_method("center of the crop in the film, as fractions, y down", metavar="X,Y")
-    ] = None,
-    spp: Annotated[str, of_method("samples per pixel, n; LOW-HIGH: drawn for each shot", metavar="N")] = "16",
-    levels: Annotated[str, of_method("noise levels, such as n,n/e,4 or noisy=n")] = "n,n/e,4",
-    reference_frames: Annotated[
-        str | None, of_method("frames with a reference, such as 1,4,7; default: all", metavar="NUMBERS")
-    ] = None,
-    seed: Annotated[int, of_input("seed of all random numbers")] = 1,
-    shots: Annotated[int, of_input("number of shots, with seeds that count up", min=1, metavar="N")] = 1,
-    jobs: Annotated[int, of_resources("Blender processes at a time", min=1, metavar="N")] = 1,
-    threads: Annotated[
-        int | None,
-        of_resources(
-            "threads of each process; default: the cores divided by --jobs", min=1, metavar="N", envvar="RAVG_THREADS"
-        ),
-    ] = None,
-    python: Annotated[
-        str | None,
-        of_resources("Python interpreter with bpy; default: this one", metavar="FILE", envvar="RAVG_BLENDER_PYTHON"),
-    ] = None,
-    scheduler: SchedulerOption = None,
+    scene: str,
+    output: Path,
+    frames: str = "1-7",
+    size: str = "320x180",
+    film: str | None = None,
+    center: str | None = None,
+    spp: str = "16",
+    levels: str = "n,n/e,4",
+    reference_frames: str | None = None,
+    seed: int = 1,
+    shots: int = 1,
+    jobs: int = 1,
+    threads: int | None = None,
+    python: str | None = None,
+    scheduler: str | None = None,
     **fields: Any,
 ) -> None:
     """Render shots with Cycles for training and comparison: several noise levels, and references.

@@ -3,21 +3,17 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from hybrid.commands import options as opt
 from hybrid.commands.log import duration, print_table, printable
-from hybrid.commands.options import FramesOption, of_output, usage
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
 from hybrid.records import Status, gather_status, is_running, sequence_name
 
 
-def status(
-    output: Annotated[str, typer.Argument(metavar="OUT", help="output of the runs: OUT.####.exr, or a folder")],
-    frames: FramesOption = None,
-    as_json: Annotated[bool, of_output("print one JSON object", "--json")] = False,
-) -> None:
+@opt.command("status")
+def status(output: str, frames: str | None = None, as_json: bool = False) -> None:
     """Show which frames are finished, running, missing and failed.
 
     Reads the records that runs write next to their frames. The exit code is 0 if all frames that were asked for are
@@ -35,7 +31,7 @@ def status(
             )
         pattern, _ = parse_pattern(output)
         folder, name = pattern.folder, sequence_name(pattern.path(1))
-    with usage():
+    with opt.usage():
         asked = None if frames is None else parse_frames(frames)
     found = gather_status(folder, name, asked)
     left = found.asked - found.finished

@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from hybrid.commands import options as opt
-from hybrid.commands.cluster import Chunk, SchedulerOption, arguments_of, run_on_cluster
+from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.files.replace import check_outputs
@@ -64,35 +64,20 @@ def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.Re
     return Levels(path.resolve().name, levels, counts)
 
 
-@opt.with_fields(opt.ReadOptions, title="Input")
+@opt.command("make-clips", opt.ReadOptions)
 def make_clips(
     context: typer.Context,
-    shots: Annotated[
-        list[str],
-        typer.Argument(metavar="SHOTS...", help="folders, each with LEVEL.####.exr at one or more noise levels"),
-    ],
-    output: Annotated[Path, opt.of_output("folder of training clips", "-o", "--output", metavar="CLIPS")],
-    levels: Annotated[
-        str | None,
-        opt.of_input("a=24,b=24,c=8: levels and their samples; default: all, with samples from Cycles' headers"),
-    ] = None,
-    tile: Annotated[int, opt.of_method("pixels on a side of a clip; 0: whole frames, to validate on", min=0)] = 128,
-    tiles: Annotated[int, opt.of_method("clips of each frame, placed by noise, detail and motion", min=1)] = 4,
-    window: Annotated[int, opt.of_method("frames of a window: 1, 3, 5 or 7")] = 5,
-    first_pass: Annotated[
-        str, opt.of_method("first pass, as for denoise; clips hold it", metavar="SOURCE", callback=opt.check_first_pass)
-    ] = "auto",
-    reference: Annotated[
-        bool, opt.of_input("target SHOT/reference.####.exr, and only frames that it has", "--reference")
-    ] = False,
-    target: Annotated[
-        str | None,
-        opt.of_input(
-            "level whose pseudo-references are the targets of the others; itself it is no input", metavar="LEVEL"
-        ),
-    ] = None,
-    seed: Annotated[int, opt.of_method("seed of the random positions of clips")] = 0,
-    scheduler: SchedulerOption = None,
+    shots: list[str],
+    output: Path,
+    levels: str | None = None,
+    tile: int = 128,
+    tiles: int = 4,
+    window: int = 5,
+    first_pass: Annotated[str, opt.check_first_pass] = "auto",
+    reference: bool = False,
+    target: str | None = None,
+    seed: int = 0,
+    scheduler: str | None = None,
     **how: Any,
 ) -> None:
     """Make training clips of shots at several noise levels.
@@ -181,28 +166,18 @@ def parse_samples(text: str) -> dict[str, float]:
     return samples
 
 
-@opt.with_fields(TrainConfig, SamplerConfig, title="Training")
+@opt.command("train", TrainConfig, SamplerConfig)
 def train(
-    clips: Annotated[Path, typer.Argument(help="folder of clips, from ravg make-clips")],
-    output: Annotated[Path, opt.of_output("weights to write", "-o", "--output", metavar="W.safetensors")],
-    preset: Annotated[
-        str, opt.of_method("network to train: fast, balanced, quality, unet, multiscale, paper or tkpcn")
-    ] = "fast",
-    init: Annotated[
-        str | None,
-        opt.of_input("initial weights: a file, a preset that ships, or oidn: the preset's, on OIDN's backbone"),
-    ] = None,
-    window: Annotated[
-        int | None, opt.of_method("frames of a window: 1, 3, 5 or 7, the middle ones of the clips'")
-    ] = None,
-    validation: Annotated[
-        list[str] | None,
-        opt.of_input("shots to validate on, which are not trained on; with commas between, or repeated"),
-    ] = None,
-    device: opt.DeviceOption = "auto",
-    threads: Annotated[int | None, opt.of_resources("threads of torch and numba (default: all cores)", min=1)] = None,
-    tensorboard: Annotated[Path | None, opt.of_output("write TensorBoard's logs there", metavar="FOLDER")] = None,
-    resume: Annotated[bool, opt.of_output("continue from W.safetensors.state, same options", "--resume")] = False,
+    clips: Path,
+    output: Path,
+    preset: str = "fast",
+    init: str | None = None,
+    window: int | None = None,
+    validation: list[str] | None = None,
+    device: opt.Device = "auto",
+    threads: int | None = None,
+    tensorboard: Path | None = None,
+    resume: bool = False,
     **settings: Any,
 ) -> None:
     """Train a network on clips.

@@ -3,28 +3,16 @@
 import os
 import sys
 import webbrowser
-from typing import Annotated
 
 import typer
 
-from hybrid.commands.options import RateOption, of_input, of_output, of_resources
+from hybrid.commands.options import command
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
 
 
-def view(
-    output: Annotated[str, typer.Argument(metavar="OUT", help="denoised frames: OUT.####.exr, or a folder")],
-    beside: Annotated[
-        list[str] | None,
-        of_input(
-            "frames to compare with, such as the noisy ones, or those of another denoiser; may be repeated",
-            metavar="SHOT",
-        ),
-    ] = None,
-    fps: RateOption = 24,
-    port: Annotated[int, of_resources("port of the page; 0: any free port", min=0, max=65535)] = 0,
-    browser: Annotated[bool, of_output("open the page in a browser, if there is a screen")] = True,
-) -> None:
+@command("view")
+def view(output: str, beside: list[str] | None = None, fps: float = 24, port: int = 0, browser: bool = True) -> None:
     """Play denoised frames beside noisy ones in a browser, also while they are being made.
 
     OUT may still be empty: frames appear as they are finished. The page is served to this machine alone and loads

@@ -7,7 +7,7 @@ import hashlib
 import math
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 RANDOM = ("random", "hard")  # shots drawn from the seed; the second kind holds what is hard to denoise
 # Fixed shots by kind: to validate with, and to test on.
@@ -23,8 +23,7 @@ class ShotSettings:
     """One shot: everything needed to render it again, given the scene.
 
     `size` is what is rendered, a crop around `center` of a camera of `film` pixels. `film`, `center` and `camera`
-    may be None: drawn from the seed for random shots, else the whole image of the scene's own camera. Texts beside
-    fields are the help of the options of `ravg simulate`.
+    may be None: drawn from the seed for random shots, else the whole image of the scene's own camera.
     """
 
     scene: str  # a .blend file, one of RANDOM, or "KIND:NAME", a fixed shot
@@ -32,20 +31,16 @@ class ShotSettings:
     frames: tuple[int, ...]
     size: tuple[int, int]
     levels: dict[str, int]  # name → samples per pixel
-    # For both halves together.
-    reference: Annotated[int, "samples per pixel of a reference; 0: none", {"metavar": "SPP"}] = 0
+    reference: int = 0  # samples per pixel of both halves together; 0: none
     reference_frames: tuple[int, ...] | None = None  # None: all
     film: tuple[int, int] | None = None
     center: tuple[float, float] | None = None  # fractions of the film, y down
-    camera: Annotated[str | None, "a camera of the file, or random", {"panel": "Input"}] = None
-    motion: Annotated[
-        Literal["auto", "keep", "add"], "auto: add motion to a file that has none", {"names": ("--animate",)}
-    ] = "auto"
-    # None: drawn, where motion is added.
-    moving_objects: Annotated[int | None, "number of moving objects in added motion", {"min": 0, "metavar": "N"}] = None
-    motion_blur: Annotated[bool, "render with motion blur", {"names": ("--motion-blur",)}] = False
-    halves: Annotated[bool, "add half buffers, for the variance", {"names": ("--halves",)}] = False
-    effects: Annotated[Literal["auto", "all"], "auto: the effects that the scene needs; all: every effect"] = "auto"
+    camera: str | None = None  # of the file, or "random"
+    motion: Literal["auto", "keep", "add"] = "auto"  # auto: added to a file that has none
+    moving_objects: int | None = None  # None: drawn, where motion is added
+    motion_blur: bool = False
+    halves: bool = False  # adds half buffers, for the variance
+    effects: Literal["auto", "all"] = "auto"  # auto: those that the scene needs
 
     def __post_init__(self) -> None:
         for name, spp in {**self.levels, "reference": self.reference}.items():

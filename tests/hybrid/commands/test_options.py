@@ -1,48 +1,55 @@
 """Options made of the fields of dataclasses: where they stand in the help, and where their values go."""
 
 from dataclasses import fields
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 import typer
 
 from hybrid.cli import COMMANDS, LazyCommand, main
 from hybrid.commands.compare import _Report
-from hybrid.commands.log import LogOptions
-from hybrid.commands.options import check_first_pass, split_number
+from hybrid.commands.options import LogOptions, check_first_pass, split_number
 from hybrid.job import DenoiseOptions
+from hybrid.option_texts import TEXTS, option_texts
 from hybrid.simulate.shot import ShotSettings
 from network.training.config import SamplerConfig, TrainConfig
 
 CONFIGS = {
-    "denoise": (DenoiseOptions, "Method"),
-    "simulate": (ShotSettings, "Method"),
-    "train": (TrainConfig, "Training"),
-    "compare": (_Report, "Output"),
-    "status": (LogOptions, "Logging"),
+    "denoise": (DenoiseOptions,),
+    "simulate": (ShotSettings,),
+    "train": (TrainConfig, SamplerConfig),
+    "compare": (_Report,),
+    "status": (LogOptions,),
 }
+# Fields whose values a command makes of options of another type.
+MADE = {"simulate": ("frames", "reference_frames", "size", "levels", "film", "center", "scene", "seed")}
 
 
 def described() -> list[Any]:
-    configs = [(name, *entry) for name, entry in CONFIGS.items()] + [("train", SamplerConfig, "Training")]
-    found = []
-    for name, config, title in configs:
-        hints = get_type_hints(config, include_extras=True)
-        for item in fields(config):
-            text, *rest = getattr(hints[item.name], "__metadata__", (None,))
-            if isinstance(text, str):
-                found.append(pytest.param(name, item, text, dict(*rest), title, id=f"{name} {item.name}"))
-    return found
+    return [
+        pytest.param(name, item, settings, id=f"{name} {item.name}")
+        for name, configs in CONFIGS.items()
+        for config in configs
+        for item in fields(config)
+        if (settings := option_texts(name).get(item.name)) and item.name not in MADE.get(name, ())
+        if item.name not in ("stages", "no_stages")  # collections in Python, repeated in a command
+    ]
 
 
-@pytest.mark.parametrize(("command", "item", "text", "settings", "title"), described())
-def test_a_field_is_an_option_with_its_help_names_panel_and_default(command, item, text, settings, title):
+@pytest.mark.parametrize(("command", "item", "settings"), described())
+def test_a_field_is_an_option_with_its_help_names_panel_and_default(command, item, settings):
     options = {p.name: p for p in LazyCommand(command, COMMANDS[command]).load().params}
     option = options[item.name]
-    assert (option.help, option.default) == (text, item.default)
-    assert option.rich_help_panel == settings.get("panel", title)
+    assert (option.help, option.default) == (settings["help"], item.default)
+    assert option.rich_help_panel == settings["panel"]
     assert {*option.opts} == {*settings.get("names", (f"--{item.name.replace('_', '-')}",))}
     assert option.envvar == settings.get("envvar")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_text_is_that_of_an_option(command):
+    names = {p.name for p in LazyCommand(command, COMMANDS[command]).load().params}
+    assert {name for entries in TEXTS.get(command, {}).values() for name in entries} <= names
 
 
 class AskedError(Exception):
