@@ -61,10 +61,7 @@ def refusal(path: Path, *, cycles: bool) -> str:
 
 
 def read_header(path: Path) -> tuple[set[str], set[str]]:
-    """Return the names of the attributes and of the channels of all parts of an OpenEXR file.
-
-    OSError if it cannot be opened; ValueError if it is no OpenEXR file, or ends within its header.
-    """
+    """Return the names of attributes and channels of an OpenEXR file; OSError or ValueError if it cannot be read."""
     attributes: set[str] = set()
     channels: set[str] = set()
     with path.open("rb") as file:

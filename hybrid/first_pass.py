@@ -257,10 +257,7 @@ class _KeptPictures:
         self._support = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
 
     def read_or_run(self, frame: Frame, *noisy_guides: bool, run: Callable[..., Array]) -> Array:
-        """Read the picture that an earlier run has kept, if it would be the same now; else make and keep it.
-
-        Raises ValueError if another file is there, which no run has kept as a first pass.
-        """
+        """Read a kept picture that would be the same now, else make and keep it; ValueError for another file there."""
         path, shot = self.places[frame.number], self._shot
         files = shot.reader.sources(shot.neighbours(frame.number, self._support))
         layers = shot.reader.layer_summary(frame.number)
@@ -308,10 +305,7 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
 
 
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
-    """Run OIDN, or what stands for it, on a frame with what guides it has: (H, W, 3) linear radiance.
-
-    Pixels that are not finite are replaced; `mode` as for `denoise_oidn`.
-    """
+    """Run OIDN, or what stands for it, on a frame made finite, with its guides: (H, W, 3) linear radiance."""
     clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
     albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
     return (denoise or denoise_oidn)(replace_nonfinite(frame.color)[0], albedo, normal, **mode)

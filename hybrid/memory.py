@@ -38,10 +38,7 @@ _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
 def parse_size(words: str) -> int:
-    """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``; units are powers of 1024.
-
-    Raises ValueError if it is no size, has no unit, is nothing, or more than there is anywhere.
-    """
+    """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``, in powers of 1024; ValueError if it is none, or absurd."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", words, re.IGNORECASE)
     size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
     if not 1 <= size < 2.0**63:

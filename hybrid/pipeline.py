@@ -254,10 +254,7 @@ def _others(number: int, numbers: Iterable[int]) -> str:
 
 
 def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) -> int:
-    """Count the frames on each side that one frame depends on.
-
-    The window's, two for the removal of fireflies, and one for the average of neighbouring results.
-    """
+    """Count the frames on each side that a frame depends on: of windows, two for fireflies, one to average results."""
     return REACH + ("stabilize" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
 
 

@@ -188,10 +188,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
 
 
 def merge(plans: Mapping[int, Plan]) -> Plan:
-    """Merge the plans of several frames into one, with the frames on which each stage runs.
-
-    Each stage has the decision whose figure lies farthest on the side that was decided for.
-    """
+    """Merge the plans of frames: each stage's most decisive decision, and the frames on which the stage runs."""
     merged = []
     for index, stage in enumerate(STAGES):
         decisions = {number: plan.decisions[index] for number, plan in plans.items()}

@@ -9,10 +9,7 @@ from hybrid.runtime.timing import Timings
 
 
 class Prefetcher:
-    """The frames of a shot, one of which is read ahead in the one thread of an executor; nothing else reads them.
-
-    Its CPU time counts as "read".
-    """
+    """The frames of a shot, one of them read ahead in the one thread of an executor, where time counts as "read"."""
 
     def __init__(self, shot: Frames, thread: Executor, timings: Timings) -> None:
         self.numbers, self.step = shot.numbers, shot.step

@@ -125,10 +125,7 @@ class Status:
 
 
 def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the records of a folder of frames, or of a sequence in it, with their files, oldest first.
-
-    Files that are no records are skipped.
-    """
+    """Yield the records in a folder of frames, or of a sequence there, with their files, oldest first."""
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
         paths = [path for path in paths if path.stem.rpartition(".")[0] == (name or NAMELESS)]
@@ -137,10 +134,7 @@ def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, 
 
 
 def gather_status(folder: Path, name: str | None = None, frames: Collection[int] | None = None) -> Status:
-    """Return the status of the runs that write into a folder; raise FileNotFoundError if it has no records.
-
-    With `frames` only of these, whether or not a run has been asked for them.
-    """
+    """Return the status of a folder's runs, of these frames or those asked for; FileNotFoundError without records."""
     status = Status()
     for _, document in read_records(folder, name):
         status.records.append(document)

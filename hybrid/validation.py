@@ -151,10 +151,7 @@ def find_repeat(a: int, b: int) -> Finding:
 
 
 def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str | None:
-    """Report whether the denoised picture (H, W, 3) of each frame of a shot shows the frame before or after; else None.
-
-    As many pairs of noisy frames are read as by `validate_layers`.
-    """
+    """Report if denoised pictures (H, W, 3) show the next or previous frame; reads pairs as `validate_layers`."""
     edges = []
     for pair in _pair_numbers(shot):
         with suppress(ValueError, OSError):  # a file that cannot be read is an error when it is denoised
@@ -166,10 +163,7 @@ def find_other_frame(shot: Shot, finished: Callable[[int], Array | None]) -> str
 
 
 def find_sequence_grade(shot: Shot, finished: Callable[[int], Array | None]) -> Grade | None:
-    """Compare the level of denoised pictures (H, W, 3) with that of a shot's samples; None if they agree.
-
-    The noisy frames are those that `validate_layers` may read.
-    """
+    """Compare the level of denoised pictures (H, W, 3) with that of a shot's samples; None if they agree."""
     numbers = sorted({number for pair in _pair_numbers(shot) for number in pair}) or [shot.available[0]]
     pictures = []
     for number in numbers:

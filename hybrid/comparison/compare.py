@@ -262,10 +262,7 @@ def _measured(
 
 
 def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
-    """Return the frames whose maps are stored: all, or the middle one of frames above `LARGE` pixels.
-
-    A map takes longer than denoising the frame.
-    """
+    """Return the frames whose maps, slower than denoising, are stored: all, or the middle of large ones (`LARGE`)."""
     return list(numbers) if pixels <= LARGE else [numbers[len(numbers) // 2]]
 
 

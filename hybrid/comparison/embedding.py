@@ -69,10 +69,7 @@ class Embedded:
 
 
 def embed_pictures(images: ShotImages) -> Embedded:
-    """Encode frames and maps of the reference and of all methods, which are alike in shape.
-
-    Above `LIMIT` bytes they are cropped around the largest differences, then frames are left out.
-    """
+    """Encode frames and maps of all sources; above `LIMIT` bytes cropped around the largest differences, then fewer."""
     middle = images.reference(images.middle)
     height, width = middle.shape[:2]
     level = measure_exposure(middle)

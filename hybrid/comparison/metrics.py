@@ -32,10 +32,7 @@ RESAMPLES = 2000
 
 
 def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
-    """Map linear radiance to [0, 1) by the curve T(x) = e·x / (1 + e·x).
-
-    Negative values count as 0: the curve has a pole at −1/e.
-    """
+    """Map linear radiance to [0, 1) by T(x) = e·x / (1 + e·x); negative values, near its pole at −1/e, count as 0."""
     scaled = np.maximum(np.asarray(x, np.float64) * exposure, 0.0)
     with np.errstate(invalid="ignore"):  # inf / inf gives NaN, as intended for non-finite pixels
         return scaled / (1.0 + scaled)

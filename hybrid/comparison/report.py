@@ -69,10 +69,7 @@ class Report:
 
 
 def write_report(folder: Path | str, report: Report) -> Path:
-    """Write `FILES` into a folder, ``ladder.png`` where there is a ladder; return the path of the page.
-
-    Results have different names, images those of results.
-    """
+    """Write `FILES` into a folder (``ladder.png`` with a ladder alone), named as results; return the page's path."""
     folder, results = Path(folder), report.comparison.results
     check_report(folder)
     folder.mkdir(parents=True, exist_ok=True)

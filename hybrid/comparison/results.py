@@ -175,10 +175,7 @@ def leading_pair(results: Sequence[MethodResult], metric: Metric) -> tuple[str, 
 
 
 def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) -> list[str]:
-    """Name the methods that no other method beats at the same cost or less, by rising cost.
-
-    Methods of unknown cost or with a mean that is not finite are excluded.
-    """
+    """Name the methods of known cost and finite mean that no other beats at the same cost or less, by rising cost."""
     points = [
         (spent, -_goodness(r.metrics[metric.key].mean, metric), r.name)
         for r in results

@@ -47,10 +47,7 @@ class Seconds:
 
 
 def run_in_process(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a module-level function in a fresh process; BrokenProcessPool if the process dies.
-
-    The process is not forked from this one, whose peak memory Linux would count as its own.
-    """
+    """Call a module-level function in a fresh process with a peak memory of its own; BrokenProcessPool if it dies."""
     let_waiting_threads_sleep()  # libraries read the setting when the new process first uses them
     with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=reuse_freed_memory) as pool:
         return pool.submit(function, *args, **kwargs).result()

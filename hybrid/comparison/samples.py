@@ -67,10 +67,7 @@ def reference_floor(error: float, samples: float, reference_samples: float) -> f
 
 
 def fit_floor(levels: Sequence[tuple[float, float]]) -> float:
-    """Fit the constant b ≥ 0 that a reference adds to the errors a/n + b of two or more (n, error).
-
-    Relative residuals are minimized, so that the noisiest level does not dominate.
-    """
+    """Fit the constant b ≥ 0 of the reference in two or more errors a/n + b, (n, error), by relative residuals."""
     n, e = np.transpose(np.asarray(levels, np.float64))
     matrix = np.stack([1 / n, np.ones_like(n)], axis=1) / e[:, None]
     _, b = np.linalg.lstsq(matrix, np.ones_like(n), rcond=None)[0]

@@ -24,10 +24,7 @@ THREADS = tuple(n for n in (1, 2, 4, 8, 16) if n <= (os.cpu_count() or 1))
 
 
 def sweep_methods(plan: Plan) -> dict[str, Method]:
-    """Return the variants for a shot with this plan, by a name that states the varied setting.
-
-    Each stage is switched to the opposite of the plan; the presets are among `METHODS` already.
-    """
+    """Return variants by a name that states the varied setting; each stage is switched to the opposite of the plan."""
     return dict([*_stages(plan), *_filters(), *_networks(), *_threads()])
 
 

@@ -120,10 +120,7 @@ def result_table(results: Sequence[MethodResult]) -> Table:
 
 
 def ladder_rows(ladder: Ladder) -> list[list[str]]:
-    """Return head and rows of a table: how many times its samples `RIVAL` needs to be as good as each method.
-
-    A row for each method and measure, a column for each number of samples per pixel; empty without a rival.
-    """
+    """Return head and rows by method and measure: how many times its samples `RIVAL` needs; [] without it."""
     tables = {metric.label: factors(ladder[metric.key]) for metric in METRICS if metric.key in ladder}
     names = dict.fromkeys(name for table in tables.values() for name in table)
     counts = sorted({n for table in tables.values() for found in table.values() for n in found})

@@ -518,10 +518,7 @@ _SHARED = (
 
 
 def _writable(header: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes without the channel list, which the binding makes from the channels, and without empty lists.
-
-    The binding refuses an empty list, as it does not know the type of its items.
-    """
+    """The attributes without the channel list, which the binding makes, and empty lists, whose type it cannot know."""
     return {k: v for k, v in header.items() if k != "channels" and not (isinstance(v, list) and not v)}
 
 

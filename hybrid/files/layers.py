@@ -210,10 +210,7 @@ def _find_denoised(image: ExrImage, color: Layer) -> Layer | None:
 
 
 def fit_sidecar(image: ExrImage, role: str, name: str | None, profile: Profile) -> Layer:
-    """Find the layer of a file that holds one role alone: by `name`, by the role's names, or by its channels.
-
-    Raises ExrError if there is none, or several fit.
-    """
+    """Find a file's layer of one role by `name`, the role's names, or its channels; ExrError if not one fits."""
     layers = list(image.layers) if name is None else [image.layer(name)]
     fitting = {layer: fitted for layer in layers if (fitted := _fit_file(image, role, layer))}
     named = [fitted for layer, fitted in fitting.items() if set(profile.names(role)) & {*_tails(image, layer)} - {""}]
@@ -427,10 +424,7 @@ def _as_gray(layer: Layer) -> Layer | None:
 
 
 def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | None:
-    """The layer with only the channels of the role; None if it lacks them.
-
-    A layer that is `named` for the role may have a single channel of any name.
-    """
+    """The layer with the role's channels alone, if `named` also with one of any name; None if it lacks them."""
     by_component: dict[str, str] = {}
     twice = {component_of(c) for c in layer.channels if by_component.setdefault(component_of(c), c) != c}
     for components in ROLE_FACTS[role]["components"]:

@@ -287,10 +287,7 @@ def format_frames(numbers: Iterable[int] | Mapping[int, Path]) -> str:
 
 
 def name_holes(numbers: Iterable[int], step: int) -> str:
-    """Name the frames missing between existing ones, `step` apart; "" if none is missing.
-
-    Only the ends of holes are computed: between two files that are numbered by dates lie millions.
-    """
+    """Name the ranges missing between frames, `step` apart; by their ends, as numbers that are dates leave millions."""
     holes = [range(a + step, b, step) for a, b in pairwise(sorted(numbers)) if b - a > step]
     names = [f"{h[0]}-{h[-1]}{f'x{step}' if step > 1 else ''}" if len(h) > 1 else f"{h[0]}" for h in holes]
     return ",".join(names[:8]) + (f" and {len(names) - 8} more ranges" if len(names) > 8 else "")

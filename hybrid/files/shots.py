@@ -229,10 +229,7 @@ class Shot:
         return write_exr(path, source, replaced, added, attributes)
 
     def recompressed_parts(self, others: Iterable[Shot] = ()) -> list[str]:
-        """Name each part of the first file that `write` stores with ZIP, to keep its layers to the bit.
-
-        `others` are the other `views` of the same files that are written.
-        """
+        """Name the parts of the first file that `write`, with `others`, stores with ZIP to keep their layers."""
         first = self.numbers[0]
         image, views = self.header(first), [shot.layers(first) for shot in (self, *others)]
         replaced = [c for found in views for layer in (found.target, *found.aovs.values()) for c in layer.channels]

@@ -44,10 +44,7 @@ def names_sequence(value: str) -> bool:
 
 
 def open_sidecar(role: str, value: str) -> SidecarSequence:
-    """Find the sequence that the user names for a role; FileNotFoundError if there is none.
-
-    The name is ``path/alb.####.exr`` or ``path/alb.####.exr:layer``.
-    """
+    """Find a role's sequence, ``path/alb.####.exr`` or ``path/alb.####.exr:layer``; FileNotFoundError if missing."""
     match = re.fullmatch(r"(.*\.exr):(.+)", value, re.IGNORECASE)
     spec, layer = (match[1], match[2]) if match else (value, None)
     return SidecarSequence(role, value, find_files(spec)[0], layer)

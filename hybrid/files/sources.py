@@ -97,10 +97,7 @@ def identify(path: Path) -> Source:
 
 
 def describe_sources(files: Mapping[str, Source], **facts: object) -> str:
-    """Return JSON for `MADE_FROM`, of files by their use and of all else that the pixels depend on.
-
-    The same for the same files and facts, to the byte.
-    """
+    """Return JSON for `MADE_FROM`, of files by use and other facts that pixels depend on; alike to the byte."""
     listed = {use: [s.name, s.size, s.modified, s.hash] for use, s in files.items()}
     return json.dumps({**facts, "files": listed}, sort_keys=True)
 

@@ -18,10 +18,7 @@ _HEADERS = 2**24
 
 
 def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
-    """Yield part, name and byte range of each string attribute in a file or its beginning.
-
-    The search ends where the data is truncated or malformed.
-    """
+    """Yield part, name and byte range of each string attribute up to where the data is truncated or malformed."""
     several = bool(int.from_bytes(data[4:8], "little") & _MULTI_PART)
     part, at = 0, 8
     while at < len(data):

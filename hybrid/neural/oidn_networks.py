@@ -31,10 +31,7 @@ TILE = 2048
 
 
 def torch_backend(device: str, *, exact: bool) -> Callable[..., Array] | None:
-    """Function that replaces OIDN for the first pass, or None where OIDN itself has to run.
-
-    That is on GPUs, and where float32 (`exact`) was asked for: then first passes are OIDN's own.
-    """
+    """Function that replaces OIDN for the first pass; None where OIDN has to run: on GPUs, and in float32 (`exact`)."""
     return denoise_unet if device == "cpu" and not exact and has_oidn_networks() else None
 
 
@@ -66,10 +63,7 @@ def denoise_unet(
 
 
 def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced") -> dict[str, Array]:
-    """Denoise "albedo" and "normal", each by itself, with OIDN's networks, at "high" quality the large ones.
-
-    Raises as `denoise_unet`.
-    """
+    """Denoise "albedo" and "normal", each by itself, with OIDN's networks, at "high" quality the large ones."""
     size = "_large" if quality == "high" else ""
     filters: dict[str, tuple[str, Callable[..., Tensor]]] = {
         "albedo": ("rt_alb", denoise_albedo),

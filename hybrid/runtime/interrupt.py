@@ -21,10 +21,7 @@ STOP_WITH_STDIN = "RAVG_STOP_WITH_STDIN"
 
 
 def stop_with_stdin() -> None:
-    """Treat the end of standard input as Ctrl-C if `STOP_WITH_STDIN` is 1.
-
-    Child processes inherit neither the variable nor the standard input.
-    """
+    """Treat the end of standard input as Ctrl-C if `STOP_WITH_STDIN` is 1; child processes inherit neither."""
     if os.environ.pop(STOP_WITH_STDIN, "") != "1":
         return
     # Windows blocks queries of a pipe while a thread reads from it; a child that inherits the pipe would query it.

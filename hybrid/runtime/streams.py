@@ -4,10 +4,7 @@ import os
 
 
 def open_standard_streams() -> None:
-    """Open the null device on each closed standard descriptor, as after ``2>&-``.
-
-    Otherwise the next opened file would get that number, and libraries would print into it.
-    """
+    """Open the null device on closed standard descriptors, or libraries would print into the next opened file."""
     for number in range(3):
         try:
             os.fstat(number)

@@ -163,10 +163,7 @@ def expand_home(words: Sequence[str]) -> list[str]:
 
 
 def same_file(one: os.stat_result, other: os.stat_result) -> bool:
-    """Return whether two statuses are of one file.
-
-    Some network drives have no inodes: True. Others change them: size and time decide.
-    """
+    """Return whether two statuses are of one file; by size and time where inodes differ, True where there are none."""
     if not (one.st_ino and other.st_ino) or os.path.samestat(one, other):
         return True
     return (one.st_size, one.st_mtime_ns) == (other.st_size, other.st_mtime_ns)

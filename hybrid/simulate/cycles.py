@@ -123,10 +123,7 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
 
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
-    """Make the scene of a shot in Blender, ready to be planned; return its description.
-
-    `attempt` counts the random shots of one seed.
-    """
+    """Make the scene of a shot, ready to be planned; return its description. `attempt` counts shots of a seed."""
     if shot.scene in RANDOM:
         description = scenes.random_shot(shot, attempt)
     elif shot.scene.partition(":")[0] in FIXED:

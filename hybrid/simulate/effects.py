@@ -322,10 +322,7 @@ def _world_kind(world: Any) -> str:
 
 
 def visible_points(scene: Any, across: int = 12, down: int = 8) -> list[tuple[Any, Any]]:
-    """Return where a grid of camera rays over the rendered region first hits a surface, and the object hit.
-
-    The rays miss hair.
-    """
+    """Return where a grid of camera rays over the rendered region first hits a surface (no hair), and the object."""
     import bpy
 
     render, camera = scene.render, scene.camera
@@ -361,10 +358,7 @@ def film_pixel(scene: Any, position: Any) -> np.ndarray:
 
 
 def point_motion(scene: Any, frame: int) -> np.ndarray:
-    """Return how far visible points move until the next frame: (N,) pixels.
-
-    Points follow the transforms of their objects; deformation is ignored.
-    """
+    """Return how far visible points move, with objects but without deformation, to the next frame: (N,) pixels."""
     scene.frame_set(frame)
     points = visible_points(scene)
     local = [item.matrix_world.inverted_safe() @ position for position, item in points]

@@ -122,10 +122,7 @@ def camera_path(rng: Rng, kind: str) -> Callable[[float, float], Pose]:
 
 
 def move_camera(rng: Rng, shot: ShotSettings, kind: str, pixels: float) -> float:
-    """Key a camera path with a median motion of `pixels` per frame in the crop; return the median reached.
-
-    The speed is bounded, so where all that is visible is very near or far the motion may be lower.
-    """
+    """Key a camera path with a median motion of `pixels` a frame in the crop, if a bounded speed allows; return it."""
     scene = bpy.context.scene
     camera = scene.camera
     points = [position for position, _ in visible_points(scene)]
@@ -213,10 +210,7 @@ def add_bend(rng: Rng, item: Any) -> Any:
 
 
 def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None) -> dict[str, Any]:
-    """Key an object's motion (line, swing, turn, deform), a few pixels per frame, at most 40; return its description.
-
-    The kind is drawn, unless given.
-    """
+    """Key a motion (line, swing, turn, deform; else drawn) of at most 40 pixels a frame; return its description."""
     scene = bpy.context.scene
     pixels = log_uniform(rng, 1, 20) if rng.random() < 0.85 else log_uniform(rng, 10, 40)
     deform = 1.5 if item.type == "MESH" else 0

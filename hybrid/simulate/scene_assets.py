@@ -399,10 +399,7 @@ def new_world() -> Any:
 
 
 def sample_image_coarsely(world: Any) -> None:
-    """Importance-sample the world's image on 1024 columns.
-
-    Cycles builds the sampling map again for each render; at the image's own size that takes seconds.
-    """
+    """Sample the world's image by 1024 columns: Cycles rebuilds its map for each render, at full size in seconds."""
     world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 1024
 
 

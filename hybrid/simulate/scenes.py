@@ -320,10 +320,7 @@ def open_aperture(camera: Any, distances: list[float], blur: float) -> None:
 
 
 def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
-    """Add one of `HARD` to a scene with a camera; return the motion of the added objects.
-
-    The aperture of `lens` is opened by `random_shot`; here floating objects before and behind the focus are added.
-    """
+    """Add one of `HARD`, but the aperture of `lens`, to a scene with a camera; return added objects' motion."""
     if name == "dim":
         light_by_bulbs(rng)
         return []

@@ -31,10 +31,7 @@ LARGEST_SIDE = 65500  # pixels of a JPEG
 
 
 class Sequence:
-    """Frames of a pattern, a folder or one file; there may be none yet.
-
-    With `finished` the denoised layer is the first choice, also where the file keeps a noisy one.
-    """
+    """Frames, if any yet, of a pattern, folder or file; of `finished` ones the denoised layer is the first choice."""
 
     def __init__(self, spec: str, *, finished: bool) -> None:
         self.spec = spec

@@ -371,10 +371,7 @@ def open_clips(folder: str | os.PathLike[str], frames: int | None = None) -> Cli
 
 
 def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips]:
-    """Split clips into those for training and those of the validation shots.
-
-    Raises ValueError if a name is not among the shots, or no clip is left to train on.
-    """
+    """Split clips into training and validation; ValueError for an unknown shot, or if none is left to train on."""
     unknown = sorted(set(validation) - set(clips.shots))
     if unknown:
         raise ValueError(f"validation: expected shots among {clips.shots}, got {unknown}")
@@ -386,10 +383,7 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
 
 @dataclass(frozen=True)
 class _Variation:
-    """How a sample is varied: flips, transposition (with flips: quarter turns), and permutations of channels.
-
-    Normals may be in any fixed space, so none is turned with the image; their axes get a signed permutation.
-    """
+    """How a sample varies: flips, transposition, permuted channels; normals, of any space, get a signed permutation."""
 
     flips: tuple[int, ...]
     transpose: bool
@@ -535,10 +529,7 @@ def input_error(batch: Sample, loss: losses.ImageLoss) -> Tensor:
 
 
 def whole_frames(clips: Clips, index: int, multiple: int) -> list[Sample]:
-    """A clip at each of its levels, towards the cleanest target, as batches of one, unvaried.
-
-    Height and width are cropped, at the bottom and the right, to multiples of a number.
-    """
+    """A clip at each level, towards the cleanest target, as batches of one, cropped to multiples of a number."""
     batches = []
     for level, targets in enumerate(clips.pairs(index)):
         sample = clips.read(index, level, targets[0])
