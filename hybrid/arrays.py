@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.motion import MotionConvention
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.files.profile import parse_motion
 from hybrid.files.shots import Shot
 from hybrid.first_pass import SPECS
@@ -18,8 +17,6 @@ from hybrid.job import DEFAULTS, DenoiseOptions, choose_first_pass, open_denoise
 from hybrid.plan import Plan
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
-
-Array = NDArray[np.float32]
 
 # Layers of each frame, by index or number.
 Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]

@@ -4,15 +4,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.files.png import encode_srgb, fit, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import average, replace_nonfinite
-
-Array = NDArray[np.float32]
 
 PICTURE_SIDE = 480  # pixels of the longer side of a frame in the image, at most: up to seven are side by side
 

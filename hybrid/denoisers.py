@@ -4,16 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hybrid.alignment.window import AlignedWindow
 from hybrid.first_pass import Backends
 from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, pool_and_denoise
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import Denoised
-
-Array = NDArray[np.float32]
 
 
 class WindowDenoiser(Protocol):

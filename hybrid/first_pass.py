@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
 from hybrid.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
@@ -28,8 +27,6 @@ from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequence_grade
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Highlights, clamp_halos
-
-Array = NDArray[np.float32]
 
 # Frames on each side that tell whether a frame's guides hold noise.
 GUIDE_RADIUS = 1

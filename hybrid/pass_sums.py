@@ -3,15 +3,12 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.files.passes import BEAUTY, Passes, Sum
 from nlm.average import replace_nonfinite
 from nlm.parts import few_differ, find_sums, is_noisy, is_textured, share_outside, shares_noise
-
-Array = NDArray[np.float32]
 
 # Height of the bands of rows in which frames are sampled, and most rows of all bands together.
 _BAND, _ROWS = 27, 540

@@ -10,9 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hybrid.alignment.fireflies import REACH
 from hybrid.files.replace import remove_leftovers
 from hybrid.files.shots import Shot, output_path
@@ -24,9 +21,6 @@ from hybrid.runtime.timing import Timings
 from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
 from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import find_nonfinite
-
-Array = NDArray[np.float32]
-
 
 # In a header: the frames whose pictures were averaged with this one's.
 BESIDE = "ravg/beside"

@@ -3,18 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import compress, measure_gain
-from hybrid.alignment.window import AlignedWindow
+from hybrid.alignment.window import AlignedWindow, Array
 from hybrid.oidn import denoise_oidn
 from hybrid.runtime.timing import Timings
 from nlm.average import average, robust_average
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
 from nlm.pooling import pool_samples
-
-Array = NDArray[np.float32]
 
 # Weight of OIDN's result on the pooled samples against the average of first passes: errors of two images that are made
 # differently cancel in part. 0.12 dB over all of it, in the mean of thirteen shots.

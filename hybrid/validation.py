@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flow.convention import SCALES, Choice, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from flow.patches import FramePair, Patches
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from hybrid.files.profile import ROLE_FACTS, ROLES
@@ -27,7 +27,6 @@ from hybrid.grade import Grade, find_grade
 from hybrid.pass_sums import classify_passes, sample_rows
 from hybrid.runtime.kept import Keeper
 
-Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # Pairs that are read, spread over all files of the shot and not over the frames that were asked for: the result must

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.comparison.embedding import Embedded, MethodImages, ShotImages
+from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
 from hybrid.files.png import encode_bytes
 
-Array = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
 # Pixels of the longer side of an embedded frame, at most and at least, and of a WebP.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
+from hybrid.files.frame import Array
 
-Array = NDArray[np.float32]
 Codes = NDArray[np.int32]
 Box = tuple[int, int, int, int]  # x, y, width, height in pixels
 

@@ -28,10 +28,9 @@ from hybrid.comparison.metrics import (
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
-from hybrid.files.frame import Frame, Frames
+from hybrid.files.frame import Array, Frame, Frames
 from hybrid.plan import STILL
 
-Array = NDArray[np.float32]
 Measure = Callable[[Array, Reference, float], float]  # of image, reference, exposure
 Level = tuple[Frames, float]  # a render of the shot, and its samples per pixel
 

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.comparison.metrics import check_images
-
-Array = NDArray[np.float32]
+from hybrid.files.frame import Array
 
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180  # 0.7 m from a display 0.7 m and 3840 pixels wide
 # The curve of ACES, (k0 x² + k1 x + k2) / (k3 x² + k4 x + k5), after the 0.6 that it is usually given before.

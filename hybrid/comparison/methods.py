@@ -12,11 +12,10 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.tvl1 import refine_flow
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.frame import Frame, Frames, MappedShot
+from hybrid.files.frame import Array, Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
 from hybrid.first_pass import OIDN_MODE_OF_PRESET, Backends, denoise_frame_oidn, named_first_pass, read_denoised
 from hybrid.oidn import Quality
@@ -29,7 +28,6 @@ from nlm.average import average, replace_nonfinite, robust_average
 if TYPE_CHECKING:
     from hybrid.neural.network_denoiser import NetworkDenoiser
 
-Array = NDArray[np.float32]
 Run = Callable[[Frames], Iterator[tuple[int, Array]]]
 Maps = Callable[[Frames, Sequence[int]], Iterator[tuple[int, dict[str, Array]]]]
 WindowFilter = Callable[[AlignedWindow], Array]  # to (H, W, 3) radiance

@@ -11,9 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from hybrid.comparison import chart, page
 from hybrid.comparison.animations import embed_animations, write_movies
@@ -46,9 +44,8 @@ from hybrid.comparison.tables import (
     format_worth,
     ladder_rows,
 )
+from hybrid.files.frame import Array
 from hybrid.files.replace import check_outputs, write_file
-
-Array = NDArray[np.float32]
 
 RATES = (4, 12, 24, 25, 30, 60)  # frames per second that the page offers
 MOVIES = "movies"  # folder next to the page

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid.comparison.metrics import Reference
-
-Array = NDArray[np.float32]
+from hybrid.files.frame import Array
 
 REFERENCE = "reference"
 HALVES = ("half a", "half b")  # of a reference that is given in halves

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flow.motion import Motion, MotionConvention, normalize_motion
 from hybrid.files.passes import NO_PASSES, Passes
+
+Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from hybrid.alignment.prepare import ALPHA
 from hybrid.alignment.transfer import compress
 from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.files.passes import BEAUTY
 from nlm.average import average
 from nlm.parts import add_light, filter_layers, split_light
-
-Array = NDArray[np.float32]
 
 
 class SharedLight(NamedTuple):

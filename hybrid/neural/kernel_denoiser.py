@@ -2,17 +2,15 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.neural.aovs import share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
 from hybrid.neural.tiling import Block, pad, tensor_of
 from hybrid.stabilize import Denoised
 from network.paper.inputs import KernelWindow
 from network.paper.models import KernelModel, filter_window, for_inference
-
-Array = NDArray[np.float32]
 
 # Bytes for each pixel of a tile in bfloat16; measured.
 SCRATCH = 2500

@@ -7,17 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.denoisers import WindowDenoiser
+from hybrid.files.frame import Array
 from hybrid.first_pass import Backends
 from hybrid.neural.oidn_networks import denoise_bundled, torch_backend
 from hybrid.neural.tiling import Block, image_of, tiles
 from hybrid.runtime.timing import Timings
-
-Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

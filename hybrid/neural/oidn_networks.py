@@ -9,10 +9,10 @@ from typing import cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hybrid.alignment.transfer import autoexposure
+from hybrid.files.frame import Array
 from hybrid.neural.tiling import image_of, tensor_of, tiles
 from hybrid.oidn import Quality
 from network.bfloat16 import round_unet
@@ -21,8 +21,6 @@ from network.devices import has_bfloat16
 from network.oidn_weights import load_oidn
 from network.robust_unet import RobustUNet
 from network.unet import OidnUNet, denoise_albedo, denoise_color, denoise_normal
-
-Array = NDArray[np.float32]
 
 # Pixels of context around a tile: nothing farther away changes an image, with any of the networks.
 HALO = 112

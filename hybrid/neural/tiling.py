@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from hybrid.files.frame import Array
+
 Block = tuple[slice, slice]
 
 

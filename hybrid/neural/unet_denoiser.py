@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.neural.aovs import filter_aovs, share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
 from hybrid.neural.oidn_networks import HALO, has_oidn_networks, prefilter_guides
@@ -17,8 +17,6 @@ from hybrid.stabilize import Denoised
 from network.robust_unet import MIRRORED, Borders, RobustUNet, denoise_window, for_inference
 from network.windows import UNetWindow
 from nlm.pooling import clamp_to_range
-
-Array = NDArray[np.float32]
 
 # Bytes for each pixel of a tile in bfloat16, by the size of the backbone; measured.
 SCRATCH = {"small": 100, "base": 100, "large": 500}
