@@ -16,8 +16,6 @@ files, takes the guides as they are (*high*) or filters them first (*best*), and
 memory is the operating system's count.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ Each checkout runs all configurations in one process, on shots written by this s
 BASE for the next call. The exit code is 1 if a channel, a header or an exit code differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

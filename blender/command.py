@@ -1,7 +1,5 @@
 """Find the command `ravg` and run it in a process of its own. Independent of Blender."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Put the denoised frames into a scene's compositor."""
 
-from __future__ import annotations
-
 import bpy
 
 from . import scenes

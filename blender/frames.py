@@ -1,7 +1,5 @@
 """Rendered frames on disk: ranges of numbers, and whether a file is a noisy render. Independent of Blender."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """A Python environment for ravg, made with Blender's Python and pip. Independent of Blender."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -3,8 +3,6 @@
 A timer follows the job, not a modal operator, which would block Blender's automatic saving.
 """
 
-from __future__ import annotations
-
 import textwrap
 import time
 from collections.abc import Callable
@@ -17,6 +15,7 @@ from . import command, frames, install, scenes, settings
 
 INTERVAL = 0.25  # seconds between two updates
 LOG = "ravg.log"  # the text block that holds ravg's output
+Report = Callable[[set[str], str], None]
 WIDTH = 160  # letters of an error: Blender shows one line, cut off at its window
 
 
@@ -195,7 +194,6 @@ class Install:
         return False
 
 
-Report = Callable[[set[str], str], None]
 current: Job | Install | None = None
 _version: command.Version | None = None
 

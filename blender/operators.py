@@ -1,7 +1,5 @@
 """The operators behind the panel's buttons."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

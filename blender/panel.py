@@ -1,7 +1,5 @@
 """The panel in Output properties."""
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A scene's noisy and denoised files, the passes that ravg needs, and settings that would spoil the result."""
 
-from __future__ import annotations
-
 import functools
 import json
 import os

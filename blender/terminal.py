@@ -1,7 +1,5 @@
 """The command line ``blender --background FILE --command ravg`` for render farms: exit codes, no tracebacks."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -12,8 +12,6 @@ The script reproduces the bundled shot, the shots of the report, those that the 
 with Blender's default settings. For new shots use `ravg simulate`.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

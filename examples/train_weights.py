@@ -9,8 +9,6 @@ An interrupted run continues at the same shot, and trainings continue from their
 docs/dev/experiments.md lists the gains.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

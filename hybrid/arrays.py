@@ -1,10 +1,8 @@
 """Denoise frames in memory, without files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Self, cast
 
 import numpy as np
 
@@ -36,7 +34,7 @@ class ArrayFrames:
         self._convention = None if motion is None else MotionConvention(**parse_motion(motion))
         self.shape = self.read(self.numbers[0]).color.shape[:2]
 
-    def with_neighbours(self, reach: int) -> ArrayFrames:
+    def with_neighbours(self, reach: int) -> Self:
         """The same frames: all of them are there."""
         return self
 

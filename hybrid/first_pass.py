@@ -4,8 +4,6 @@ A first pass comes from the file (Cycles keeps the ``Noisy Image`` beside the de
 from OIDN where it is installed, or from the classical chain.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable
@@ -164,7 +162,7 @@ def named_first_pass(
     *,
     classical: ClassicalPreset = FINAL,
     mode: str = "oidn-clean",
-    keep: Callable[[str, bool, str], _KeptPictures] | None = None,
+    keep: Callable[[str, bool, str], "_KeptPictures"] | None = None,
     backends: Backends = NO_BACKENDS,
     device: str = "cpu",
 ) -> FirstPassSource:
@@ -222,7 +220,7 @@ def _sequence(spec: str, shot: Shot) -> FirstPassSource:
     return FirstPassSource("sequence", PerFrame(denoised, files=sequence), why, sequence)
 
 
-def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: _KeptPictures | None) -> FirstPassSource:
+def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: "_KeptPictures | None") -> FirstPassSource:
     """A mode of OIDN, by this function, with its pictures kept or not."""
     run: Callable[..., Array] = partial(_run_mode, mode, denoise=denoise)
     if store is not None:

@@ -3,8 +3,6 @@
 The command, the Python API, chunks on a cluster and ``--resume`` all go through `Job`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -15,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
@@ -425,7 +423,7 @@ class Job:
         options: DenoiseOptions,
         paths: Paths = NO_PATHS,
         validating: AbstractContextManager[object] | None = None,
-    ) -> Job:
+    ) -> Self:
         """Validate everything that a job depends on; `validating` is entered while frames are read and validated.
 
         Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be

@@ -4,8 +4,6 @@ A persistent highlight is a light of one or two pixels that neighbouring frames 
 (K, 2) rows and columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -53,7 +51,7 @@ class Highlights:
     light: Floats  # (K, C) radiance above the surroundings, summed over the 3×3 pixels; NaN outside the frame
     pattern: Floats  # (K, 3, 3) distribution over these pixels, in the mean over channels
 
-    def __getitem__(self, chosen: Mask) -> Highlights:
+    def __getitem__(self, chosen: Mask) -> "Highlights":
         """Select some highlights by a mask (K,)."""
         return Highlights(self.pixels[chosen], self.points[chosen], self.light[chosen], self.pattern[chosen])
 

@@ -1,9 +1,7 @@
 """Samples of all frames of a window, pooled at the centre before denoising."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -73,7 +71,7 @@ class SampleRange(NamedTuple):
     high: Floats
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> SampleRange:
+    def empty(cls, shape: tuple[int, ...]) -> Self:
         """Make the range of a picture of this shape, to be filled by `add`."""
         return cls(np.empty(shape, np.float32), np.empty(shape, np.float32))
 

@@ -1,7 +1,5 @@
 """`ravg compare`: accuracy against time."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -85,7 +83,7 @@ class _Report:
             self.write(joined, None)
         self.show(others, joined)
 
-    def write(self, comparison: Comparison, images: ShotImages | None) -> None:
+    def write(self, comparison: Comparison, images: "ShotImages | None") -> None:
         """Write the page and its files."""
         from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
 
@@ -194,7 +192,7 @@ def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
     return opened
 
 
-def _write_frames(folder: Path, shot: Shot, images: ShotImages) -> None:
+def _write_frames(folder: Path, shot: Shot, images: "ShotImages") -> None:
     """Write the reference and each method's frames as files of the shot with another color."""
     for index, source in enumerate(images.sources):
         name = file_name(index, source.name)

@@ -5,8 +5,6 @@ JSON, or in the format of Open Job Description. Results, such as tables of `ravg
 standard output.
 """
 
-from __future__ import annotations
-
 import codecs
 import json
 import logging
@@ -200,7 +198,7 @@ class _JsonLine(logging.Formatter):
 class _Terminal(logging.Handler):
     """Lines above a progress bar."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: "Console") -> None:
         super().__init__()
         self._console = console
         self._bar: Bar | None = None

@@ -4,8 +4,6 @@
 `hybrid.comparison.sweep` varies the settings of some methods.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -157,7 +155,7 @@ class Network:
 
 
 @lru_cache(maxsize=1)
-def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> NetworkDenoiser:
+def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> "NetworkDenoiser":
     """A network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 

@@ -1,10 +1,9 @@
 """Results as text: formatted numbers, and tables for a terminal and for Markdown."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
@@ -82,7 +81,7 @@ class _Columns:
     verdicts: Sequence[tuple[Metric, str | None, set[str]]]
 
     @classmethod
-    def of(cls, results: Sequence[MethodResult], keys: Sequence[str]) -> _Columns:
+    def of(cls, results: Sequence[MethodResult], keys: Sequence[str]) -> Self:
         """The columns of the measures among `keys` that some result has."""
         metrics = [m for m in present_metrics(results, METRICS) if m.key in keys]
         return cls({r.name: r for r in results}, [(m, *best_and_ties(results, m)) for m in metrics])

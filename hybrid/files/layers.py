@@ -1,11 +1,10 @@
 """Layers by role: which channels of a file are the color, albedo, normal, …, found by a renderer's names."""
 
-from __future__ import annotations
-
 import fnmatch
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
@@ -86,7 +85,7 @@ class Layers:
     pass_colors: Mapping[str, Layer] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # layers left alone that a user might expect to be denoised; one line each
 
-    def without(self, roles: Collection[str]) -> Layers:
+    def without(self, roles: Collection[str]) -> Self:
         """Return the layers without some roles, and without the layers these are made from."""
         gone = {*roles}
         gone |= {"motion_next"} if "motion" in gone else set()
@@ -94,7 +93,7 @@ class Layers:
         convention = None if "motion" in gone else self.motion_convention
         return replace(self, **dict.fromkeys(gone), motion_convention=convention)  # type: ignore[arg-type]
 
-    def without_aovs(self, names: Collection[str]) -> Layers:
+    def without_aovs(self, names: Collection[str]) -> Self:
         """Return the layers without some AOVs."""
         aovs = {name: layer for name, layer in self.aovs.items() if name not in names}
         pass_colors = {name: layer for name, layer in self.pass_colors.items() if name not in names}

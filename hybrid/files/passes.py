@@ -1,9 +1,8 @@
 """How AOVs relate to the beauty: parts that add up to it, light of their own, or no light."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ class Passes:
     kept: tuple[str, ...] = ()  # AOVs without noise, which are not denoised
     light: float = 0.0  # mean of all AOVs of light together, as a share of the beauty's
 
-    def in_frame(self, color: Array, lights: Mapping[str, Array], exposure: float) -> Passes:
+    def in_frame(self, color: Array, lights: Mapping[str, Array], exposure: float) -> Self:
         """Return the passes without the sums that do not hold in a frame: their parts are denoised by themselves.
 
         `color` (H, W, 3) is the noisy beauty, finite; `lights` are AOVs times their pass colors; `exposure` is the

@@ -4,8 +4,6 @@ A profile is a TOML file. Those in `profiles/` come with ravg; the user's own ar
 configuration folder, or given with `--profile`. docs/renderers.md explains how to write one.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from flow.motion import CYCLES, DIRECTIONS, ENCODINGS, UNITS, VERTICAL, MotionConvention
 from hybrid.files.exr import ExrImage
@@ -71,7 +69,7 @@ class Profile:
         # No renderer is known to shift vectors otherwise than by their encoding, and only MoonRay premultiplies them.
         return frozenset({*self.motion, "offset", "premultiplied"})
 
-    def with_motion(self, words: str) -> Profile:
+    def with_motion(self, words: str) -> Self:
         """Return the profile with the user's motion convention (`parse_motion`); "auto" settles no part of it."""
         if words == "auto":
             return replace(self, motion={}, motion_assumed={**self.motion_assumed, **self.motion})

@@ -1,7 +1,5 @@
 """Shots: numbered EXR files, read lazily, a window of neighbouring frames at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -9,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -114,12 +112,12 @@ class Shot:
         numbers = range(number - reach * self.step, number + reach * self.step + 1, self.step)
         return [n for n in numbers if n in self.files]
 
-    def with_neighbours(self, reach: int) -> Shot:
+    def with_neighbours(self, reach: int) -> Self:
         """Return the shot that also asks for the existing frames up to `reach` steps before and after."""
         numbers = {n for number in self.numbers for n in self.neighbours(number, reach)}
         return replace(self, numbers=tuple(sorted(numbers)))
 
-    def reopened(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Shot:
+    def reopened(self, files: Mapping[int, Path], *, aovs: Sequence[str] | None = None) -> Self:
         """Return the same frames, all or some, from files that `write` made: the denoised picture is the color."""
         reader = self.reader
         numbers = tuple(n for n in self.numbers if n in files) or tuple(sorted(files))
@@ -136,7 +134,7 @@ class Shot:
         made = ShotReader(ShotHeaders(reopened), reader.interpretation, reader.keep)
         return replace(self, numbers=numbers, reader=made, warnings=())
 
-    def reinterpreted(self, interpretation: Interpretation) -> Shot:
+    def reinterpreted(self, interpretation: Interpretation) -> Self:
         """Return the shot with layers read by `interpretation`, less the roles that are already left out."""
         reader = self.reader
         left_out = reader.interpretation.left_out | interpretation.left_out
@@ -144,7 +142,7 @@ class Shot:
         return replace(self, reader=ShotReader(reader.headers, interpretation, reader.keep))
 
     @cached_property
-    def views(self) -> tuple[Shot, ...]:
+    def views(self) -> tuple[Self, ...]:
         """This shot once for each view layer and stereo view of its files; itself if the color was chosen.
 
         Raises ExrError if there are several, and sidecars: which view these belong to is unknown.
@@ -161,7 +159,7 @@ class Shot:
             raise ExrError(f"{image.path}: {names}, and layers in other files: expected one (--layer color=NAME)")
         return tuple(self._with_color(color) for color in colors)
 
-    def _with_color(self, color: Layer) -> Shot:
+    def _with_color(self, color: Layer) -> Self:
         reader = self.reader
         files = replace(reader.files, layers={**reader.files.layers, "color": color})
         headers = ShotHeaders(files, reader.headers.sources)
@@ -192,7 +190,7 @@ class Shot:
         images: Mapping[str, np.ndarray],
         extra: Mapping[str, np.ndarray] | None = None,
         attributes: Mapping[str, str] | None = None,
-        others: Iterable[tuple[Shot, Mapping[str, np.ndarray], Mapping[str, np.ndarray]]] = (),
+        others: Iterable[tuple[Self, Mapping[str, np.ndarray], Mapping[str, np.ndarray]]] = (),
     ) -> int:
         """Write a frame's file again with some layers replaced (`hybrid.files.exr.write_exr`).
 
@@ -228,7 +226,7 @@ class Shot:
             added |= {shot.own_name(name): shot.reader.cut(layer, part) for name, layer in layers.items()}
         return write_exr(path, source, replaced, added, attributes)
 
-    def recompressed_parts(self, others: Iterable[Shot] = ()) -> list[str]:
+    def recompressed_parts(self, others: Iterable[Self] = ()) -> list[str]:
         """Name the parts of the first file that `write`, with `others`, stores with ZIP to keep their layers."""
         first = self.numbers[0]
         image, views = self.header(first), [shot.layers(first) for shot in (self, *others)]

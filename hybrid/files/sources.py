@@ -5,8 +5,6 @@ The header of each result holds the string `MADE_FROM`: JSON with ``files``, a m
 content; and with all other facts that the pixels depend on, by name.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
@@ -14,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.replace import refuse_other_kinds
@@ -43,7 +41,7 @@ class Source:
     hash: str
     inode: int = field(default=0, compare=False)
 
-    def same_as(self, other: Source) -> bool:
+    def same_as(self, other: Self) -> bool:
         """Whether size, hash and time are the same, the time to two seconds; names may differ."""
         same = self.size == other.size and self.hash == other.hash
         return same and abs(self.modified - other.modified) <= _SECONDS

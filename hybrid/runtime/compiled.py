@@ -7,8 +7,6 @@ unpickling a truncated file.
 As a program it compiles loops that are needed late, for the process that has started it as a helper.
 """
 
-from __future__ import annotations
-
 import atexit
 import logging
 import os
@@ -20,7 +18,7 @@ import tempfile
 from contextlib import suppress
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numba.core import event
@@ -89,7 +87,7 @@ class Fallback(UserWideCacheLocator):
         self._cache_path = os.path.join(folder or os.devnull, within)
 
     @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> Fallback:
+    def from_function(cls, py_func: Any, py_file: str) -> Self:
         """Accept any function: this is the last locator."""
         return cls(py_func, py_file)
 

@@ -1,13 +1,11 @@
 """The settings of one simulated shot, as plain data."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 RANDOM = ("random", "hard")  # shots drawn from the seed; the second kind holds what is hard to denoise
 # Fixed shots by kind: to validate with, and to test on.
@@ -78,7 +76,7 @@ class ShotSettings:
         return dataclasses.asdict(self)
 
     @classmethod
-    def from_json(cls, data: dict[str, Any]) -> ShotSettings:
+    def from_json(cls, data: dict[str, Any]) -> Self:
         """Return the settings that `to_json` wrote."""
         values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in data.items()}
         return cls(**values)

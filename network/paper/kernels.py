@@ -6,13 +6,11 @@ row, then column). All taps of a pixel are normalised together. Applying them ke
 images of any subset of the frames, and the share of each frame, are sums of the same.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from numba import njit, prange
@@ -111,11 +109,11 @@ class Filtered:
     denominators: Tensor
     kernels: Tensor | Pyramid  # the kernels
     centre: Tensor  # ``(N, C, H, W)``: the centre frame before filtering
-    coarse: Filtered | None = None  # the same at half the resolution
+    coarse: "Filtered | None" = None  # the same at half the resolution
     blend: Tensor | None = None  # ``(N, 1, H, W)``, α of `Pyramid`; with coarse
 
     @classmethod
-    def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Filtered:
+    def of(cls, kernels: Tensor | Pyramid, color: Tensor) -> Self:
         """Apply kernels of one or more resolutions to ``(N, T, C, H, W)``, any linear quantity."""
         centre = color[:, color.shape[1] // 2]
         if isinstance(kernels, Tensor):

@@ -4,8 +4,6 @@ A shard is a safetensors file that holds clips of one shot, stacked. Of a memory
 be read by itself: a sample costs what it reads (one clip, one level), no shard is ever loaded, and the order is free.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -106,7 +104,7 @@ class Clip:
         values = {name: getattr(self, name) for name in FIELDS}
         return {name: value for name, value in values.items() if value is not None}
 
-    def crop(self, y: int, x: int, size: int) -> Clip:
+    def crop(self, y: int, x: int, size: int) -> "Clip":
         """Cut out a square tile by its corner; linked to no other clip, as the next frame's tiles lie elsewhere."""
         part = np.s_[..., y : y + size, x : x + size]
         tile = {n: v if FIELDS[n].is_number else v[part] for n, v in self.values().items()}
@@ -291,7 +289,7 @@ class Clips:
         """Least height or width of a clip."""
         return min(min(shard.shape[4:]) for shard in self._shards)
 
-    def of(self, shots: Sequence[str]) -> Clips:
+    def of(self, shots: Sequence[str]) -> "Clips":
         """The clips of some shots."""
         found = [shard for shard in self._shards if shard.shot in shots]
         return Clips(found, self.frames if found else None)
@@ -393,7 +391,7 @@ class _Variation:
     stops: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, exposure_stops: float) -> _Variation:
+    def draw(cls, rng: np.random.Generator, exposure_stops: float) -> "_Variation":
         """Draw a variation."""
         across, down, transpose = rng.random(3) < 0.5
         channels = torch.from_numpy(rng.permutation(3))
