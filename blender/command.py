@@ -88,7 +88,6 @@ class Run:
 
     @property
     def total(self) -> int:
-        """The number of frames to make."""
         return len(self._before)
 
     @property
@@ -115,21 +114,18 @@ class Run:
         return code
 
     def stop(self) -> None:
-        """Ask the command to stop; finished frames stay."""
         if self._stopped_at is None and self._process.poll() is None:
             self._stopped_at = time.monotonic()
             with suppress(OSError):
                 self._process.stdin.close()
 
     def wait(self) -> int:
-        """Wait for the end and return the exit code."""
         while (code := self.code) is None:
             time.sleep(0.05)
         return code
 
     @property
     def log(self) -> str:
-        """All output so far."""
         return self._log.read_text(encoding="utf-8", errors="replace")
 
     @property

@@ -101,7 +101,6 @@ class Job:
 
     @property
     def ended(self) -> bool:
-        """Whether the job has ended."""
         return self.cancelled if self.run is None else self.run.code is not None
 
     def conclude(self, report: Report) -> bool:
@@ -169,12 +168,10 @@ class Install:
         return f"Installing ravg: {lines[-1][:80]}" if lines else "Installing ravg"
 
     def cancel(self) -> None:
-        """Stop pip; an earlier installation stays."""
         self.run.stop()
 
     @property
     def ended(self) -> bool:
-        """Whether the job has ended."""
         last = self.run.stopped or bool(self._error) or self._step == len(self._steps) - 1
         return self.run.code is not None and (self.run.code != 0 or last)
 

@@ -116,7 +116,6 @@ def _wrong_denoise(scene: bpy.types.Scene) -> bool:
 
 
 def frame_numbers(scene: bpy.types.Scene) -> range:
-    """The frames that the scene renders."""
     return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
 
 
@@ -329,7 +328,6 @@ def _strips(scene: bpy.types.Scene) -> bool:
 
 
 def _light_passes(layer: bpy.types.ViewLayer) -> bool:
-    """Whether a view layer renders light passes."""
     named = "use_pass_((diffuse|glossy|transmission)_(direct|indirect)|emit|environment)"
     return any(getattr(layer, name) for name in dir(layer) if re.fullmatch(named, name))
 

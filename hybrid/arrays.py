@@ -43,7 +43,6 @@ class ArrayFrames:
         return self.read(number)
 
     def has(self, number: int) -> bool:
-        """Whether there is such a frame."""
         return number in self.numbers
 
     def read(self, number: int) -> Frame:

@@ -75,7 +75,6 @@ class LazyCommand(TyperCommand):
         self._entry = entry
 
     def load(self) -> Any:
-        """Import the command."""
         module, _, function = self._entry.function.partition(":")
         command = getattr(import_module(f"hybrid.commands.{module}"), function)
         single = typer.Typer(add_completion=False)
@@ -87,7 +86,6 @@ class LazyCommand(TyperCommand):
         return made
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Import the command and parse its arguments."""
         return self.load().make_context(info_name, args, parent, **extra)
 
 
@@ -95,7 +93,6 @@ class Commands(TyperGroup):
     """The commands of `COMMANDS`, also under their old names."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names in the order of the help."""
         return [*COMMANDS]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:

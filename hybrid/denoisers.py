@@ -56,7 +56,6 @@ class ClassicalDenoiser(WindowDenoiser):
     needs_first_pass = False
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        """Denoise the centre of a window."""
         return Denoised(filter_window(aligned, self.preset, timings=self.timings))
 
 
@@ -67,7 +66,6 @@ class AverageDenoiser(WindowDenoiser):
     timings: Timings
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        """Denoise the centre of a window."""
         return Denoised(gated_average(aligned, timings=self.timings))
 
 
@@ -82,9 +80,7 @@ class PooledDenoiser(WindowDenoiser):
 
     @property
     def devices(self) -> Mapping[str, str]:
-        """OIDN's device."""
         return {"oidn": self.device}
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        """Denoise the centre of a window."""
         return Denoised(pool_and_denoise(aligned, device=self.device, timings=self.timings))

@@ -53,7 +53,6 @@ class PerFrame(FirstPass):
     reads_frame = True
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
-        """See `FirstPass`."""
         frame, prepared = stream.as_read(number), stream.frame(number)
         with stream.timings.stage("estimate"):
             return _checked(self.function(frame), frame, None if prepared is None else prepared.highlights)
@@ -68,11 +67,9 @@ class GuideAware(FirstPass):
     function: Callable[[Frame, bool], Array]
 
     def reach(self, radius: int) -> int:
-        """See `FirstPass`."""
         return radius + GUIDE_RADIUS
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
-        """See `FirstPass`."""
         prepared = stream.frame(number)
         assert prepared is not None
         noisy = "prefilter" in stream.plan(stream.around(number, GUIDE_RADIUS)).stages
@@ -89,11 +86,9 @@ class Classical(FirstPass):
     from_noisy = True
 
     def reach(self, radius: int) -> int:
-        """See `FirstPass`."""
         return 2 * radius
 
     def make(self, stream: FrameStream, number: int) -> Array:
-        """See `FirstPass`."""
         window = align(stream.window(number, noisy=True), timings=stream.timings)
         return filter_window(window, self.preset, timings=stream.timings)
 

@@ -513,7 +513,6 @@ class Job:
         return [support * (self.options.passes - number) for number in range(1, self.options.passes + 1)]
 
     def total(self) -> int:
-        """Frames of all passes together."""
         return sum(len(self.views[0].with_neighbours(margin)) for margin in self.margins())
 
     def run(self, progress: Progress | None = None) -> Iterator[Finished | Failed]:

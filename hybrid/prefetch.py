@@ -21,7 +21,6 @@ class Prefetcher:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of every frame."""
         return self._shot.shape
 
     def expect(self, numbers: Iterable[int]) -> None:

@@ -97,7 +97,6 @@ class _Pairs:
         self._exposure = np.float32(measure_exposure(middle) / 0.18)
 
     def read(self, number: int) -> tuple[Image8, Image8]:
-        """Read a frame: noisy and denoised, (H, W, 3) each."""
         return self._encoded(self.noisy, number), self._encoded(self.denoised, number)
 
     def _encoded(self, shot: Shot, number: int) -> Image8:

@@ -87,7 +87,6 @@ class ValidationReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The messages of all findings that are warnings."""
         return tuple(finding.message for finding in self.findings if finding.warning)
 
     def readings(self) -> list[tuple[str, str, str]]:

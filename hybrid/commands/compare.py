@@ -70,7 +70,6 @@ class _Report:
         self.read_others()
 
     def read_others(self) -> list[Comparison]:
-        """Read the finished comparisons."""
         return [read_comparison(folder / "results.json") for folder in self.with_report or ()]
 
     def show_joined(self) -> None:

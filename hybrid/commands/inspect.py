@@ -94,7 +94,6 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
 
 
 def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
-    """Layers and plan of a view."""
     return {
         "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in describe_layers(layers)],
         "plan": [asdict(decision) for decision in plan.decisions],
@@ -102,7 +101,6 @@ def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
 
 
 def _measured(decision: Decision) -> str:
-    """A measurement and its threshold."""
     if decision.figure is None or decision.threshold is None:
         return "–"
     sign = ">" if decision.figure > decision.threshold else "<="

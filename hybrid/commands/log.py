@@ -54,7 +54,6 @@ class Progress:
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the start."""
         return time.monotonic() - self._start
 
     def _record(self, message: str, facts: dict[str, object]) -> None:
@@ -84,7 +83,6 @@ def log_file() -> Path | None:
 
 
 def end_log() -> None:
-    """Remove the handlers and the progress bar."""
     for handler in tuple(LOG.handlers):
         LOG.removeHandler(handler)
         handler.close()

@@ -67,7 +67,6 @@ def status(output: str, frames: str | None = None, as_json: bool = False) -> Non
 
 
 def _show(found: Status) -> None:
-    """Print one row for each run."""
     rows = []
     for record in found.records:
         made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]

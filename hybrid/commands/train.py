@@ -28,7 +28,6 @@ class Levels(NamedTuple):
 
     @property
     def first(self) -> Shot:
-        """The first level."""
         return next(iter(self.shots.values()))
 
 

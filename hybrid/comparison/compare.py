@@ -234,7 +234,6 @@ def _measure_ladder(
 
 
 def _result_of(name: str, method: Method) -> MethodResult:
-    """The result of a method, without measurements."""
     return MethodResult(name, method.settings, method.family, method.sweep, method.base)
 
 
@@ -280,7 +279,6 @@ def _store_all_maps(
 
 
 def _store_maps(method: Method, shot: Frames, numbers: Sequence[int], name: str, store: FrameStore) -> None:
-    """Store a method's maps of some frames."""
     for number, maps in method.maps(shot, numbers) if method.maps is not None else ():
         for title, values in maps.items():
             store.save(name, number, values, title)

@@ -51,12 +51,10 @@ class ShotImages:
 
     @property
     def sources(self) -> list[MethodImages]:
-        """The reference, then the methods."""
         return [MethodImages("reference", self.reference, self.reference_maps), *self.methods]
 
     @property
     def middle(self) -> int:
-        """Number of the middle frame."""
         return self.frames[len(self.frames) // 2]
 
 
@@ -141,7 +139,6 @@ def _encode_all(
 
 
 def _cut(image: Array, box: Box) -> Array:
-    """The box of an image."""
     x, y, width, height = box
     return image[y : y + height, x : x + width]
 

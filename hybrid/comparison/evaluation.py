@@ -106,7 +106,6 @@ class Evaluator:
         return {key: summarize(series) for key, series in values.items() if series}
 
     def _map_flip(self, names: Sequence[str], number: int) -> None:
-        """Store the methods' FLIP maps of a frame."""
         images = [self.store.load(name, number, lazily=True) for name in names]
         maps = flip_maps(images, self.store.load(REFERENCE, number), self.exposure)
         for name, errors in zip(names, maps, strict=True):

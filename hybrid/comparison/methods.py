@@ -91,7 +91,6 @@ class WindowSettings:
     solver: Mapping[str, Any] = field(default_factory=dict)
 
     def stream(self, shot: Frames) -> FrameStream:
-        """The aligned windows of a shot."""
         frames = shot
         if not self.vectors:
             frames = MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
@@ -114,13 +113,11 @@ class Classical:
     window: WindowSettings = field(default_factory=WindowSettings)
 
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        """Yield number and radiance of each frame."""
         stream = self.window.stream(shot)
         for number in shot.numbers:
             yield number, self.denoise(stream.align(number))
 
     def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
-        """Yield number and `window_maps` of some frames."""
         stream = self.window.stream(shot)
         for number in numbers:
             yield number, window_maps(stream.align(number), self.denoise)
@@ -140,7 +137,6 @@ class Network:
     threshold: float | None = None
 
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        """Yield number and radiance of each frame."""
         denoiser = _denoiser(self.preset, self.tile, self.precision, self.threshold)
         frames = FrameDenoiser(replace(self.window, radius=denoiser.radius).stream(shot), denoiser)
         for number in shot.numbers:

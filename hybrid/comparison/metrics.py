@@ -138,7 +138,6 @@ def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) 
 
 
 def _by_shot(data: NDArray[np.float64], shots: Sequence[int]) -> list[NDArray[np.float64]]:
-    """Split the values into those of each shot."""
     return np.split(data, np.cumsum(shots)[:-1]) if shots else [data]
 
 

@@ -126,7 +126,6 @@ def _embed(folder: Path, report: Report) -> dict[str, Any]:
 def _page(
     report: Report, embedded: Mapping[str, Any], document: Mapping[str, Any], charted: Sequence[Metric]
 ) -> Markup:
-    """The page as HTML."""
     comparison, results = report.comparison, report.comparison.results
     metrics = present_metrics(results, METRICS)
     pair = leading_pair(results, metrics[0]) if metrics else None

@@ -115,7 +115,6 @@ def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
 
 
 def _join_method(results: Sequence[MethodResult]) -> MethodResult:
-    """One result from those of one method on several shots."""
     metrics = {}
     for key in results[0].metrics:
         values = [r.metrics[key].values for r in results if key in r.metrics]
@@ -298,7 +297,6 @@ def to_json(document: object, indent: int | None = None) -> str:
 
 
 def is_comparison(path: Path) -> bool:
-    """Whether `read_comparison` can read the file."""
     try:
         read_comparison(path)
     except (OSError, ValueError):

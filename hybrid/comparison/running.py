@@ -61,7 +61,6 @@ class _TimedFrames:
         self._shot, self._timings = shot, timings
 
     def read(self, number: int) -> Frame:
-        """A frame of the shot."""
         with self._timings.stage("read"):
             return self._shot.read(number)
 

@@ -39,7 +39,6 @@ class FrameStore:
         return image
 
     def has(self, owner: str, number: int, title: str = "color") -> bool:
-        """Whether the array was saved."""
         return self._path(owner, number, title).exists()
 
     def load_reference(self, number: int) -> Reference:

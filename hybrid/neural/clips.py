@@ -165,7 +165,6 @@ def _level(
 
 
 def _clip(levels: list[dict[str, torch.Tensor]], targets: Mapping[str, NDArray[np.float32]], *, linked: bool) -> Clip:
-    """A clip of its levels, with the targets that all of them share."""
     values = {name: torch.cat([level[name] for level in levels]) for name in levels[0]}
     values["linked"] = values["linked"].min().expand(len(levels)) * linked
     for name, image in targets.items():

@@ -28,7 +28,6 @@ class KernelDenoiser(NetworkDenoiser):
         self.threshold = threshold
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        """Denoise the centre of a window."""
         with self.setup.timings.stage("network"):
             guides = {"albedo": aligned.albedo, "normal": aligned.normal}
             layers = {"color": aligned.mixed(aligned.color), "confidence": aligned.confidence[..., None]}

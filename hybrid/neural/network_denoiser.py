@@ -66,18 +66,15 @@ class NetworkDenoiser(WindowDenoiser):
 
     @property
     def radius(self) -> int:
-        """Frames on each side of the centre."""
         return int(self.model.frames // 2)
 
     @property
     def settings(self) -> Mapping[str, object]:
-        """JSON values that pixels depend on."""
         precision = "bfloat16" if self.setup.bfloat16 else "float32"
         return {"tile": self.tile, "threshold": self.threshold, "precision": precision}
 
     @property
     def devices(self) -> Mapping[str, str]:
-        """The network's device."""
         return {"network": self.setup.device}
 
     @property

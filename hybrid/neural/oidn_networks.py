@@ -99,13 +99,11 @@ def has_oidn_networks() -> bool:
 
 @lru_cache
 def _network(name: str) -> OidnUNet:
-    """One of OIDN's networks."""
     return _for_inference(load_oidn(name))
 
 
 @lru_cache
 def _bundled(preset: str) -> OidnUNet:
-    """The backbone of a preset."""
     return _for_inference(cast(RobustUNet, load_model(shipped_weights(preset))).backbone)
 
 
@@ -117,7 +115,6 @@ def _for_inference(unet: OidnUNet) -> OidnUNet:
 
 
 def _exposure(color: Array) -> float:
-    """OIDN's exposure of an image, a float32."""
     return float(np.float32(autoexposure(np.asarray(color, np.float32))))
 
 

@@ -33,7 +33,6 @@ class UNetDenoiser(NetworkDenoiser):
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        """Denoise the centre of a window."""
         if aligned.first_pass is None or aligned.centre_first_pass is None:
             raise ValueError("estimate: expected those of the frames, as this network takes, got none")
         with self.setup.timings.stage("network"):

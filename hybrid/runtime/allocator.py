@@ -38,7 +38,6 @@ def return_freed_memory() -> None:
 
 
 def _adjust(parameter: int, value: int) -> None:
-    """Set a parameter of glibc's allocator."""
     adjust = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if adjust is not None:
         adjust(parameter, value)

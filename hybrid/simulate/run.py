@@ -156,12 +156,10 @@ class _Worker:
         self._unread = b""
 
     def messages(self) -> list[dict[str, Any]]:
-        """Return the messages since the last call."""
         *lines, self._unread = (self._unread + self._answers.read()).split(b"\n")
         return [json.loads(line) for line in lines if line.startswith(b"{")]
 
     def ended(self) -> bool:
-        """Return whether the process has ended."""
         return self._process.poll() is not None
 
     def close(self) -> None:

@@ -96,7 +96,6 @@ def wood(dark: Color = (0.09, 0.035, 0.012), light: Color = (0.33, 0.16, 0.06), 
 
 
 def glow(color: Color, strength: float) -> Any:
-    """Make an emissive material."""
     return plain("glow", (0, 0, 0), Emission_Color=(*color, 1), Emission_Strength=strength, Specular_IOR_Level=0)
 
 
@@ -392,7 +391,6 @@ def add_lamp(kind: str, position: Point, power: float, size: float, target: Poin
 
 
 def new_world() -> Any:
-    """Give the scene a new world with nodes; return the world."""
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.use_nodes = True
     return world

@@ -68,7 +68,6 @@ class SceneFile:
         self.parts[name] = item
 
     def _move(self, item: Any, motion: dict[str, Any]) -> None:
-        """Key the motion of an item, if it has any."""
         if "swing" in motion:
             key_swing(item, self.frames, *motion["swing"])
         if "velocity" in motion or "spin" in motion:
@@ -90,7 +89,6 @@ class SceneFile:
 
 
 def make_material(name: str, values: dict[str, Any]) -> Any:
-    """Make the material that a file describes."""
     if "grain" in values:
         return wood(*values.pop("grain"), **values)
     if "glow" in values:

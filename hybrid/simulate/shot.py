@@ -72,12 +72,10 @@ class ShotSettings:
         return {**self.levels, **({"reference": self.reference} if referenced else {})}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the settings as JSON holds them."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
-        """Return the settings that `to_json` wrote."""
         values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in data.items()}
         return cls(**values)
 

@@ -64,12 +64,10 @@ class ViewServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The address to open."""
         return f"http://{LOOPBACK}:{self.port}/{self.secret}/"
 
     @property
     def hosts(self) -> set[str]:
-        """Accepted values of ``Host``."""
         return {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
 
     @property

@@ -95,7 +95,6 @@ class MultiScaleConfig:
 
     @property
     def kernel(self) -> KernelConfig:
-        """The kernels, the same at every resolution."""
         return self.base.kernel
 
 
@@ -118,7 +117,6 @@ class TKPCNConfig:
 
 
 def _check_odd(conv_size: int) -> None:
-    """Raise ValueError unless a convolution has an odd size."""
     if conv_size < 1 or conv_size % 2 == 0:
         raise ValueError(f"conv_size: expected an odd number >= 1, got {conv_size}")
 
@@ -210,7 +208,6 @@ class RAUNet(KernelNetwork):
         self.multiple = int(2 ** (len(widths) - 1))
 
     def trunk(self, features: Tensor) -> Tensor:
-        """See `KernelNetwork.trunk`."""
         x = self._enter(features)
         scales: list[Tensor] = []
         for scale, block in enumerate(self.encode):
@@ -245,7 +242,6 @@ class RAResNet(KernelNetwork):
         self.head = KernelHead(width, config.kernel)
 
     def trunk(self, features: Tensor) -> Tensor:
-        """See `KernelNetwork.trunk`."""
         x = self._enter(features)
         section, skips = x, iter(self.skip)
         for count, block in enumerate(self.blocks, start=1):
@@ -271,7 +267,6 @@ class TKPCN(KernelNetwork):
         self.head = KernelHead(width, config.kernel)
 
     def trunk(self, features: Tensor) -> Tensor:
-        """See `KernelNetwork.trunk`."""
         x = self._enter(features)
         for block in self.blocks:
             x = block(x)

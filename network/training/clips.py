@@ -46,11 +46,9 @@ class Layout(NamedTuple):
 
     @property
     def is_number(self) -> bool:
-        """Whether it is one number per level, of a whole frame."""
         return self.channels == 0
 
     def shape(self, levels: int, frames: int, height: int, width: int) -> tuple[int, ...]:
-        """Shape of the field."""
         if self.is_number:
             return (levels,)
         return (levels, *((frames,) if self.window else ()), self.channels, height, width)
@@ -290,7 +288,6 @@ class Clips:
         return min(min(shard.shape[4:]) for shard in self._shards)
 
     def of(self, shots: Sequence[str]) -> "Clips":
-        """The clips of some shots."""
         found = [shard for shard in self._shards if shard.shot in shots]
         return Clips(found, self.frames if found else None)
 
@@ -392,7 +389,6 @@ class _Variation:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, exposure_stops: float) -> "_Variation":
-        """Draw a variation."""
         across, down, transpose = rng.random(3) < 0.5
         channels = torch.from_numpy(rng.permutation(3))
         axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
@@ -458,7 +454,6 @@ class Samples(Dataset[Sample]):
         return int(self._cycle[1][place])
 
     def __getitem__(self, number: int) -> Sample:
-        """Make a sample."""
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
         level = int(rng.integers(len(pairs)))

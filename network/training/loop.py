@@ -261,7 +261,6 @@ def _groups(model: Model, backbone_rate: float) -> list[dict[str, Any]]:
 
 
 def _in_group() -> bool:
-    """Whether this is one of several processes that train together."""
     return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
@@ -304,7 +303,6 @@ def _rate(config: TrainConfig, step: int, done: float) -> float:
 
 @torch.no_grad()
 def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
-    """Exponential moving average of the weights."""
     torch._foreach_lerp_(list(average.parameters()), list(model.parameters()), 1 - decay)
 
 

@@ -93,7 +93,6 @@ class Perceptual(nn.Module):
         self.vgg = vgg
 
     def forward(self, prediction: Tensor, target: Tensor, scale: Tensor, weight: Tensor | None = None) -> Tensor:
-        """``(N,)`` losses; see `network.training.losses.ImageLoss`."""
         images = torch.cat([prediction, target]).relu() / torch.cat([scale, scale]).view(-1, 1, 1, 1)
         distance = torch.zeros_like(scale)
         for features in self.vgg(images / (1 + images)):

@@ -47,12 +47,10 @@ def render(template: str, **values: object) -> Markup:
 
 
 def style() -> Markup:
-    """Return the page's style sheet."""
     return _source("report.css")
 
 
 def script() -> Markup:
-    """Return the page's scripts as the text of one module script."""
     return Markup("\n").join([Markup(player.script()), *map(_source, SCRIPTS)])
 
 
