@@ -194,12 +194,9 @@ def _is_record(document: Any) -> bool:
     if not isinstance(document, dict):
         return False
     get = document.get
-    texts, times = ("state", "host", "ravg"), ("started",)
     return (
-        all(isinstance(get(name), str) for name in texts)
-        and all(_is_amount(get(name)) for name in times)
-        and all(_is_amount(get(name, 0)) for name in ("updated", "peak_bytes"))
-        and isinstance(get("error", ""), str)
+        all(isinstance(text, str) for text in (get("state"), get("host"), get("ravg"), get("error", "")))
+        and all(_is_amount(number) for number in (get("started"), get("updated", 0), get("peak_bytes", 0)))
         and type(get("process")) is int
         and 0 < document["process"] < 2**31
         and isinstance(get("asked"), list)

@@ -195,9 +195,12 @@ def _validate_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationR
     keeper = Keeper(in_files=height * width > LARGE)
 
     def add_surfaces(earlier: Frame, later: Frame, roles: Collection[str]) -> list[Patches]:
-        for pair in _surface_pairs(earlier, later, roles, shot.step):
-            surfaces.append(Patches(pair))
-            keeper.release()
+        for role in roles:
+            here, there = getattr(earlier, role), getattr(later, role)
+            both = here is not None and there is not None
+            if both and (pair := _pair_of(earlier, later, here, there, shot.step)) is not None:
+                surfaces.append(Patches(replace(pair, lift=float(role == "normal"))))
+                keeper.release()
         return surfaces
 
     for a, b in pairs:
@@ -218,14 +221,6 @@ def _pair_of(earlier: Frame, later: Frame, here: Array, there: Array, step: int)
         return None
     resolution = earlier.resolution or earlier.motion.shape[:2]
     return FramePair(here, there, earlier.motion, later.motion, resolution, step)
-
-
-def _surface_pairs(earlier: Frame, later: Frame, roles: Collection[str], step: int) -> Iterator[FramePair]:
-    """Guides of two frames as pictures of their surfaces."""
-    for role in roles:
-        here, there = getattr(earlier, role), getattr(later, role)
-        if here is not None and there is not None and (pair := _pair_of(earlier, later, here, there, step)) is not None:
-            yield replace(pair, lift=float(role == "normal"))
 
 
 def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
@@ -452,10 +447,6 @@ def _check_normal(layer: Array, _: Array) -> str | None:
     return f"is longer than 1 in {long:.1%} of the picture" if long > STRAY else None
 
 
-def _check_depth(layer: Array, _: Array) -> str | None:
-    return _check_guide(layer[..., None])
-
-
 def _check_alpha(layer: Array, color: Array) -> str | None:
     if layer.min() == layer.max():
         return None  # opaque everywhere, or empty
@@ -489,7 +480,7 @@ def _equal_share(a: Array, b: Array, same: Mask) -> float:
 _CHECKS: dict[str, Callable[[Array, Array], str | None]] = {
     "albedo": _check_albedo,
     "normal": _check_normal,
-    "depth": _check_depth,
+    "depth": lambda layer, _: _check_guide(layer[..., None]),
     "variance": _check_variance,
     "alpha": _check_alpha,
     "estimate": _check_estimate,

@@ -8,7 +8,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 from hybrid.comparison.evaluation import Evaluator, Level, find_static_pixels, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
@@ -16,7 +15,7 @@ from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.results import Comparison, Ladder, MethodResult, Statistic
 from hybrid.comparison.running import ENOUGH, WARM_UP, OnStep, RunCost, run_in_process, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
-from hybrid.comparison.store import FrameStore
+from hybrid.comparison.store import REFERENCE, FrameStore
 from hybrid.files.frame import Frames
 from hybrid.files.sources import versions
 from hybrid.runtime.system import load_average, processor_name
@@ -95,7 +94,12 @@ def compare_shot(
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
         mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
         map_facts = _store_all_maps(store, shot, mapped, evaluator, on_step)
-    facts = _facts_of_frames(evaluator) | law_facts
+    height, width = static.shape
+    facts = {
+        "Frames": f"{_span(numbers)}, {width} × {height} pixels",
+        "Static pixels": f"{static.mean():.1%}",
+        **law_facts,
+    }
     if findings:
         facts["Layers"] = "; ".join(findings)
     return Comparison(options.title, tuple(results), facts | map_facts | _facts_of_runs(options, load), ladder)
@@ -141,20 +145,16 @@ def _check_levels(numbers: Sequence[int], methods: Mapping[str, Method], options
                 )
 
 
-class _Input(NamedTuple):
-    """A sequence that is read besides the shot, and the frames that are needed."""
-
-    name: str
-    sequence: Frames
-    numbers: Sequence[int]
+# A sequence that is read besides the shot, by name, and the frames that are needed.
+_Input = tuple[str, Frames, Sequence[int]]
 
 
 def _inputs(
     numbers: Sequence[int], halves: Sequence[Frames], methods: Mapping[str, Method], levels: Sequence[Level]
 ) -> list[_Input]:
-    inputs = [_Input("reference", half, numbers) for half in halves]
-    inputs += [_Input(f"method {name!r}", m.given, numbers) for name, m in methods.items() if m.given is not None]
-    inputs += [_Input(f"level of {n:g} samples", level, [k for k in numbers if level.has(k)]) for level, n in levels]
+    inputs: list[_Input] = [("reference", half, numbers) for half in halves]
+    inputs += [(f"method {name!r}", m.given, numbers) for name, m in methods.items() if m.given is not None]
+    inputs += [(f"level of {n:g} samples", level, [k for k in numbers if level.has(k)]) for level, n in levels]
     return inputs
 
 
@@ -165,14 +165,14 @@ def _check_sizes(shot: Frames, inputs: Sequence[_Input]) -> None:
     the frames are not pickled with the shot for the methods.
     """
     expected = shot.read(shot.numbers[0]).color.shape
-    for item in inputs:
-        for number in item.numbers:
-            if not item.sequence.has(number):
-                raise ValueError(f"{item.name} gave no frame {number}, expected all of {_span(item.numbers)}")
-            found = item.sequence.read(number).color.shape
+    for name, sequence, numbers in inputs:
+        for number in numbers:
+            if not sequence.has(number):
+                raise ValueError(f"{name} gave no frame {number}, expected all of {_span(numbers)}")
+            found = sequence.read(number).color.shape
             if found != expected:
                 sizes = f"{found[1]}x{found[0]}, expected {expected[1]}x{expected[0]}, the size of the shot"
-                raise ValueError(f"frame {number} of {item.name} is {sizes}")
+                raise ValueError(f"frame {number} of {name} is {sizes}")
 
 
 def _span(numbers: Sequence[int]) -> str:
@@ -186,11 +186,13 @@ def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], on_step: OnSt
     """Measures of each method; without FLIP for points of a sweep."""
     on_step("FLIP of all methods")
     evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
-    evaluator.map_reference_changes()
+    evaluator.map_changes(REFERENCE)  # true changes, beside which flicker can be told
     statistics = {}
     for name, method in methods.items():
         on_step(f"measure {name}")
-        statistics[name] = evaluator.measure(name, flip=not method.sweep, change=not method.sweep)
+        statistics[name] = evaluator.measure(name, flip=not method.sweep)
+        if not method.sweep:
+            evaluator.map_changes(name)
     return statistics
 
 
@@ -229,7 +231,7 @@ def _measure_ladder(
         timed = time_methods(at_level, level, 1, evaluator.store, on_step)
         on_step(f"measure the level of {samples:g} samples")
         evaluator.map_flip(list(timed.runs))
-        measured[samples] = {names[long]: evaluator.measure(long, flip=True, change=False) for long in timed.runs}
+        measured[samples] = {names[long]: evaluator.measure(long, flip=True) for long in timed.runs}
     return build_ladder(measured)
 
 
@@ -285,14 +287,6 @@ def _store_maps(method: Method, shot: Frames, numbers: Sequence[int], name: str,
 
 
 # Facts
-
-
-def _facts_of_frames(evaluator: Evaluator) -> dict[str, str]:
-    height, width = evaluator.static.shape
-    return {
-        "Frames": f"{_span(evaluator.numbers)}, {width} × {height} pixels",
-        "Static pixels": f"{evaluator.static.mean():.1%}",
-    }
 
 
 def _facts_of_runs(options: CompareOptions, load: float | None) -> dict[str, str]:

@@ -13,29 +13,19 @@ from numpy.typing import NDArray
 
 from flow.motion import Vectors, forward_backward_error, invert_flow
 from flow.warp import warp
+from hybrid.comparison import metrics
 from hybrid.comparison.flip import flip_maps
-from hybrid.comparison.metrics import (
-    Reference,
-    mean_bias,
-    psnr,
-    relmse,
-    smape,
-    ssim,
-    static_std,
-    temporal_psnr,
-    tone_map,
-)
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
 from hybrid.files.frame import Array, Frame, Frames
 from hybrid.plan import STILL
 
-Measure = Callable[[Array, Reference, float], float]  # of image, reference, exposure
+Measure = Callable[[Array, metrics.Reference, float], float]  # of image, reference, exposure
 Level = tuple[Frames, float]  # a render of the shot, and its samples per pixel
 
 
-def _whole(reference: Reference) -> NDArray[np.floating]:
+def _whole(reference: metrics.Reference) -> NDArray[np.floating]:
     """The reference as one image: the mean of its halves."""
     return (reference[0] + reference[1]) / 2 if isinstance(reference, tuple) else reference
 
@@ -44,12 +34,12 @@ def _whole(reference: Reference) -> NDArray[np.floating]:
 AT_ONCE = min(os.cpu_count() or 1, 4)
 # Measures of single frames, without FLIP.
 MEASURES: dict[str, Measure] = {
-    "psnr": lambda x, r, e: psnr(x, r, exposure=e),
-    "ssim": lambda x, r, e: ssim(x, _whole(r), exposure=e),
-    "relmse": lambda x, r, e: relmse(x, r, exposure=e),
-    "relmse_trimmed": lambda x, r, e: relmse(x, r, exposure=e, trim=0.001),
-    "smape": lambda x, r, e: smape(x, _whole(r), exposure=e),
-    "mean_bias": lambda x, r, _: mean_bias(x, _whole(r)),
+    "psnr": lambda x, r, e: metrics.psnr(x, r, exposure=e),
+    "ssim": lambda x, r, e: metrics.ssim(x, _whole(r), exposure=e),
+    "relmse": lambda x, r, e: metrics.relmse(x, r, exposure=e),
+    "relmse_trimmed": lambda x, r, e: metrics.relmse(x, r, exposure=e, trim=0.001),
+    "smape": lambda x, r, e: metrics.smape(x, _whole(r), exposure=e),
+    "mean_bias": lambda x, r, _: metrics.mean_bias(x, _whole(r)),
 }
 # Static light: 9×9 means of the reference change by less than this on the tone curve. Well above their noise (a ninth
 # of the pixels'), well below a visible change.
@@ -73,17 +63,14 @@ class Evaluator:
         with ThreadPoolExecutor(AT_ONCE) as threads:
             list(threads.map(partial(self._map_flip, names), self.numbers))
 
-    def map_reference_changes(self) -> None:
-        """Store the maps of changes of the reference: true changes, beside which flicker can be told."""
+    def map_changes(self, name: str) -> None:
+        """Store the maps of changes between the frames of a method, or of the reference."""
         if self.pairs:
             with ThreadPoolExecutor(AT_ONCE) as threads:
-                list(threads.map(partial(self._map_change, REFERENCE), self.numbers))
+                list(threads.map(partial(self._map_change, name), self.numbers))
 
-    def measure(self, name: str, *, flip: bool, change: bool) -> dict[str, Statistic]:
-        """Measure the frames of a method, and pairs of frames; measures over time only with pairs or static pixels.
-
-        With `flip` by the maps of `map_flip`; with `change` the maps of changes between frames are stored.
-        """
+    def measure(self, name: str, *, flip: bool) -> dict[str, Statistic]:
+        """Measure frames, by `map_flip` too if `flip`; over time only with pairs of frames or static pixels."""
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
 
         def measure_frame(number: int) -> dict[str, float]:
@@ -95,14 +82,12 @@ class Evaluator:
                 for key, value in measured.items():
                     values[key].append(value)
             values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
-            if change and self.pairs:
-                list(threads.map(partial(self._map_change, name), self.numbers))
         if flip:
             maps = (self.store.load(name, number, FLIP_MAP) for number in self.numbers)
             values["flip"] += [float(errors.mean(dtype=np.float64)) for errors in maps]
         if self.static.any():
             frames = (self.store.load(name, number) for number in self.numbers)
-            values["static_std"] = list(static_std(frames, self.static, exposure=self.exposure))
+            values["static_std"] = list(metrics.static_std(frames, self.static, exposure=self.exposure))
         return {key: summarize(series) for key, series in values.items() if series}
 
     def _map_flip(self, names: Sequence[str], number: int) -> None:
@@ -117,12 +102,12 @@ class Evaluator:
         With W the warp of the previous frame, the map is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5
         where no motion leads to a pixel. Unlike temporal PSNR it also shows real changes: light, reflections.
         """
-        current = tone_map(self.store.load(name, number), self.exposure)
+        current = metrics.tone_map(self.store.load(name, number), self.exposure)
         previous = next((pair[0] for pair in self.pairs if pair[1] == number), None)
         changes = np.full(current.shape[:2], 0.5, np.float32)
         if previous is not None:
             motion = self.store.load(REFERENCE, number, FLOW)
-            earlier = tone_map(self.store.load(name, previous), self.exposure).astype(np.float32)
+            earlier = metrics.tone_map(self.store.load(name, previous), self.exposure).astype(np.float32)
             difference = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
             valid = (motion[..., 2] > 0) & np.isfinite(difference)
             changes[valid] = np.clip(0.5 + CHANGE_GAIN * difference[valid], 0, 1)
@@ -133,7 +118,7 @@ class Evaluator:
         references = [self.store.load_reference(number) for number in pair]
         motion = self.store.load(REFERENCE, pair[1], FLOW)
         flows, valid = [motion[..., :2]], [motion[..., 2] > 0]
-        return float(temporal_psnr(images, references, flows, valid, exposure=self.exposure)[0])
+        return float(metrics.temporal_psnr(images, references, flows, valid, exposure=self.exposure)[0])
 
     def find_noise_law(
         self,
@@ -152,7 +137,9 @@ class Evaluator:
             common = [number for number in self.numbers if shot.has(number)]
             references = map(self.store.load_reference, common)
             pairs = zip(common, references, strict=True)
-            errors.append((count, mean_error([psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs])))
+            errors.append(
+                (count, mean_error([metrics.psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs]))
+            )
         errors.sort()
         floor, words = self._find_floor(errors, samples, reference_samples)
         return NoiseLaw(tuple(errors), samples or 1.0, floor), words
@@ -164,7 +151,8 @@ class Evaluator:
         if isinstance(self.store.load_reference(self.numbers[0]), tuple):
             # The error of the mean is a quarter of that between the halves.
             halves = (
-                [tone_map(self.store.load(REFERENCE, n, half), self.exposure) for half in HALVES] for n in self.numbers
+                [metrics.tone_map(self.store.load(REFERENCE, n, half), self.exposure) for half in HALVES]
+                for n in self.numbers
             )
             level = decibels(np.mean([float(np.mean((a - b) ** 2)) / 4 for a, b in halves]))
             return 0.0, (
@@ -226,7 +214,7 @@ def find_static_pixels(
         return np.zeros(shape[:2], bool)
     least, most = np.full(shape, np.inf), np.full(shape, -np.inf)
     for number in numbers:
-        tone = cv2.blur(tone_map(store.load(REFERENCE, number), exposure), (9, 9))
+        tone = cv2.blur(metrics.tone_map(store.load(REFERENCE, number), exposure), (9, 9))
         least, most = np.minimum(least, tone), np.maximum(most, tone)
     static = np.all(most - least < STATIC_CHANGE, axis=-1)
     for _, number in pairs:

@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from hybrid.comparison import chart, page
+from hybrid.comparison import chart, page, tables
 from hybrid.comparison.animations import embed_animations, write_movies
 from hybrid.comparison.embedding import MethodImages, ShotImages, embed_pictures
 from hybrid.comparison.results import (
@@ -36,14 +36,6 @@ from hybrid.comparison.results import (
     to_plain_numbers,
 )
 from hybrid.comparison.store import CHANGE_MAP, MAP_TITLES, REFERENCE, FrameStore
-from hybrid.comparison.tables import (
-    format_bytes,
-    format_change,
-    format_seconds,
-    format_value,
-    format_worth,
-    ladder_rows,
-)
 from hybrid.files.frame import Array
 from hybrid.files.replace import check_outputs, write_file
 
@@ -158,7 +150,7 @@ def _page(
         sweeps=_sweep_tables(present, metrics),
         stages=stage_values(results),
         ladder=None if (ladder := chart.draw_ladder(comparison.ladder)) is None else chart.to_svg(ladder, "ladder"),
-        ladder_rows=ladder_rows(comparison.ladder),
+        ladder_rows=tables.ladder_rows(comparison.ladder),
         shots=_shot_table([comparison, *report.others]),
         **embedded,
         rates=sorted({*RATES, report.rate}),
@@ -185,16 +177,16 @@ def _verdict(
         return None
     metric, by_name = metrics[0], {r.name: r for r in results}
     leader = by_name[best]
-    figures = [(format_value(leader.metrics[metric.key].mean, metric), metric.unit, metric.label)]
+    figures = [(tables.format_value(leader.metrics[metric.key].mean, metric), metric.unit, metric.label)]
     for gained in (m for m in metrics[:2] if pair and not m.logarithmic):
         means = [by_name[name].metrics[gained.key].mean for name in pair or () if gained.key in by_name[name].metrics]
         if len(means) == 2:
             label = f"{gained.label} over {pair[1] if pair else ''}"
-            figures.append((format_change(means[0] - means[1], gained), gained.unit, label))
+            figures.append((tables.format_change(means[0] - means[1], gained), gained.unit, label))
     if leader.worth is not None and math.isfinite(leader.worth):
-        figures.append((format_worth(leader.worth), "", "worth in samples"))
+        figures.append((tables.format_worth(leader.worth), "", "worth in samples"))
     if leader.seconds_per_megapixel is not None:
-        figures.append((format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
+        figures.append((tables.format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
     return Verdict(best, pair and pair[1], [r.name for r in results if r.name in ties], figures)
 
 
@@ -214,8 +206,8 @@ def _plot(results: Sequence[MethodResult], metric: Metric, cost: Cost, prefix: s
     advice = []
     for name in pareto_front(results, metric, cost):
         spent = getattr(by_name[name], cost)
-        budget = format_bytes(spent) if cost == "peak_bytes" else f"{format_seconds(spent)} s"
-        value = f"{format_value(by_name[name].metrics[metric.key].mean, metric)} {metric.unit}".strip()
+        budget = tables.format_bytes(spent) if cost == "peak_bytes" else f"{tables.format_seconds(spent)} s"
+        value = f"{tables.format_value(by_name[name].metrics[metric.key].mean, metric)} {metric.unit}".strip()
         advice.append(("nothing" if spent == 0 else budget, name, value))
     return Plot(metric, cost, None if figure is None else chart.to_svg(figure, prefix), advice)
 

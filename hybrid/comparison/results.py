@@ -210,24 +210,22 @@ def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
     values = []
     for variant in by_name.values():
         base = by_name.get(variant.base)
-        if variant.sweep == "Stages" and base is not None:
-            ((stage, state),) = variant.settings.items()
-            on = state == "off"  # the sweep inverts the plan
-            values.append(_stage_value(str(stage), base.name, on, (base, variant) if on else (variant, base)))
+        if variant.sweep != "Stages" or base is None:
+            continue
+        ((stage, state),) = variant.settings.items()
+        on = state == "off"  # the sweep inverts the plan
+        having, lacking = (base, variant) if on else (variant, base)
+        pairs = {
+            key: (having.metrics[key], lacking.metrics[key])
+            for key in MARKDOWN_METRICS
+            if key in having.metrics and key in lacking.metrics
+        }
+        gains = {key: a.mean - b.mean for key, (a, b) in pairs.items()}
+        significant = tuple(key for key, pair in pairs.items() if not _tied(*pair))
+        costs = [(getattr(having, name), getattr(lacking, name)) for name in list(COSTS)[:2]]
+        spent = (None if None in cost else cost[0] - cost[1] for cost in costs)
+        values.append(StageValue(str(stage), base.name, on, gains, significant, *spent))
     return values
-
-
-def _stage_value(stage: str, base: str, on: bool, pair: tuple[MethodResult, MethodResult]) -> StageValue:
-    """The effect of a stage from the results (with, without) it."""
-    having, lacking = pair
-    gains, significant = {}, []
-    for key in MARKDOWN_METRICS:
-        if key in having.metrics and key in lacking.metrics:
-            gains[key] = having.metrics[key].mean - lacking.metrics[key].mean
-            if not _tied(having.metrics[key], lacking.metrics[key]):
-                significant.append(key)
-    costs = [(getattr(having, name), getattr(lacking, name)) for name in list(COSTS)[:2]]
-    return StageValue(stage, base, on, gains, tuple(significant), *(None if None in c else c[0] - c[1] for c in costs))
 
 
 def _goodness(value: float, metric: Metric) -> float:

@@ -10,25 +10,8 @@ import tomllib
 from importlib.resources import files
 from typing import Any
 
+from hybrid.simulate import scene_assets as assets
 from hybrid.simulate.motion import aim_camera, key_motion, key_swing
-from hybrid.simulate.scene_assets import (
-    add_box,
-    add_lamp,
-    add_object,
-    bevelled,
-    glow,
-    lathe,
-    new_world,
-    node,
-    place,
-    plain,
-    sample_image_coarsely,
-    sphere_profile,
-    studio_light,
-    two_tone,
-    wire,
-    wood,
-)
 
 
 class SceneFile:
@@ -51,18 +34,18 @@ class SceneFile:
     def _add_part(self, part: dict[str, Any]) -> None:
         name, surface = part["name"], self.materials.get(part.get("material", ""))
         if "bevel" in part:
-            item = bevelled((0, 0, 0), part["box"], surface, part["bevel"], name)
+            item = assets.bevelled((0, 0, 0), part["box"], surface, part["bevel"], name)
         elif "box" in part:
-            item = add_box((0, 0, 0), part["box"], surface, name)
+            item = assets.add_box((0, 0, 0), part["box"], surface, name)
         elif "wire" in part:
-            item = wire(part["wire"], part["radius"], surface, name)
+            item = assets.wire(part["wire"], part["radius"], surface, name)
         elif "lathe" in part or "sphere" in part:
-            outline = part["lathe"] if "lathe" in part else sphere_profile(*part["sphere"])
-            item = lathe(name, outline, surface, segments=part.get("segments", 72))
+            outline = part["lathe"] if "lathe" in part else assets.sphere_profile(*part["sphere"])
+            item = assets.lathe(name, outline, surface, segments=part.get("segments", 72))
         else:
-            item = add_object(name, None)
+            item = assets.add_object(name, None)
         parent = self.parts.get(part.get("parent", ""))
-        place(item, part.get("at", (0, 0, 0)), part.get("turn", (0, 0, 0)), parent=parent)
+        assets.place(item, part.get("at", (0, 0, 0)), part.get("turn", (0, 0, 0)), parent=parent)
         item.scale = part.get("scale", (1, 1, 1))
         self._move(item, part)
         self.parts[name] = item
@@ -74,7 +57,7 @@ class SceneFile:
             key_motion(item, self.frames, motion.get("velocity", (0, 0, 0)), motion.get("spin", (0, 0, 0)))
 
     def _add_lamp(self, kind: str, **lamp: Any) -> None:
-        item = add_lamp(kind, *(lamp.pop(key) for key in ("at", "power", "size", "target", "tint")))
+        item = assets.add_lamp(kind, *(lamp.pop(key) for key in ("at", "power", "size", "target", "tint")))
         self._move(item, lamp)
         for key in lamp.keys() - {"spin"}:
             setattr(item.data, key, lamp[key])
@@ -90,23 +73,24 @@ class SceneFile:
 
 def make_material(name: str, values: dict[str, Any]) -> Any:
     if "grain" in values:
-        return wood(*values.pop("grain"), **values)
+        return assets.wood(*values.pop("grain"), **values)
     if "glow" in values:
-        return glow(values["glow"], values["strength"])
+        return assets.glow(values["glow"], values["strength"])
     if "glass" in values:
-        return plain(name, values["glass"], Roughness=0, Transmission_Weight=1, IOR=values["ior"])
-    return two_tone(name, **values) if "dark" in values else plain(name, **values)
+        return assets.plain(name, values["glass"], Roughness=0, Transmission_Weight=1, IOR=values["ior"])
+    return assets.two_tone(name, **values) if "dark" in values else assets.plain(name, **values)
 
 
 def light_by_image(image: str = "", strength: float = 0.0, turn: float = 0.0) -> None:
     """Light the scene by one of Blender's environment images, turned around z; not at all without one."""
-    world = new_world()
+    world = assets.new_world()
     tree = world.node_tree
     background = tree.nodes["Background"]
     background.inputs["Strength"].default_value = strength
     if image:
-        sample_image_coarsely(world)
-        where = node(tree, "Mapping", Vector=node(tree, "TexCoord").outputs["Generated"], Rotation=(0, 0, turn))
-        texture = node(tree, "TexEnvironment", Vector=where.outputs[0])
-        texture.image = studio_light(image)
+        assets.sample_image_coarsely(world)
+        generated = assets.node(tree, "TexCoord").outputs["Generated"]
+        where = assets.node(tree, "Mapping", Vector=generated, Rotation=(0, 0, turn))
+        texture = assets.node(tree, "TexEnvironment", Vector=where.outputs[0])
+        texture.image = assets.studio_light(image)
         tree.links.new(texture.outputs["Color"], background.inputs["Color"])

@@ -9,15 +9,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from hybrid import player
+from hybrid.comparison import tables
 from hybrid.comparison.results import settings_as_text
-from hybrid.comparison.tables import (
-    column_title,
-    format_bytes,
-    format_change,
-    format_seconds,
-    format_value,
-    format_worth,
-)
 
 # In this order, after the player, they are one module script; each file is named after its part of the page.
 SCRIPTS = ("figures.js", "chart.js", "pictures.js", "painter.js", "slices.js", "viewer.js", "animations.js", "start.js")
@@ -31,12 +24,12 @@ _templates = Environment(
 )
 _templates.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # without sorting keys
 _templates.filters |= {
-    "column_title": column_title,
-    "value": format_value,
-    "change": format_change,
-    "seconds": format_seconds,
-    "bytes": format_bytes,
-    "worth": format_worth,
+    "column_title": tables.column_title,
+    "value": tables.format_value,
+    "change": tables.format_change,
+    "seconds": tables.format_seconds,
+    "bytes": tables.format_bytes,
+    "worth": tables.format_worth,
     "settings": settings_as_text,
 }
 
