@@ -89,14 +89,8 @@ def estimate_confidence(
 def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, first_row: int = 0) -> np.ndarray:
     """Find where valid vectors end in the frame, at pixels that have all been measured: (H, W) bool.
 
-    Parameters
-    ----------
-    flow, valid : (h, W, 2) float32 and (h, W) bool array
-        From some rows of the centre to a neighbour, pixels.
-    measured : (H, W) bool array
-        Of the whole neighbour.
-    first_row : int
-        The first of these rows.
+    The flow (h, W, 2), pixels, and its validity are those of rows of the centre from `first_row` on, `measured` (H, W)
+    is of the whole neighbour.
     """
     covered = np.empty(valid.shape, np.bool_)
     given = (np.ascontiguousarray(layer) for layer in (flow, valid, measured))
@@ -105,13 +99,7 @@ def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, fir
 
 
 def fill_uncovered(warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray) -> None:
-    """Write the centre's pixels, in place, into a warped picture where its coverage is 0.
-
-    Parameters
-    ----------
-    warped, centre : (H, W, C) float32 array
-    coverage : (H, W) float32 array
-    """
+    """Write the centre's pixels (H, W, C) into a warped picture, in place, where its coverage (H, W) is 0."""
     run_bands(_fill, len(warped), warped, np.ascontiguousarray(centre), coverage)
 
 

@@ -104,26 +104,14 @@ def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
 
 
 def make_guide(color: np.ndarray, albedo: np.ndarray | None = None, *, exposure: float) -> Guide:
-    """Make the guide of a frame: tone-mapped luminance, smoothed within its surfaces, and albedo.
+    """Make the guide of a frame (H, W, 3): tone-mapped luminance, smoothed within its surfaces, and albedo, if given.
 
-    Parameters
-    ----------
-    color : (H, W, 3) float array
-        Linear radiance. Negative and NaN count as 0, Inf as white.
-    albedo : (H, W, 3) float array, optional
-        At least 0. It steers the smoothing, and is a guide plane of its own; without albedo the luminance steers
-        itself.
-    exposure : float, the radiance that maps to 0.5, positive: one value for both frames of a pair
+    In linear radiance negative and NaN count as 0, Inf as white. The albedo, at least 0, steers the smoothing, and is a
+    guide plane of its own; without it the luminance steers itself. `exposure` is the radiance that maps to 0.5, one
+    value for both frames of a pair; the guide is the same for ``a * color`` and ``a * exposure``.
 
-    Returns
-    -------
-    Guide
-        One plane, or two with albedo. The same for ``a * color`` and ``a * exposure``.
-
-    Notes
-    -----
-    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided
-    filter over 5 x 5 pixels (He, Sun, Tang: Guided image filtering. 2013. doi:10.1109/TPAMI.2012.213).
+    Reinhard's L / (L + exposure) comes first, so that a firefly counts for one white pixel, then a guided filter over 5
+    x 5 pixels (He, Sun, Tang: Guided image filtering. 2013. doi:10.1109/TPAMI.2012.213).
     """
     if color.ndim != 3 or color.shape[2] != 3:
         raise ValueError(f"color has shape {color.shape}, expected (H, W, 3)")

@@ -112,26 +112,11 @@ class Motion(NamedTuple):
 def normalize_motion(
     vectors: np.ndarray, convention: MotionConvention, *, resolution: tuple[int, int] | None = None
 ) -> Motion:
-    """Convert a renderer's motion vectors into flows to the previous and to the next frame.
+    """Convert a renderer's vectors (H, W, C) into flows (H, W, 2), pixels, to the previous and to the next frame.
 
-    Parameters
-    ----------
-    vectors : (H, W, C) array of float
-        As rendered, C at least `convention.channels`; further channels are ignored.
-    convention : MotionConvention
-    resolution : (int, int), optional
-        Height and width, pixels, of the whole picture, the base of NDC units; default: those of `vectors`.
-
-    Returns
-    -------
-    Motion
-        At least one flow (H, W, 2) float32, pixels, x right then y down. Vectors that are NaN, infinite, or longer than
-        `ABSURD_LENGTH` in a component are invalid.
-
-    Raises
-    ------
-    ValueError
-        Fewer channels than the convention has.
+    Channels beyond those of the convention are ignored. `resolution` is height and width of the whole picture, the base
+    of NDC units, by default those of `vectors`. At least one flow is there; vectors that are NaN, infinite, or longer
+    than `ABSURD_LENGTH` in a component are invalid. Raises ValueError for fewer channels than the convention has.
     """
     if vectors.ndim != 3 or vectors.shape[2] < convention.channels:
         expected = f"(H, W, {convention.channels} or more) for {convention}"
@@ -270,25 +255,12 @@ def _splat(
 def invert_flow(
     flow: np.ndarray, *, valid: np.ndarray | None = None, depth: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Invert the flow from frame b to frame a by splatting: flow and validity from a to b.
+    """Invert the flow (H, W, 2), finite, from frame b to frame a by splatting: flow and validity from a to b.
 
     Where a renderer gives only vectors to the previous frame, those to the next frame are `invert_flow(the next frame's
-    to_previous)`.
-
-    Parameters
-    ----------
-    flow : (H, W, 2) array of float, pixels, finite, of frame b
-    valid : (H, W) array of bool, optional
-        Of frame b; invalid vectors are left out.
-    depth : (H, W) array of float, optional
-        Above 0, of frame b, smaller is nearer. Of several pixels that arrive at one place the nearest wins; without
-        depth the fastest, as fast objects tend to be in front.
-
-    Returns
-    -------
-    inverse : (H, W, 2) array of float32
-        Of frame a. Where nothing arrives (hidden in b), the mean of the neighbours within two pixels, else 0.
-    valid : (H, W) array of bool, True where a vector arrived
+    to_previous)`. Vectors of b that are not `valid` (H, W) are left out. Of several pixels that arrive at one place the
+    nearest by `depth` (H, W), above 0, wins, without depth the fastest, as fast objects tend to be in front. Where
+    nothing arrives (hidden in b) the inverse is invalid, the mean of the neighbours within two pixels, else 0.
     """
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise ValueError(f"flow has shape {flow.shape}, expected (H, W, 2)")

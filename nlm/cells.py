@@ -20,15 +20,7 @@ class Axis(NamedTuple):
 
 
 def cell_axis(length: int, side: int) -> Axis:
-    """Divide the pixels of an axis into cells.
-
-    Parameters
-    ----------
-    length : int
-        Number of pixels.
-    side : int
-        Pixels of a cell.
-    """
+    """Divide the pixels of an axis of this length into cells of `side` pixels."""
     cells = -(-length // side)
     pixels = np.pad(np.arange(length), (0, cells * side - length), mode="symmetric")
     position = np.clip((np.arange(length) + 0.5) / side - 0.5, 0, cells - 1)
@@ -38,18 +30,7 @@ def cell_axis(length: int, side: int) -> Axis:
 
 @njit(cache=True, nogil=True, inline="always")
 def blend_rows(cells: Floats, axis: Axis, y: int, blended: Floats) -> None:
-    """Write the values of planes at the height of a row of pixels.
-
-    Parameters
-    ----------
-    cells : (K, rows of cells, columns of cells) float32
-    axis : Axis
-        Of the rows.
-    y : int
-        The row.
-    blended : (K, columns of cells) float32
-        The result.
-    """
+    """Write the values of cells (K, rows, columns) at the height of a row `y` of pixels into `blended` (K, columns)."""
     above, below, share = axis.before[y], axis.after[y], axis.share[y]
     for k in range(cells.shape[0]):
         for column in range(cells.shape[2]):
@@ -59,19 +40,7 @@ def blend_rows(cells: Floats, axis: Axis, y: int, blended: Floats) -> None:
 
 @njit(cache=True, nogil=True, inline="always")
 def blend_columns(blended: Floats, k: int, axis: Axis, x: int) -> np.float32:
-    """Value of a plane at a pixel.
-
-    Parameters
-    ----------
-    blended : (K, columns of cells) float32
-        From `blend_rows`.
-    k : int
-        The plane.
-    axis : Axis
-        Of the columns.
-    x : int
-        The column.
-    """
+    """Value of plane `k` at a pixel `x` of the columns' axis, from `blend_rows`."""
     first = blended[k, axis.before[x]]
     value: np.float32 = first + axis.share[x] * (blended[k, axis.after[x]] - first)
     return value

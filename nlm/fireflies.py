@@ -85,17 +85,9 @@ def find_bright_samples(color: Floats) -> tuple[Places, Mask]:
 def measure_highlights(
     color: Floats, pixels: Places, factor: Callable[[Places, Places], Floats | None] = lambda *_: None
 ) -> Highlights:
-    """Measure position, light and pattern of bright pixels above their surroundings.
+    """Measure position, light and pattern of pixels (K, 2), anywhere, above their surroundings in a color (H, W, C).
 
-    Parameters
-    ----------
-    color : (H, W, C) float32, radiance or irradiance, finite
-    pixels : (K, 2) intp, anywhere, also outside the frame
-    factor : callable
-        From rows and columns (K, y, x) to the factor (K, y, x, C) from `color` to radiance there, or None.
-
-    Notes
-    -----
+    `factor` maps rows and columns (K, y, x) to the factor (K, y, x, C) from the color to radiance there, or to None.
     The light is Σ f (c − r) over the 3×3 around a pixel, r the mean of the 5×5 ring around these without its brightest
     pixel: this holds all of a small lamp under a pixel filter of up to 1.5 pixels, wherever in the pixel the lamp is.
     """

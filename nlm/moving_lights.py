@@ -70,10 +70,8 @@ def confirmed_by_neighbour(
 
     Parameters
     ----------
-    excess, bright : (H, W) array, of the frame, as for `find_bright` and from `find_bright`
-    other_excess, other_bright : (H, W) array, of the other frame
-    flow : (H, W, 2) float32 or None
-        Motion of surfaces to the other frame, pixels, x first; None: nothing moves.
+    excess, bright, other_excess, other_bright : (H, W) array, as for and from `find_bright`, of both frames
+    flow : (H, W, 2) float32 or None, motion of surfaces to the other frame, pixels, x first; None: nothing moves
     """
     found = np.zeros_like(bright)
     for motion in shared_motions(bright, other_bright):
@@ -84,23 +82,12 @@ def confirmed_by_neighbour(
 def passing_lights(
     excess: Floats, bright: Mask, others: Mapping[int, tuple[tuple[Floats, Mask], Floats | None]]
 ) -> tuple[Mask, tuple[int, int]]:
-    """Find the bright pixels that the frames before and after show along one steady motion.
+    """Find the bright pixels (H, W) that the frames before and after show along one steady motion, rows and columns.
 
-    As `confirmed_by_neighbour`, for an excess that edges of moving things have too: motions must be few, as those
-    between two edges are not, and opposite in both frames, unless the pixel leaves the frame: noise is seldom confirmed
-    twice.
-
-    Parameters
-    ----------
-    excess, bright : (H, W) array, of the frame
-    others : mapping of −1 (the frame before) and 1, or one of these, to (`excess`, `bright`) there, and `flow` to it
-
-    Returns
-    -------
-    (H, W) bool
-        The pixels.
-    (int, int)
-        The motion to the frame after that most of them share, rows and columns.
+    `excess` and `bright` are as for `confirmed_by_neighbour`, `others` maps −1 (the frame before) and 1, or one of
+    these, to both there and the `flow` to it. For an excess that edges of moving things have too: motions must be few,
+    as those between two edges are not, and opposite in both frames, unless the pixel leaves the frame: noise is seldom
+    confirmed twice. The motion is that to the frame after that most pixels share.
     """
     motions = {
         time: [(time * y, time * x) for y, x in shared_motions(bright, other_bright)]

@@ -253,19 +253,10 @@ def _second_differences(layer: Floats) -> Floats:
 
 
 def limit_change(own: Floats, color: Floats, most: float, *, with_factor: bool) -> tuple[Floats, Floats]:
-    """Change a picture to another color by a factor of `most` at most, and return the factor.
+    """Change a picture `own` (H, W, C) to another color by a factor of `most` at most, and return the factor.
 
-    Parameters
-    ----------
-    own, color : (H, W, C) float32
-        The picture; where it is 0 or less the color is taken as it is.
-    most : float
-    with_factor : bool
-        Whether the factor is needed, by which the parts of the picture change; else it is empty.
-
-    Returns
-    -------
-    changed, factor : (H, W, C) float32
+    Where the picture is 0 or less the color is taken as it is. The factor, by which the parts of the picture change, is
+    empty unless `with_factor`.
     """
     changed, factor = np.empty_like(own), np.empty(own.shape if with_factor else (0, 0, 0), np.float32)
     run_bands(_limit_change, len(own), own, np.ascontiguousarray(color), np.float32(most), changed, factor)

@@ -176,27 +176,9 @@ def align_results(
 ) -> tuple[Array, Array]:
     """Align the results of a frame and its two neighbours, and measure how far they show the same.
 
-    Parameters
-    ----------
-    window : Window
-        Three frames, with their results in the place of a first pass.
-    trust : sequence of Trust or None
-        Of the two neighbours, for the whole frame.
-    stillness : Stillness
-        Of the centre (`measure_stillness`).
-    exposure : float
-        Of the centre's irradiance as rendered.
-    rows : slice, optional
-        As for `align`.
-    timings : Timings, optional
-        Counts the stages "warp" and "stabilize".
-
-    Returns
-    -------
-    results : (3, h, W, 3) array
-        Radiance at the centre's rows `rows`, in its light; its own where a frame shows or has none.
-    confidence : (3, h, W) array
-        In [0, 1].
+    `window` holds three frames with their results in the place of a first pass, `trust` is that in the two neighbours
+    for the whole frame, `exposure` that of the centre's irradiance as rendered, `rows` as for `align`. Returns radiance
+    (3, h, W, 3) in the centre's light, its own where a frame shows or has none, and a confidence (3, h, W) in [0, 1].
     """
     timings = timings or Timings()
     centre, stages = window.centre, window.stages

@@ -43,23 +43,12 @@ def warp_residual(
     out: Array,
     limited: Limited | None = None,
 ) -> None:
-    """Write irradiance − first pass of a frame, warped to the nearest pixel.
+    """Write irradiance − first pass of a frame (H, W, 3), warped to the nearest pixel, into contiguous `out` (h, w, 3).
 
-    Parameters
-    ----------
-    irradiance : (H, W, 3) array
-    first_pass : (H, W, 3) array
-        Radiance.
-    albedo : (H, W, 3) array or None
-        Divides the first pass (`hybrid.alignment.transfer.demodulate`); None where irradiance is radiance.
-    flow : (h, w, 2) array or None
-        From a part of the centre to the frame, pixels; None for no motion.
-    start : (int, int)
-        The first row and column of that part.
-    out : (h, w, 3) array
-        The result, contiguous.
-    limited : Limited, optional
-        From `measure_limited`: residuals are limited, and the light that this takes is added.
+    The first pass is radiance; `albedo` divides it (`hybrid.alignment.transfer.demodulate`), None where irradiance is
+    radiance. The flow (h, w, 2), pixels, leads from a part of the centre, whose first row and column are `start`, to
+    the frame; None: no motion. With `limited` from `measure_limited` residuals are limited, and the light that this
+    takes is added.
     """
     absent = np.empty((0, 0, 0), np.float32)
     given = irradiance, first_pass, albedo, flow
@@ -70,20 +59,9 @@ def warp_residual(
 def measure_limited(irradiance: Array, first_pass: Array, albedo: Array | None, exposure: float) -> Limited | None:
     """Measure the light that the limit of residuals takes from a frame; None where it takes next to nothing.
 
-    The limit cuts bright samples alone, so that what is left is too dark: by 14 % in a room at 8 samples.
+    The limit cuts bright samples alone, so that what is left is too dark: by 14 % in a room at 8 samples. Arrays are
+    those of `warp_residual`, the exposure that of the irradiance.
 
-    Parameters
-    ----------
-    irradiance : (H, W, 3) array
-    first_pass : (H, W, 3) array
-        Radiance.
-    albedo : (H, W, 3) array or None
-        As for `warp_residual`.
-    exposure : float
-        Of the irradiance.
-
-    Notes
-    -----
     With r the residual, r' the limited one (`nlm.pooling.pool_samples`), l the first pass plus exposure and K a
     Gaussian mean, the light lost is −K[r' / l], which is 0 for a first pass that is right in the mean, but between 0
     and K[(r − r') / l]: no more than was cut, however wrong the first pass, and however bright one sample.

@@ -192,28 +192,12 @@ class Shot:
         attributes: Mapping[str, str] | None = None,
         others: Iterable[tuple[Self, Mapping[str, np.ndarray], Mapping[str, np.ndarray]]] = (),
     ) -> int:
-        """Write a frame's file again with some layers replaced (`hybrid.files.exr.write_exr`).
+        """Write a frame's file again with some layers replaced (`write_exr`); return how many values were clamped.
 
-        Parameters
-        ----------
-        path : str or Path
-            The file to write.
-        number : int
-            Frame number.
-        images : mapping of str to array
-            "color", "alpha" or the name of one of `aovs` → (H, W, C) or (H, W), of the size of `Frame.color`.
-            "color" replaces `Layers.target`. Channels beyond C stay as they are.
-        extra : mapping of str to array, optional
-            Layers to add; name → (H, W, C) or (H, W), of the same size, named by `own_name`.
-        attributes : mapping of str to str, optional
-            Strings for the header.
-        others : iterable of (Shot, mapping of str to array, mapping of str to array)
-            Other `views` of the same files with their `images` and `extra`.
-
-        Returns
-        -------
-        int
-            How many values were too large for a half channel.
+        `images` maps "color" (`Layers.target`), "alpha" or the name of one of `aovs` to (H, W, C) or (H, W), of the
+        size of `Frame.color`; channels beyond C stay as they are. `extra` maps names of layers to add (`own_name`) to
+        such images, `attributes` are strings for the header; `others` are other `views` of the same files with their
+        `images` and `extra`.
         """
         reader = self.reader
         reader.check_unchanged([number])
@@ -371,14 +355,8 @@ def _warn_of_one_file(spec: str | Path) -> list[str]:
 def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None = None) -> Shot:
     """Open another sequence of the frames of a shot: a reference, or the result of another denoiser.
 
-    Errors are those of `open_shot`.
-
-    Parameters
-    ----------
-    spec : str or Path
-    shot : Shot
-        Its color is chosen if the other's layers leave a choice, as between two view layers.
-    frames : str, optional
+    The shot's color is chosen if the other's layers leave a choice, as between two view layers. Errors are those of
+    `open_shot`.
     """
     opened = open_shot(spec, frames=frames, keep=0)
     with suppress(ExrError):
@@ -392,24 +370,11 @@ def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None =
 
 
 def output_path(pattern: str | Path, shot: Shot, number: int, *, include_context: bool = False) -> Path:
-    """Return the file of a result.
+    """Return the file of a frame's result; with `include_context` frames that were not asked for get files too.
 
-    Parameters
-    ----------
-    pattern : str or Path
-        ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (an existing one, or any
-        name without ``.exr``), which keeps the input's file names.
-    shot : Shot
-    number : int
-        Frame number.
-    include_context : bool
-        Frames that were not asked for get files too.
-
-    Raises
-    ------
-    ValueError
-        If several frames would get one name, an input file would be overwritten, or a name with a place for the number
-        does not end in ``.exr``.
+    The pattern is ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (an existing
+    one, or any name without ``.exr``), which keeps the input's file names. Raises ValueError if several frames would
+    get one name, an input file would be overwritten, or a name with a place for the number does not end in ``.exr``.
     """
     pattern = str(pattern)
     names, _ = parse_pattern(pattern)
