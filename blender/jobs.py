@@ -1,7 +1,4 @@
-"""The current job: wait for Blender to render if requested, then follow `ravg` to its end.
-
-A timer follows the job, not a modal operator, which would block Blender's automatic saving.
-"""
+"""The current job, followed by a timer: a modal operator would block Blender's automatic saving."""
 
 import textwrap
 import time

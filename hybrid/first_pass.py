@@ -129,16 +129,13 @@ def find_first_pass(
     """Find a first pass by its name.
 
     "auto" is the denoised picture in the file, else `mode` where OIDN is installed, else the bundled network, else the
-    classical chain. "oidn" (quality high, guides as given), "oidn-fast", "oidn-clean" (guides prefiltered with OIDN's
-    balanced networks, in frames where they hold noise), "oidn-best" (with its largest, in all), "nlm" (the classical
-    chain on each frame's window), "bundled" (of the quality of `mode`), "none", or the pattern of a finished sequence.
-
-    `kept` is a pattern or a folder that keeps OIDN's pictures; those that are there and would be the same are read;
-    they depend on the `forced` stages (`hybrid.plan.Rules.forced`).
+    classical chain; others are "none", "nlm" (the classical chain on each frame's window), "bundled" (of the quality of
+    `mode`), the `OIDN_MODES`, or the pattern of a finished sequence. `kept` is a pattern or a folder that keeps OIDN's
+    pictures; those that would be the same, under the same `forced` stages, are read.
 
     Raises ImportError if OIDN is asked for by name and not installed; FileNotFoundError if there is no such sequence;
-    ValueError if a sequence lacks frames of the shot, or has each in the place of its neighbour, if `kept` is one file
-    for several frames, or if OIDN has no such device.
+    ValueError if a sequence lacks frames or has each in its neighbour's place, `kept` is one file, or OIDN lacks the
+    device.
     """
     if spec not in SPECS:
         source = _sequence(spec, shot)

@@ -1,7 +1,4 @@
-"""Denoise a shot: one description of what is asked for, and one way to run it.
-
-The command, the Python API, chunks on a cluster and ``--resume`` all go through `Job`.
-"""
+"""One description of what is asked for and one way to run it: command, Python, chunks on a cluster, ``--resume``."""
 
 import hashlib
 import json

@@ -1,7 +1,4 @@
-"""Intel Open Image Denoise, frame by frame: the peer to compare with, and a source of estimates.
-
-Needs the optional package ``pyoidn`` (extra ``compare``), imported at the first call.
-"""
+"""Intel Open Image Denoise, frame by frame, by the optional package ``pyoidn``: a peer, and a source of estimates."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,14 +33,11 @@ def denoise_oidn(
     """Denoise one frame (H, W, 3) with OIDN's ray-tracing filter in HDR mode (https://www.openimagedenoise.org).
 
     The color is linear radiance, finite; OIDN counts negative values as 0. Albedo is in [0, 1], normals in [−1, 1], in
-    any fixed space; OIDN takes these only beside an albedo.
-
-    `prefilter` denoises albedo and normal with filters of their own first, of this quality, and declares them clean
-    (``cleanAux``). With "high" this is OIDN's best mode and Blender's default, at seven times the cost; with "balanced"
-    it takes four times, for pictures that are 0.07 dB worse (mean over 13 shots of 4 to 54 samples). `clean` declares
-    them clean as they are. `scale` is what color is multiplied by before the network sees it; measured by OIDN if not
-    given. Part of a frame needs the whole frame's (`hybrid.alignment.transfer.autoexposure`). `device` is as for
-    `find_device`.
+    any fixed space, beside an albedo only. `prefilter` denoises these first, with this quality, and declares them clean
+    (``cleanAux``): "high" is OIDN's best mode and Blender's default, at seven times the cost; "balanced" takes four
+    times, for pictures that are 0.07 dB worse (mean over 13 shots of 4 to 54 samples). `clean` declares them clean as
+    they are. `scale` multiplies the color before the network, measured by OIDN if not given; part of a frame needs the
+    whole frame's (`hybrid.alignment.transfer.autoexposure`).
 
     Raises ImportError if pyoidn is not installed; ValueError if shapes differ or values are not finite; RuntimeError if
     OIDN reports an error, or has no such device here.

@@ -88,16 +88,12 @@ def denoise_frames(
     radius: int = 2,
     timings: Timings | None = None,
 ) -> Iterator[Finished | Failed]:
-    """Denoise every frame of a shot and write it, one after the other.
+    """Denoise every frame of a shot and write it; yield `Finished`, or `Failed` with `keep_going`, in their order.
 
-    Yields `Finished` or, with `keep_going`, `Failed` in the order of the frames, each after it has been written as a
-    whole or given up; most often when the next one has been denoised. The views are the shot and further pictures of
-    the same files, each with a window of its own; a file is written once.
-
-    While a frame is denoised, the one before it is written in one thread; after it is denoised, the next one that its
-    successor needs is read in another: memory is at its fullest while a denoiser runs. Whatever ends the process, a
-    frame is there as a whole or not at all (`hybrid.files.replace.replace_file`). Files that earlier processes have
-    left half written are removed.
+    Most often a frame is yielded when the next one has been denoised. The views are the shot and further pictures of
+    the same files, each with a window of its own; a file is written once. While a frame is denoised, the one before it
+    is written in one thread; after it is denoised, the next one that its successor needs is read in another: memory is
+    at its fullest while a denoiser runs. Files that earlier processes have left half written are removed.
 
     Raises ValueError if a frame would be written over its own input, or its result cannot be right: it is not finite,
     or its light is not that of the noisy frame (`hybrid.validation.find_lost_light`).

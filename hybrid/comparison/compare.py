@@ -56,14 +56,10 @@ def compare_shot(
     """Run every method on a shot and evaluate its frames against the reference; one result per method, in their order.
 
     Frames without a reference are not evaluated. Two independent renders as reference remove its noise from PSNR,
-    relMSE and temporal PSNR (`hybrid.comparison.metrics`). That noise matters: 512 samples per pixel of a bathroom had
-    half of the squared error that OIDN's best mode showed against them. The new or empty `folder`, or a temporary one,
-    receives frames and maps for a `FrameStore`. `on_step` is told each step as it starts (`count_steps`). A
-    method that is not installed, or whose process died, has an `absent_reason` instead of measurements.
-
-    Raises ValueError before any method runs: if shot and reference have no frame in common; if another input lacks a
-    frame or differs in size; if levels are given without samples or without the method "noisy"; if a ladder has one
-    number of samples twice, or a level without some frame.
+    relMSE and temporal PSNR: 512 samples per pixel of a bathroom had half of the squared error that OIDN's best mode
+    showed against them. The empty `folder`, or a temporary one, receives a `FrameStore`. A method that is not
+    installed, or whose process died, has an `absent_reason`. Raises ValueError before any method runs if an input lacks
+    a frame or differs in size, or levels do not fit the shot, the methods or a ladder.
     """
     options = options or CompareOptions()
     halves = reference if isinstance(reference, tuple) else (reference,)

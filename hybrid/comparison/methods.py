@@ -1,8 +1,4 @@
-"""Denoisers that `ravg compare` runs: parts of ravg, alone and together, and OIDN.
-
-`METHODS` is the one place to add a method. A method is a callable from a shot to its denoised frames;
-`hybrid.comparison.sweep` varies the settings of some methods.
-"""
+"""Denoisers that `ravg compare` runs, from a shot to denoised frames: parts of ravg, alone and together, and OIDN."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

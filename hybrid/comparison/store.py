@@ -1,7 +1,4 @@
-"""Arrays of a comparison on disk: frames of each method, reference, flows and maps.
-
-The frames of a long shot do not fit into the memory of the comparing process.
-"""
+"""Arrays of a comparison on disk, as frames of long shots do not fit in memory: frames, reference, flows and maps."""
 
 import hashlib
 from dataclasses import dataclass

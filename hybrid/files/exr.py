@@ -211,13 +211,12 @@ class ExrImage:
         return out
 
     def layer(self, name: str) -> Layer:
-        """Return the layer with this name, or a channel as a layer of its own; ExrError, with what is there, if not
-        one.
+        """Return the layer with this name, or a channel as a layer; ExrError, with what is there, unless there is one.
 
-        Tried in this order: the name of a layer, or ``RGBA`` or ``RGB`` for the bare channels; the name of a layer
-        without its view; the name of a channel; a layer with its channels (``ViewLayer.Combined.RGBA``, as listed);
-        the name of a part; all of these in any case; the end of a layer's name (``DiffDir`` for
-        ``ViewLayer.DiffDir``). The default stereo view goes before the others.
+        Tried in this order: the name of a layer (``RGBA`` or ``RGB`` for the bare channels), without its view, of a
+        channel, of a layer with its channels (``ViewLayer.Combined.RGBA``, as listed), of a part; all of these in any
+        case; the end of a layer's name (``DiffDir`` for ``ViewLayer.DiffDir``). The default stereo view goes before the
+        others.
         """
         end = "." + name.lower()
         for fold in (str, str.lower):
@@ -285,12 +284,11 @@ def without_view(layer: Layer) -> str:
 
 
 def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIXELS) -> ExrImage:
-    """Read an OpenEXR file, or its headers only: scan lines or tiles, one part or several, half, float and uint
-    channels.
+    """Read an OpenEXR file, of scan lines or tiles, one part or several, or its headers only.
 
     `max_pixels` is the largest data window accepted; memory is bounded by 64 bytes for each of these pixels. Raises
-    OSError if the file cannot be opened; ExrError if it is no OpenEXR file, is damaged or truncated (also where only
-    one part of it is), too large, deep in all parts, mip-mapped or chroma-subsampled.
+    OSError if the file cannot be opened; ExrError if it is no OpenEXR file, damaged (also where only one part is), too
+    large, deep in all parts, mip-mapped or chroma-subsampled.
     """
     path = Path(path)
     refuse_other_kinds(path)
@@ -452,17 +450,13 @@ def write_exr(
     """Write a file again with some channels replaced; every other channel, part and attribute is kept.
 
     `path` may be the source itself; the file appears when all of it is written. `replaced` maps qualified channel names
-    to (H, W), of the size of the part's data window, which are converted to the source's pixel type. `extra` maps names
-    of layers to add to (H, W) or (H, W, C), of the size of some part's data window, stored as float16, float32 or
-    uint32; `attributes` are strings for the header of the first part. Returns how many finite values were too large for
-    a half channel, and were written as ±65504 instead of Inf.
-
-    Channels that are not replaced keep their values exactly: a part with such channels whose compression loses a little
-    each time it is written (DWA, B44) is written with ZIP. Deep parts are kept.
+    to (H, W), of the part's data window, which are converted to the source's pixel type; `extra` maps names of layers
+    to add to (H, W) or (H, W, C), of some part's data window; `attributes` are strings for the first header. Returns
+    how many finite values were too large for a half channel, and were written as ±65504 instead of Inf. A part that
+    keeps channels, whose compression loses a little each time (DWA, B44), is written with ZIP.
 
     Raises ExrError if the source has no such channel, or an added layer already; ValueError if such a layer has more
-    than four channels, or an attribute would replace one that is not a string; OSError if the file cannot be written;
-    no partial file is left.
+    than four channels, or an attribute would replace one that is no string; OSError if the file cannot be written.
     """
     by_part: list[dict[str, OpenEXR.Channel]] = [dict(part.channels) for part in source.parts]
     clamped = 0

@@ -109,20 +109,17 @@ def find_layers(
 ) -> Layers:
     """Find the layer of each role by its name; a file's pixels are not needed.
 
-    `overrides` maps roles to names (`ExrImage.layer`) or to layers that were found in such a file before; `aovs` are
-    names of further layers to denoise, `ALL` for every layer that has a name for light; `sidecars` maps roles to layers
-    of other files. Without a profile the one that fits the file is used.
+    `overrides` maps roles to names (`ExrImage.layer`) or to layers found in such a file before; `aovs` are names of
+    further layers to denoise, or `ALL`; `sidecars` maps roles to layers of other files. Without a profile the one that
+    fits the file is used.
 
     Where Cycles denoised at render time, ``Noisy Image`` is the color and ``Combined`` an estimate (``Image``, where
-    Blender's File Output node has written them). The other layers come from the color's own view layer and stereo view
-    only. Gray is read as a color, of one channel three times, where there is no other.
-
-    Two layers that could be the color (of two view layers; ``beauty`` beside bare R, G, B) are refused: the other one
-    would stay noisy in the file. A known renderer's name of its color goes before names that others use.
+    Blender's File Output node has written them). Other layers come from the color's own view layer and stereo view
+    only. Two layers that could be the color (of two view layers; ``beauty`` beside bare R, G, B) are refused: one would
+    stay noisy in the file. A known renderer's name of its color goes before names that others use.
 
     Raises ExrError if there is no color, if a role fits several layers, if an override names a missing layer or one
-    with other channels than the role needs, or if an AOV is a layer that is written anyway; ValueError for an unknown
-    role.
+    without the role's channels, or if an AOV is a layer that is written anyway; ValueError for an unknown role.
     """
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLES):

@@ -1,7 +1,4 @@
-"""Atomic writes: a file appears whole or not at all, and never replaces an input.
-
-All that a command writes is checked by `check_outputs` at its start, and written by `replace_file`.
-"""
+"""Atomic writes: a file appears whole or not at all (`replace_file`), and never replaces an input (`check_outputs`)."""
 
 import os
 import re

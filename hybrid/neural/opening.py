@@ -22,16 +22,11 @@ def open_network(
     add_layers: bool = False,
     timings: Timings | None = None,
 ) -> NetworkDenoiser:
-    """Load weights, and return the denoiser that runs them.
+    """Load weights, and return the denoiser that runs them; options are those of `hybrid.job.DenoiseOptions`.
 
-    `tile` is the side of the squares that the network processes at once, pixels; a halo is added around each.
-    `precision` "auto" is bfloat16 where the processor computes in it. `threshold` is t·K of predicted kernels, in [0,
-    1); higher stays closer to the input; by default that of the training. A breakdown counts the weights of the frames;
-    each frame's contribution and weight are then further layers. With `add_layers` the image is the sum of its light
-    passes, instead of these being scaled to it.
-
-    Options are those of `hybrid.job.DenoiseOptions`, which validates them. Raises ValueError for a threshold for a
-    network without kernels, a device that is not there, or a file without a model.
+    A breakdown counts the weights of the frames; each frame's contribution and weight are then further layers. With
+    `add_layers` the image is the sum of its light passes, instead of these being scaled to it. Raises ValueError for a
+    threshold for a network without kernels, a device that is not there, or a file without a model.
     """
     name, torch_device = find_device(device)
     bfloat16 = precision == "bfloat16" or (precision == "auto" and has_bfloat16(torch_device))

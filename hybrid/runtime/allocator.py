@@ -17,9 +17,8 @@ def reuse_freed_memory() -> None:
 
     glibc returns blocks above 32 MiB to the kernel at once, which zeroes pages one by one when the next block is
     written: a sixth of the CPU time of `denoise` at 1280×720 and at 1920×1080. Peak memory grows by a tenth and a
-    quarter there, as free memory is fragmented. All threads share one heap: with a second heap for the thread that
-    reads, `fast` took 0.2 GiB more at 1920×1080. Returning free memory between two stages saved 0.1 GiB, and cost a
-    tenth of the CPU time.
+    quarter there. All threads share one heap: a second one, for the thread that reads, took 0.2 GiB more at 1920×1080.
+    Returning free memory between two stages saved 0.1 GiB, and cost a tenth of the CPU time.
     """
     _adjust(M_MMAP_THRESHOLD, KEPT)
     _adjust(M_TRIM_THRESHOLD, KEPT)

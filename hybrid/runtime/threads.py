@@ -1,7 +1,4 @@
-"""Thread counts of the libraries, and their waiting policy.
-
-numba and torch (OpenMP), OpenCV and OIDN (TBB) each have a pool of their own.
-"""
+"""Thread counts of numba, torch, OpenCV and OIDN, which have pools of their own, and their waiting policy."""
 
 import os
 import sys

@@ -1,16 +1,9 @@
 """The fixed shots: three to validate with and to view, five to test on, never to train on.
 
-To validate with, together they hold every effect: *table*: glass and its caustics, wax, hair, depth of field, indirect
-light. *night*: many small lights, fog, a mirror. *garden*: sky, leaves cut out by transparency, fast motion. Each holds
-something that moves.
-
-To test on, what temporal denoising helps least, framed as film frames it: *lens*: a table through an open aperture,
-with motion in focus, behind it, and through it. *closeup*: hair, cut glass and turning metal. *lamps*: a pan over a dim
-bar of many small lamps. *shadow*: sunlight that moves over a wall, a pendulum and swaying leaves. *volume*: a fan that
-turns in front of a light, in smoke. Skies are Blender's *courtyard* or *night*, which random shots never take. Made for
-a camera of 1920×1080 pixels, of which the middle is rendered.
-
-Lengths are metres, z is up. Materials, outlines and whatever stands alone are in the files of ``shots``.
+Those to validate with hold every effect together, those to test on what temporal denoising helps least, framed as film
+frames it, under Blender's skies *courtyard* or *night*, which random shots never take. Made for a camera of 1920×1080
+pixels, of which the middle is rendered. Lengths are metres, z is up. Materials, outlines and whatever stands alone are
+in the files of ``shots``.
 """
 
 import math

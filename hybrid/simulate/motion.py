@@ -1,7 +1,4 @@
-"""Cameras and motion: crop, camera position, and the keys of cameras, objects and lights.
-
-Speeds are drawn in film pixels per frame, and turned into keys by measuring what the camera sees.
-"""
+"""Cameras and motion, drawn in film pixels per frame and turned into keys by measuring what the camera sees."""
 
 import math
 from collections.abc import Callable

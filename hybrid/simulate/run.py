@@ -1,7 +1,4 @@
-"""Run Blender processes that render shots with Cycles, and resume where an earlier run stopped.
-
-Nothing here imports Blender, so that the command's help works without it.
-"""
+"""Run Blender processes that render shots with Cycles, and resume; without Blender, so that the help works."""
 
 import json
 import os

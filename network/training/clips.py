@@ -413,14 +413,12 @@ class _Variation:
 
 
 class Samples(Dataset[Sample]):
-    """The samples of a training, by number: each is a function of the seed and its number alone.
+    """The samples of a training, by number: each is a function of the seed and its number alone, in any process.
 
-    So the state of the sampling is one number, any process may make any sample, and a training that is resumed or
-    spread over processes gets the same samples. With `neighbours` each sample is two, of successive frames, at the same
-    place and varied alike; clips without a neighbour, as at a cut, are left out.
-
-    The clips are split at random into disjoint sets, one per epoch. An epoch takes each clip of its set once, in random
-    order, at a noise level and towards a target drawn from `noise_pairs`; after the last set the first comes again.
+    With `neighbours` each sample is two, of successive frames, at the same place and varied alike; clips without a
+    neighbour, as at a cut, are left out. The clips are split at random into disjoint sets, one per epoch. An epoch
+    takes each clip of its set once, in random order, at a noise level and towards a target drawn from `noise_pairs`;
+    after the last set the first comes again.
     """
 
     def __init__(

@@ -155,14 +155,11 @@ def train(
 ) -> list[float]:
     """Train a model in place and write the moving average of its weights; return the loss of each step of this process.
 
-    The file `out` is written at each checkpoint and at the end; ``OUT.state`` beside it holds the state that `resume`
-    continues from as if nothing had been interrupted, and is removed at the end. `validation` may be empty.
-    `log` is called in the first process with the steps done and, after every step, ``train/loss``, ``train/rate``,
-    ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds`` (since the start); after a validation with its
-    values, as ``validation/psnr`` and so on.
-
-    In a process group (``torch.distributed``, gloo or nccl) each process trains on its share of every batch, and
-    `DistributedDataParallel` averages the gradients: the same as one process on the whole batch.
+    `out` is written at each checkpoint and at the end; ``OUT.state`` beside it holds what `resume` continues from as if
+    nothing had been interrupted. `log` is called in the first process with the steps done and, after each,
+    ``train/loss``, ``train/rate``, ``train/norm`` (of the gradient), ``done`` (0 to 1) and ``seconds``; after a
+    validation with its values. In a process group (``torch.distributed``) each process trains on its share of every
+    batch, and gradients are averaged: the same as one process on the whole batch.
 
     Raises ValueError if the state to resume is cut short or of another training, the batch cannot be shared evenly, or
     crops or terms do not fit the model; FileNotFoundError if there is no state to resume.

@@ -1,7 +1,4 @@
-"""Templates, style and scripts of the report's page.
-
-Jinja2 fills the templates and escapes names. Style sheet and scripts are put into the page, which is one file.
-"""
+"""Templates of the report's page, which Jinja2 fills, and its style sheet and scripts, which the one file holds."""
 
 from importlib.resources import files
 
