@@ -79,13 +79,11 @@ def choose_convention(
     pairs : sequence of Patches
         At least one, of frames of one size. Costs are cached in the pairs.
     assumed : MotionConvention, used where the pictures do not decide
-    settled : collection of str
-        Parts that are known; other values are tried only if the known ones explain little.
+    settled : collection of str, parts that are known; other values are tried only if the known ones explain little
     surfaces : callable
         Returns such pairs of a layer that does not depend on light, such as albedo; called only where light leaves a
         doubt.
-    typed : collection of str
-        Parts that the user has stated; nothing overrules these.
+    typed : collection of str, parts that the user has stated; nothing overrules these
 
     Returns
     -------

@@ -183,8 +183,7 @@ def compose_flow(
 
     Parameters
     ----------
-    first, second : (H, W, 2) array of float
-        Finite, pixels; `second` belongs to the frame that `first` points to.
+    first, second : (H, W, 2) array of float, finite, pixels; `second` belongs to the frame that `first` points to
     first_valid, second_valid : (H, W) array of bool, optional, default: all True
 
     Returns

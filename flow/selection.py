@@ -25,8 +25,7 @@ def select_flow(
 
     Parameters
     ----------
-    candidates : sequence of (H, W, 2) float array
-        Flows, pixels, finite; the renderer's vectors first.
+    candidates : sequence of (H, W, 2) float array, flows, pixels, finite; the renderer's vectors first
     guides : GuidePair
     visible : (H, W) bool array, optional
         False where a pixel is hidden in the neighbour (a forward-backward error of several pixels): no match counts

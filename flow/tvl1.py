@@ -45,10 +45,8 @@ def refine_flow(
     Parameters
     ----------
     guides : GuidePair, their noise weakens the data term where a gradient is no stronger than the noise
-    start : (H, W, 2) float array
-        Pixels; vectors that are not finite, or longer than the frame, start from 0.
-    scales : int
-        Number of scales, each half the size of the one before; fewer where the image has not 16 pixels left.
+    start : (H, W, 2) float array, pixels; vectors that are not finite, or longer than the frame, start from 0
+    scales : int, number of scales, each half the size of the one before; fewer where the image has not 16 pixels left
     warps, iterations : int, at each scale: linearisations, and steps of each
 
     Notes

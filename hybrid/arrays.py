@@ -95,16 +95,13 @@ def denoise_arrays(
         "variance" of the color's mean, "estimate", an image denoised already, (H, W, 3) each; "depth", "alpha" (H, W);
         "motion" (H, W, 2 or 4). Any other name is an AOV (H, W, C), which a network denoises along. Keys of a mapping
         are frame numbers, and its frames may be computed when they are looked up.
-    options : DenoiseOptions, optional
-        What is asked for; options about files, passes and memory are refused.
+    options : DenoiseOptions, optional, what is asked for; options about files, passes and memory are refused
     motion : str, optional
         Convention of the vectors in words of ``ravg --motion`` (docs/renderers.md), such as "next,pixels,y-down".
     numbers : collection of int, optional
         Frames to denoise; all without. The others are neighbours.
-    progress : callable, optional
-        Called with each result; if it returns False, the work ends there.
-    **changes : object
-        Fields of `DenoiseOptions`, in place of those of `options`.
+    progress : callable, optional, called with each result; if it returns False, the work ends there
+    **changes : object, fields of `DenoiseOptions`, in place of those of `options`
 
     Yields
     ------

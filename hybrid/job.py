@@ -574,12 +574,9 @@ def denoise_shot(
         From `hybrid.open_shot`. Each view layer and stereo view of its files is denoised.
     output : str or Path
         ``OUT.####.exr``, or a folder.
-    options : DenoiseOptions, optional
-        What is asked for.
-    progress : callable, optional
-        Called with a `Step` after each frame of each pass.
-    **changes : object
-        Fields of `DenoiseOptions`, in place of those of `options`.
+    options : DenoiseOptions, optional, what is asked for
+    progress : callable, optional, called with a `Step` after each frame of each pass
+    **changes : object, fields of `DenoiseOptions`, in place of those of `options`
 
     Yields
     ------

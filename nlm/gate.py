@@ -57,10 +57,8 @@ def color_gates(
     noisy : (H, W, 3) float32, the centre frame as rendered, in the same unit
     exposure : float
     shares : sequence of float, tolerated difference of two estimates as a share of the centre's noise, at least 0
-    floor : float
-        Tolerated difference without noise, in tone-mapped units.
-    detail : float, optional
-        By how many times more than their means single pixels may differ; without it by any amount.
+    floor : float, tolerated difference without noise, in tone-mapped units
+    detail : float, optional, by how many times more than their means single pixels may differ; without it by any amount
 
     Returns
     -------

@@ -70,13 +70,11 @@ def joint_nlm(
     ----------
     window : (T, H, W, C) float32
         Irradiance or radiance. Non-finite values are left out.
-    variance : (H, W, C) float32
-        Variance of the centre's values, smoothed; used for all frames.
+    variance : (H, W, C) float32, variance of the centre's values, smoothed; used for all frames
     features : (H, W, F) float32, optional
         The centre's albedo, normal, depth …, of about unit range and prefiltered (`nlm.variance.prefilter_guide`); used
         for all frames, as these are aligned.
-    confidence : (T, H, W) float32, optional
-        In [0, 1]; default 1.
+    confidence : (T, H, W) float32, optional, in [0, 1]; default 1
     radius, patch_radius : int, of the search and of the compared patches, pixels
     k : float, strength of the colour distance: more smooths more
     where : (H, W) bool, optional, columns of a tile far from True pixels are copied from the centre

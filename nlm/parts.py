@@ -185,12 +185,10 @@ def split_light(
 
     Parameters
     ----------
-    filtered : sequence of (H, W, 3) float32
-        The parts, from `filter_layers`; negative light is allowed.
+    filtered : sequence of (H, W, 3) float32, the parts, from `filter_layers`; negative light is allowed
     denoised : (H, W, 3) float32, the picture
     exposure : float
-    factors : sequence of (H, W, 3) float32 or None, optional
-        Factor of each part in the sum, at least 0; None: 1.
+    factors : sequence of (H, W, 3) float32 or None, optional, factor of each part in the sum, at least 0; None: 1
     bounds : sequence of (H, W, 3) float32 or None, optional
         Layers whose range over 17×17 pixels bounds a part; None: no bounds.
 

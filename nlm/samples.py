@@ -108,8 +108,7 @@ def average_neighbours(
 
     Parameters
     ----------
-    estimates : (T, H, W, 3) float32
-        Denoised, aligned; with `residuals` None the noisy frames.
+    estimates : (T, H, W, 3) float32, denoised, aligned; with `residuals` None the noisy frames
     residuals : iterable of (int, (T, h, W, 3) float32), optional
         Noisy frame minus estimate, aligned, in strips of rows with the first row of each; together they are the frame.
     confidence, geometry : (T, H, W) float32

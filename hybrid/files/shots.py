@@ -261,20 +261,17 @@ def open_shot(
     ----------
     spec : str or Path
         A sequence as `hybrid.files.sequences.find_files` takes it: ``shot.####.exr``, a folder, one file, ….
-    frames : str, optional
-        A range such as ``1001-1010x2``; default: the range in `spec`, or all.
+    frames : str, optional, a range such as ``1001-1010x2``; default: the range in `spec`, or all
     layers : mapping of str to str or Layer, optional
         Role → name of a layer in the files (`hybrid.files.layers.find_layers`), or a sequence that holds it:
         ``path/alb.####.exr``, ``path/alb.####.exr:layer``.
-    profile : Profile, optional
-        Names and conventions of the renderer; default: the profile that fits the files.
+    profile : Profile, optional, names and conventions of the renderer; default: the profile that fits the files
     motion : str, optional
         Convention of motion vectors that the profile does not state (`hybrid.files.profile.Profile.with_motion`);
         "none" ignores them.
     aovs : sequence of str
         Names of layers to read into `Frame.aovs`.
-    keep : int
-        How many frames to hold in memory.
+    keep : int, how many frames to hold in memory
     max_pixels : int
         Of the largest frame, see `hybrid.files.exr.read_exr`.
 
