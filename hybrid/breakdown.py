@@ -61,9 +61,9 @@ def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
 def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     """Return layers (H, W), in [0, 1], that show the effect of each stage on the result of a window.
 
-    ``stage.align``: mean geometric confidence of the neighbours that exist. ``stage.gate``: the same after
-    comparison of their light. ``stage.network``: relative difference of the result to the weighted average of the
-    first passes (without these: of the colors), |r − a| / (a + exposure), means over channels.
+    ``stage.align`` and ``stage.gate``: mean confidence of the neighbours that exist, by geometry, and by light too.
+    ``stage.network``: difference r of the result from the average a of first passes (else colors), |r − a| / (a +
+    exposure).
     """
     sides = [
         index for index, trust in enumerate(aligned.geometric_confidence) if index != aligned.centre and trust.any()

@@ -36,11 +36,10 @@ def check_png(path: Path, what: str) -> None:
 
 
 def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = RATE) -> None:
-    """Write an image of the middle frame, or a movie of the shot, depending on the suffix.
+    """Write the middle frame as a .png, noisy left and denoised right, or a .mp4 or .webp with a moving divider.
 
-    A .png shows the middle frame, noisy on the left and denoised on the right. A .mp4 or .webp plays the shot, at
-    `rate` frames per second, with a moving divider: noisy left of it, denoised right. All frames have one exposure, at
-    which the middle noisy frame has a mean of 0.18, and are sRGB encoded.
+    Movies play at `rate` frames per second. All frames have one exposure, at which the middle noisy frame has a mean of
+    0.18, and are sRGB encoded.
     """
     check_preview(path)
     pairs = _Pairs(shot, output)

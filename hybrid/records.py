@@ -33,9 +33,8 @@ LONGEST = 60
 class Record:
     """The record of one run, rewritten after each frame.
 
-    `folder` is that of the frames, `name` that of the sequence without number and extension, `facts` are known at the
-    start: command, input, options. Raises ValueError if another file has the record's name, or the folder for records
-    is a link.
+    `name` is that of the sequence without number and extension, `facts` are known at the start. Raises ValueError if
+    another file has the record's name, or the folder for records is a link.
     """
 
     def __init__(self, folder: Path, name: str, numbers: Sequence[int], **facts: object) -> None:

@@ -32,12 +32,11 @@ class Levels(NamedTuple):
 
 
 def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.ReadOptions = opt.AS_IT_IS) -> Levels:
-    """Find the noise levels of a shot.
+    """Find the noise levels of a shot: all independent renders in a folder, ``LEVEL.####.exr``, or one sequence.
 
-    `spec` is a folder of one shot, with ``LEVEL.####.exr`` for each independent render of it (names that begin with
-    ``reference`` are left out), or one sequence; `samples` are the levels to open and their samples per pixel, by
-    default all levels, as the headers of Cycles have them. Raises FileNotFoundError if there is no such folder,
-    sequence or level, and ValueError if there are several levels and no samples of one of them.
+    `samples` are the levels to open and their samples per pixel, by default all but those named ``reference…``, as the
+    headers of Cycles have them. Raises FileNotFoundError if there is no such folder, sequence or level, and ValueError
+    if there are several levels and no samples of one of them.
     """
     path, roles, profile = Path(spec), parse_layers(read.layer), parse_input(read.profile, read.motion)
     if path.is_dir():

@@ -93,14 +93,11 @@ def temporal_psnr(
 ) -> NDArray[np.float64]:
     """PSNR of motion-compensated frame differences against those of the reference, for each pair of N frames.
 
-    Flow k of N − 1 leads from frame k + 1 back to frame k, pixels, and is valid where to the same point of the scene.
-    Infinite where the differences equal the reference's, NaN where a frame is not finite or no pixel is valid.
-
-    With W the bilinear warp of frame t − 1 to frame t, D_t(x) = T(x_t) − W T(x_{t−1}), and the value is
-    −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels. Subtracting the reference's differences excludes real changes:
-    light, reflections, the interpolation itself; without it, blur would score above the truth. An error that is the
-    same on every frame is no flicker and is not measured here. Arguments are consumed a pair at a time: generators
-    are accepted.
+    With W the bilinear warp along flow k from frame k + 1 back to frame k, pixels, D_t(x) = T(x_t) − W T(x_{t−1}), and
+    the value is −10 log₁₀ mean (D_t(d) − D_t(r))² over valid pixels; NaN where a frame is not finite or no pixel is
+    valid. Subtracting the reference's differences excludes real changes: light, reflections, the interpolation itself;
+    without it, blur would score above the truth. An error that is the same on every frame is no flicker. Generators are
+    accepted.
     """
     series = zip(frames, references, strict=True)
     values = []
@@ -117,11 +114,10 @@ def temporal_psnr(
 
 
 def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> NDArray[np.float64]:
-    """Standard deviation over time of static pixels, on the tone curve, frame by frame.
+    """Standard deviation over time of static pixels, on the tone curve, frame by frame; NaN where undefined.
 
-    RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of
-    the squares is the unbiased variance over time. NaN without static pixels, for fewer than two frames, or if a
-    frame is not finite.
+    RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of the
+    squares is the unbiased variance over time.
     """
     values = [tone_map(frame[static], exposure) for frame in frames]
     count = len(values)

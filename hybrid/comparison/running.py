@@ -132,11 +132,10 @@ def time_methods(
 
 
 def summarize_runs(runs: Sequence[RunCost]) -> Seconds:
-    """Reduce the runs of a method to seconds per megapixel.
+    """Reduce the runs of a method to seconds per megapixel: the median, which more rounds make more repeatable.
 
-    The median alone. Normalizing by the load of a round (measured over all methods), or of a run (by a fixed piece of
-    work between its frames), made ratios no more repeatable on a machine under eight times its load, which changes
-    within seconds. More rounds do help.
+    Normalizing by the load of a round (measured over all methods), or of a run (by a fixed piece of work between its
+    frames), did not, on a machine under eight times its load, which changes within seconds.
     """
     wall = np.array([run.seconds / run.megapixels for run in runs])
     cpu = np.array([run.cpu_seconds / run.megapixels for run in runs])

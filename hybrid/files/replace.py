@@ -20,11 +20,9 @@ _LOCK = ".lock"
 
 
 def check_outputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[tuple[str, Path]]) -> None:
-    """Raise an error if an output would overwrite an input or another output, or is not a regular file.
+    """Raise ValueError if an output would overwrite an input, by any name, or another output; OSError if it is no file.
 
-    Files come with a name for the message (``output``, ``preview``). Inputs may be read by another run. Raises
-    ValueError if an output is an input by any name (links, another spelling), or another output; OSError if an output
-    is a folder, a device, a pipe or a socket.
+    Files come with a name for the message (``output``, ``preview``). Inputs may be read by another run.
     """
     names: dict[object, str] = {}
     for name, path in inputs:

@@ -91,11 +91,10 @@ class Pattern:
 def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
     """Find a sequence: return frame number → file of all existing frames, and the range in `spec`, if any.
 
-    `spec` is a pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), a folder that holds one sequence, a file,
-    or a glob. A range may be part of it: ``shot.####.exr 8-12`` (Nuke), ``shot.8-12####.exr``.
-
-    Raises FileNotFoundError, with the sequences of the folder, if nothing matches; ValueError if several sequences
-    match, `spec` is both a file and the pattern of others, or its hyphen would be a sign.
+    `spec` is a pattern (``shot.####.exr``, ``%04d``, ``$F4``, ``<frame04>``), with a range (``shot.####.exr 8-12`` as
+    in Nuke, ``shot.8-12####.exr``), a folder that holds one sequence, a file, or a glob. Raises FileNotFoundError, with
+    the sequences of the folder, if nothing matches; ValueError if several sequences match, `spec` is both a file and
+    the pattern of others, or its hyphen would be a sign.
     """
     path = Path(spec)
     if path.is_dir():

@@ -58,10 +58,9 @@ def write_clips(
 ) -> list[Path]:
     """Write the training clips of a shot; return the shards (paper, section 6, "Training Data").
 
-    Of each frame `tiles` clips of `tile` pixels a side (0: the whole frame) are placed by
-    `network.training.clips.importance` with a seed. `estimate` is the source of the first passes
-    (`hybrid.first_pass.find_first_pass`); not "none". Raises ValueError if the levels have no frame in common, frames
-    are smaller than a tile, or there is no first pass.
+    Of each frame `tiles` clips of `tile` pixels a side (0: the whole frame) are placed by `importance` with a seed.
+    `estimate` is the source of the first passes; not "none". Raises ValueError if the levels have no frame in common,
+    frames are smaller than a tile, or there is no first pass.
     """
     shots, numbers = list(source.levels.values()), source.numbers()
     rendered = [*shots, *([] if source.target is None else [source.target])]

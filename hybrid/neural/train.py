@@ -39,9 +39,8 @@ def train_network(
 ) -> list[float]:
     """Train a preset, or given weights, on the clips of a folder; return the losses.
 
-    The seed of `config` is that of the initial weights too; `threads` are those of torch and numba; `resume` and `log`
-    as for `network.training.loop.train`. Under ``torchrun``, which sets WORLD_SIZE, the processes train together, over
-    nccl with GPUs and gloo without. Raises ValueError if settings, clips and model do not fit together.
+    The seed of `config` is that of the initial weights too; `threads` are those of torch and numba. Under ``torchrun``,
+    the processes train together. Raises ValueError if settings, clips and model do not fit together.
     """
     if threads is not None:
         limit_threads(threads)

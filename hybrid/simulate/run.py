@@ -47,12 +47,10 @@ def simulate(
 ) -> None:
     """Render shots, each into a folder of its own, which holds `LEVEL.####.exr` and `meta.json`; skip finished frames.
 
-    `jobs` is the number of Blender processes at a time. With fewer shots than jobs, the frames of a shot are divided
-    between processes; without `threads` the machine's cores between the jobs. `python` is an interpreter that has bpy,
-    by default this one. `on_event(kind, shot folder, message)` is called with the kinds `plan` and `frame`.
-
-    Raises SimulationError if bpy is missing, or Blender failed; ValueError if a folder holds a shot with other
-    settings.
+    `jobs` is the number of Blender processes at a time, which divide the frames of few shots, and the machine's cores
+    unless `threads` are given; `python` an interpreter that has bpy, by default this one. `on_event(kind, shot folder,
+    message)` is called with the kinds `plan` and `frame`. Raises SimulationError if bpy is missing, or Blender failed;
+    ValueError if a folder holds a shot with other settings.
     """
     python = python or sys.executable
     check_blender(python)

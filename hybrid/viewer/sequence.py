@@ -88,11 +88,9 @@ class Sequence:
         """Return a layer of a frame as an (H, W, 3) 8-bit image on the display window, black outside the data.
 
         Radiance is multiplied by `gain`, albedo and single channels are brightened by `ev` stops; radiance and albedo
-        are sRGB encoded. Vectors have their zero at middle gray. Single channels are gray: in [0, 1] unchanged,
-        others scaled, like vectors, by the range of the first frame that was shown.
-
-        Raises KeyError if there is no such frame or layer; OSError or ExrError if the file cannot be read, for instance
-        because it is incomplete so far.
+        are sRGB encoded. Vectors have their zero at middle gray. Single channels are gray: in [0, 1] unchanged, others
+        scaled, like vectors, by the range of the first frame that was shown. KeyError if there is no such frame or
+        layer; OSError or ExrError if the file cannot be read, for instance because it is incomplete so far.
         """
         image, layer, pixels = self._read_layer(number, name)
         part = image.parts[layer.part]

@@ -24,12 +24,10 @@ class ResidualBlock(nn.Module):
 class RobustAverage(nn.Module):
     """Robust Average block: blends each frame with the robust average of the others, by a learned weight per pixel.
 
-    For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place:
-    ``a = ravg(x_j, j ≠ i)``, ``w = sigmoid(conv(relu(conv([x_i, a]))))``, ``x_i ← (1 − w) x_i + w a``, one weight
-    per pixel. The parameters are shared over the steps. ``w → 0`` makes the block the identity.
-
-    The first convolution acts on the concatenation of x_i and a, and is held as two halves. As each frame is
-    excluded before it has been changed, the half on x_i runs on all frames at once, and nothing is concatenated.
+    For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place: ``a =
+    ravg(x_j, j ≠ i)``, ``w = sigmoid(conv(relu(conv([x_i, a]))))``, ``x_i ← (1 − w) x_i + w a``. The parameters are
+    shared over the steps. The first convolution is held as two halves: as each frame is excluded before it has been
+    changed, the half on x_i runs on all frames at once, and nothing is concatenated.
     """
 
     def __init__(self, channels: int, kernel_size: int = 3) -> None:

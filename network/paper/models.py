@@ -224,12 +224,10 @@ class RAUNet(KernelNetwork):
 class RAResNet(KernelNetwork):
     """The paper's network (figure 1): residual blocks at full resolution, RA blocks among them.
 
-    The paper's figure shows skip connections after the first four RA blocks and does not say how they join. Here
-    each section (residual blocks up to and with an RA block) is skipped: its input is concatenated to its output
-    and a 1×1 convolution brings both back to the width.
-
-    With 3×3 convolutions it has 3.5 M parameters, with 7×7 19.0 M. The paper says 24 M; 3×3 and the trunk of the
-    VGG19 in its loss (20.0 M) come close to that.
+    The figure shows skip connections after the first four RA blocks and not how they join: here the input of each
+    section up to an RA block is concatenated to its output, and a 1×1 convolution brings both back to the width. With
+    3×3 convolutions it has 3.5 M parameters, with 7×7 19.0 M. The paper says 24 M; 3×3 and the trunk of the VGG19 in
+    its loss (20.0 M) come close to that.
     """
 
     def __init__(self, config: RAResNetConfig) -> None:

@@ -160,11 +160,11 @@ def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
 
 
 def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
-    """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed.
+    """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed; 0 in flat
+    skies.
 
-    Images are (3, H, W), the confidence (T, 1, H, W); 0 where a flat sky is. Differences on x/(1+x): |noisy −
-    estimate|, |∇ estimate|, |∇ albedo|; and a tenth of the frames' lack of confidence, which would otherwise outweigh
-    all else where an object passes.
+    Of images (3, H, W) and confidence (T, 1, H, W) the differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇
+    albedo|; and a tenth of the lack of confidence, which would otherwise outweigh all else where an object passes.
     """
     noisy, estimate = (image.clamp_min(0) / (1 + image.clamp_min(0)) for image in (noisy.float(), estimate.float()))
     result = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))
