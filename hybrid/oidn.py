@@ -75,11 +75,7 @@ def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np
 
 
 def _execute(
-    images: dict[str, NDArray[np.float32]],
-    quality: str,
-    where: str,
-    scale: float | None = None,
-    **flags: bool,
+    images: dict[str, NDArray[np.float32]], quality: str, where: str, scale: float | None = None, **flags: bool
 ) -> NDArray[np.float32]:
     """Run one filter over `images`."""
     oidn, device = _device(where)

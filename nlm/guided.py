@@ -16,13 +16,7 @@ _STRIP = 64
 
 
 def guided_filter(
-    image: Floats,
-    guide: Floats,
-    *,
-    radius: int,
-    eps: float = 1e-2,
-    subsample: int = 1,
-    moments: Doubles | None = None,
+    image: Floats, guide: Floats, *, radius: int, eps: float = 1e-2, subsample: int = 1, moments: Doubles | None = None
 ) -> Floats:
     """Fit the image, in every box, by an affine function of the guide.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import typer
 from rich.console import Console
@@ -16,6 +16,7 @@ from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import ShotInput, log_cuts, validate_renders
 from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot, count_steps
+from hybrid.comparison.embedding import ShotImages
 from hybrid.comparison.ladder import join_ladders
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.methods import external as finished
@@ -28,9 +29,6 @@ from hybrid.files.movies import check_movie
 from hybrid.files.shots import Shot, open_matching_sequence
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.stream import plan_shot
-
-if TYPE_CHECKING:
-    from hybrid.comparison.embedding import ShotImages
 
 FRAMES = "frames"  # folder next to the page
 
@@ -82,7 +80,7 @@ class _Report:
             self.write(joined, None)
         self.show(others, joined)
 
-    def write(self, comparison: Comparison, images: "ShotImages | None") -> None:
+    def write(self, comparison: Comparison, images: ShotImages | None) -> None:
         """Write the page and its files."""
         from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
 
@@ -191,7 +189,7 @@ def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:
     return opened
 
 
-def _write_frames(folder: Path, shot: Shot, images: "ShotImages") -> None:
+def _write_frames(folder: Path, shot: Shot, images: ShotImages) -> None:
     """Write the reference and each method's frames as files of the shot with another color."""
     for index, source in enumerate(images.sources):
         name = file_name(index, source.name)
@@ -213,11 +211,7 @@ def _seconds(stated: Sequence[str] | None) -> dict[str, float]:
 
 
 def _methods(
-    names: str | None,
-    external: Sequence[str] | None,
-    seconds: Mapping[str, float],
-    shot: Shot,
-    frames: str | None,
+    names: str | None, external: Sequence[str] | None, seconds: Mapping[str, float], shot: Shot, frames: str | None
 ) -> dict[str, Method]:
     """The requested methods, and sequences of other denoisers with their seconds per frame."""
     wanted = METHODS if names is None else map(str.strip, names.split(","))

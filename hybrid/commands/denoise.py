@@ -15,18 +15,9 @@ import numpy as np
 import typer
 
 from hybrid.commands import options as opt
+from hybrid.commands import shots
 from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
 from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
-from hybrid.commands.shots import (
-    ShotInput,
-    expect_views_apart,
-    import_neural,
-    in_view,
-    log_cuts,
-    log_findings,
-    split_stages,
-    views_of,
-)
 from hybrid.files.layers import summarize_layers
 from hybrid.files.profile import ROLE_FACTS
 from hybrid.files.sequences import format_frames
@@ -47,7 +38,7 @@ from hybrid.validation import Finding
 class Request:
     """The options of the command, of one view."""
 
-    shot: ShotInput
+    shot: shots.ShotInput
     output: str
     options: DenoiseOptions
     preview: Path | None
@@ -103,26 +94,26 @@ def denoise(
     with opt.usage():
         options = DenoiseOptions(
             **settings,
-            stages=split_stages(stages),
-            no_stages=split_stages(no_stages),
+            stages=shots.split_stages(stages),
+            no_stages=shots.split_stages(no_stages),
             device=device,
             strict=how["strict"],
         )
         if scheduler is not None and (options.budget is not None or options.breakdown is not None):
             raise ValueError("--budget and --breakdown are of one machine, expected no --scheduler with them")
-    read = ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **how)
+    read = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **how)
     request = Request(read, output, options, preview, contact_sheet, fps)
     if options.method == "network":
-        import_neural()
-    views = views_of(shot)
+        shots.import_neural()
+    views = shots.views_of(shot)
     sequence = None if options.first_pass in SPECS else options.first_pass
     pictures = {"preview": preview, "contact-sheet": contact_sheet, "breakdown": options.breakdown}
     folders = {"output": output, "keep-first-pass": options.keep_first_pass}
-    expect_views_apart(views, read, folders, {"first-pass": sequence, **pictures})
+    shots.expect_views_apart(views, read, folders, {"first-pass": sequence, **pictures})
     for view in views:
         if view:
             LOG.info(f"view {view}")
-        here = in_view(request, view)
+        here = shots.in_view(request, view)
         if scheduler is None:
             _denoise(here)
         else:
@@ -139,7 +130,7 @@ def _hand_out(context: typer.Context, request: Request, view: str, scheduler: st
         name = format_frames(part)
         # A chunk that is run again, after its worker died, skips the frames that are finished.
         words = arguments_of(context, {"frames": name, "resume": True})
-        chunks[name] = Chunk(in_view(words, view), len(part))
+        chunks[name] = Chunk(shots.in_view(words, view), len(part))
     run_on_cluster(scheduler, str(context.info_name), chunks)
     if shot.missing:
         LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
@@ -153,7 +144,7 @@ def _denoise(request: Request) -> None:
     shot = request.shot.open()
     job = Job.open(shot, request.output, request.options, request.paths, _failure_on_record(request, shot))
     _summarize_input(request, job)
-    log_findings(job.report, job.views)
+    shots.log_findings(job.report, job.views)
     first = output_path(request.output, shot, shot.numbers[0])
     record = Record(
         first.parent,
@@ -271,7 +262,7 @@ class _Report:
         self.outliers += frame.outliers
         if frame.plan is not None:
             self.plans[frame.number] = frame.plan
-            self.findings += log_cuts(frame.plan, self.findings, strict=False)
+            self.findings += shots.log_cuts(frame.plan, self.findings, strict=False)
         light = frame.mean + frame.removed_radiance
         share = frame.removed_radiance / light if light > 0 else 0.0
         self._log(frame, share)

@@ -108,9 +108,6 @@ def count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:
     return 1 + options.rounds * len(methods) + 1 + len(methods) + levels + maps
 
 
-# Checks before any method runs
-
-
 def _common_frames(shot: Frames, halves: Sequence[Frames]) -> list[int]:
     """Frames of the shot for which there is a whole reference."""
     numbers = [n for n in shot.numbers if all(n in half.numbers for half in halves)]
@@ -173,9 +170,6 @@ def _check_sizes(shot: Frames, inputs: Sequence[_Input]) -> None:
 
 def _span(numbers: Sequence[int]) -> str:
     return f"{numbers[0]}–{numbers[-1]}" if numbers else "none"
-
-
-# Results of the runs
 
 
 def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], on_step: OnStep) -> dict[str, dict[str, Statistic]]:
@@ -280,9 +274,6 @@ def _store_maps(method: Method, shot: Frames, numbers: Sequence[int], name: str,
     for number, maps in method.maps(shot, numbers) if method.maps is not None else ():
         for title, values in maps.items():
             store.save(name, number, values, title)
-
-
-# Facts
 
 
 def _facts_of_runs(options: CompareOptions, load: float | None) -> dict[str, str]:

@@ -121,11 +121,7 @@ class Evaluator:
         return float(metrics.temporal_psnr(images, references, flows, valid, exposure=self.exposure)[0])
 
     def find_noise_law(
-        self,
-        noisy: Statistic,
-        samples: float | None,
-        levels: Sequence[Level],
-        reference_samples: float | None,
+        self, noisy: Statistic, samples: float | None, levels: Sequence[Level], reference_samples: float | None
     ) -> tuple[NoiseLaw, str]:
         """Measure the error of the noisy render against its samples, and describe the reference's noise.
 
@@ -176,9 +172,6 @@ class Evaluator:
 def mean_error(scores: Sequence[float]) -> float:
     """Mean squared error from the PSNR of frames."""
     return float(np.mean([float(10 ** (-score / 10)) for score in scores]))
-
-
-# Prepared once for all methods
 
 
 def store_reference(store: FrameStore, halves: Sequence[Frames], numbers: Sequence[int]) -> None:

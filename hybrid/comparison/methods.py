@@ -49,9 +49,6 @@ class Method:
     base: str = ""
 
 
-# Frames that exist already
-
-
 def noisy(shot: Frames) -> Iterator[tuple[int, Array]]:
     """Yield the frames as rendered, non-finite pixels replaced as in the pipeline."""
     for number in shot.numbers:
@@ -68,9 +65,6 @@ def finished(shot: Frames, *, other: Shot) -> Iterator[tuple[int, Array]]:
 def external(other: Shot, seconds: float | None = None) -> Method:
     """Return a finished sequence as a method, with its seconds per frame if these are known."""
     return Method(partial(finished, other=other), "External", cost="unknown", seconds=seconds, given=other)
-
-
-# Methods on aligned windows
 
 
 @dataclass(frozen=True)
@@ -185,9 +179,6 @@ def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Arra
         "Confidence": aligned.confidence[is_neighbour].mean(axis=0),
         "Temporal contribution": np.clip(contribution, 0, 1).astype(np.float32),
     }
-
-
-# OIDN
 
 
 def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:

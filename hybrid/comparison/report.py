@@ -102,9 +102,6 @@ def report_images(
     return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure, changes if there else {})
 
 
-# Content of the page
-
-
 def _embed(folder: Path, report: Report) -> dict[str, Any]:
     """Encode the images of a page, `animations` of more than one frame, and write the movies next to it by method."""
     images = report.images

@@ -255,9 +255,6 @@ def settings_as_text(result: MethodResult) -> dict[str, str]:
     }
 
 
-# JSON
-
-
 def to_document(comparison: Comparison) -> dict[str, object]:
     """Return the content of ``results.json`` as plain dicts: the comparison, its fronts, the effect of stages."""
     results, metrics = comparison.results, present_metrics(comparison.results, METRICS)

@@ -23,8 +23,6 @@ from hybrid.comparison.results import (
     present_metrics,
 )
 
-# Numbers
-
 
 def format_value(value: float, metric: Metric) -> str:
     """Format a value with the digits of its metric, "–" for NaN."""
@@ -68,9 +66,6 @@ def format_factor(factor: Factor | None) -> str:
 def column_title(metric: Metric) -> str:
     """Return the metric's label with its unit."""
     return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
-
-
-# Tables
 
 
 @dataclass(frozen=True)

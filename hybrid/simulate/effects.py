@@ -140,10 +140,7 @@ def settings_of(decisions: Iterable[EffectDecision], base: dict[str, Any] | None
 
 
 def needed_bounces(
-    render: Callable[[dict[str, Any], int], np.ndarray],
-    settings: dict[str, Any],
-    samples: int,
-    target_samples: int,
+    render: Callable[[dict[str, Any], int], np.ndarray], settings: dict[str, Any], samples: int, target_samples: int
 ) -> list[EffectDecision]:
     """Measure how many bounces an image needs: all together, and of each kind that `settings` allow.
 
@@ -209,7 +206,6 @@ def _block_means(image: np.ndarray) -> np.ndarray:
     return np.asarray(image[:h, :w].reshape(h // bh, bh, w // bw, bw, -1).mean(axis=(1, 3)))
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Reading a Blender scene
 
 

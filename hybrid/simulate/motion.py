@@ -21,7 +21,6 @@ def key(owner: Any, name: str, frames: range, middle: int, value: Callable[[int]
         owner.keyframe_insert(name, frame=frame)
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Cameras
 
 
@@ -159,7 +158,6 @@ def move_camera(rng: Rng, shot: ShotSettings, kind: str, pixels: float) -> float
     return result
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Objects
 
 
@@ -250,7 +248,6 @@ def key_swing(item: Any, frames: range, axis: str, amplitude: float, rate: float
         item.keyframe_insert("rotation_euler", frame=frame)
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Lights, and all of it
 
 

@@ -20,7 +20,6 @@ Profile = Sequence[tuple[float, float]]  # radii and heights
 CUBE = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
 CUBE_FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
-# ---------------------------------------------------------------------------------------------------------------
 # Materials
 
 
@@ -112,7 +111,6 @@ def hair_material(melanin: float, redness: float, roughness: float = 0.3) -> Any
     return made
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Objects
 
 
@@ -282,7 +280,6 @@ def bottle(kind: int, surface: Any, label: Any = None) -> Any:
     return item
 
 
-# ---------------------------------------------------------------------------------------------------------------
 # Hair, volumes and lamps
 
 

@@ -160,8 +160,7 @@ def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
 
 
 def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
-    """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed; 0 in flat
-    skies.
+    """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed.
 
     Of images (3, H, W) and confidence (T, 1, H, W) the differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇
     albedo|; and a tenth of the lack of confidence, which would otherwise outweigh all else where an object passes.

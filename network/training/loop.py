@@ -79,11 +79,7 @@ def image_loss(config: TrainConfig) -> losses.ImageLoss:
 
 
 def batch_loss(
-    model: Model,
-    batch: Sample,
-    config: TrainConfig,
-    loss: losses.ImageLoss,
-    run: Callable[..., Any] | None = None,
+    model: Model, batch: Sample, config: TrainConfig, loss: losses.ImageLoss, run: Callable[..., Any] | None = None
 ) -> Tensor:
     """Training loss of a batch: mean of log(1 + loss of each crop, relative to that of its clip's best input).
 
@@ -312,12 +308,7 @@ def _identity(config: TrainConfig) -> dict[str, Any]:
 
 
 def _write_state(
-    path: Path,
-    identity: str,
-    model: Model,
-    average: Model,
-    optimizer: torch.optim.Optimizer,
-    progress: dict[str, Any],
+    path: Path, identity: str, model: Model, average: Model, optimizer: torch.optim.Optimizer, progress: dict[str, Any]
 ) -> None:
     """Everything the next step depends on; replaces the last state whole."""
     partial = new_partial(path)

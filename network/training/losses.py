@@ -151,13 +151,7 @@ def temporal_loss(
 
 
 def image_loss(
-    loss: ImageLoss,
-    image: Tensor,
-    noisy: Tensor,
-    target: Tensor,
-    modulation: Tensor,
-    scale: Tensor,
-    slope: float = 1.0,
+    loss: ImageLoss, image: Tensor, noisy: Tensor, target: Tensor, modulation: Tensor, scale: Tensor, slope: float = 1.0
 ) -> Tensor:
     """Loss (N,) of the radiance of one image; parameters as for `temporal_loss`.
 
@@ -170,13 +164,7 @@ def image_loss(
 
 
 def difference_loss(
-    loss: ImageLoss,
-    images: Tensor,
-    targets: Tensor,
-    modulation: Tensor,
-    scale: Tensor,
-    to_next: Tensor,
-    trust: Tensor,
+    loss: ImageLoss, images: Tensor, targets: Tensor, modulation: Tensor, scale: Tensor, to_next: Tensor, trust: Tensor
 ) -> Tensor:
     """Loss of flicker (N,): of changes between two successive images that their targets do not have.
 
