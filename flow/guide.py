@@ -39,10 +39,7 @@ def median_luminance(color: np.ndarray, lift: float = 0.0) -> float:
 
 
 def tone_map(color: np.ndarray, exposure: float, lift: float = 0.0) -> np.ndarray:
-    """Luminance L of color + lift on Reinhard's curve, L / (L + exposure), (H, W) float32 in [0, 1].
-
-    Negative and NaN count as 0, Inf as white.
-    """
+    """Luminance of color + lift on L / (L + exposure), (H, W) in [0, 1]; negative and NaN count as 0, Inf as white."""
     if not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a positive number")
     # As 1 − e / (L + e), which is 1 and not NaN for the largest float.
@@ -85,10 +82,7 @@ class GuidePair(NamedTuple):
 
 
 def pair_guides(centre: Guide, neighbour: Guide) -> GuidePair:
-    """Combine the guides of two frames for `flow.tvl1` and `flow.selection`; the greater noise counts.
-
-    Non-finite values become 0 (+Inf: 1).
-    """
+    """Combine the guides of two frames, finite, for `flow.tvl1` and `flow.selection`; the greater noise counts."""
     shape = centre.planes.shape
     if centre.planes.ndim != 3 or centre.planes.size == 0:
         raise ValueError(f"centre guide has shape {shape}, expected a non-empty (H, W, G)")

@@ -37,10 +37,7 @@ ENCODINGS = {
 
 @dataclass(frozen=True)
 class MotionConvention:
-    """The meaning of a renderer's motion vectors: v = scale · unit · (decode(c) + offset), y turned to point down.
-
-    Raises ValueError if a word is unknown or a number is not finite.
-    """
+    """A renderer's convention: v = scale · unit · (decode(c) + offset), y turned down; ValueError if invalid."""
 
     direction: str = "previous"  # a key of `DIRECTIONS`
     unit: str = "pixels"  # a key of `UNITS`
@@ -126,10 +123,7 @@ def normalize_motion(
 
 
 def decode_motion(vectors: np.ndarray, convention: MotionConvention) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Decode motion vectors into two-channel flows to the previous and the next frame, without unit, scale and y.
-
-    `MotionConvention.factors` makes pixels of the result.
-    """
+    """Decode motion vectors into flows to the previous and next frame, before `MotionConvention.factors`."""
     size = convention.channels // (2 if convention.pair else 1)
     first = _decode(vectors[..., :size], convention)
     if convention.direction == "previous":
@@ -287,10 +281,7 @@ def invert_flow(
 
 
 def forward_backward_error(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
-    """Measure the distance from start to end of a round trip, (H, W) float32, pixels: |f(x) + r(x + f(x))|.
-
-    Outside the frame r has its edge value.
-    """
+    """Measure |f(x) + r(x + f(x))|, (H, W), pixels, from start to end of a round trip; r ends with its edge."""
     loop, _ = warp(reverse, flow)
     loop += flow
     return np.asarray(np.hypot(loop[..., 0], loop[..., 1]))

@@ -125,10 +125,7 @@ def dense_flow(guides: GuidePair) -> np.ndarray:
 
 
 def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """Estimate a flow (H, W, 2), pixels from later to earlier, on pictures reduced to `_ROUGH_PIXELS` pixels.
-
-    Both are from `flow.guide.tone_map`.
-    """
+    """Estimate a flow (H, W, 2), pixels, from later to earlier `tone_map`s, reduced to `_ROUGH_PIXELS` pixels."""
     height, width = later.shape
     factor = min(1.0, float(np.sqrt(_ROUGH_PIXELS / (height * width))))
     size = max(1, round(width * factor)), max(1, round(height * factor))
@@ -226,10 +223,7 @@ def _solve_block(
     neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray, change: np.ndarray,
     corner: tuple[int, int], effort: _Effort,
 ) -> np.ndarray:  # fmt: skip
-    """Solve TV-L1 at one scale for the change from `base`, starting at `change`.
-
-    All but the neighbour may be of a part of the frame, whose first row and column are `corner`.
-    """
+    """Solve TV-L1 at one scale for the change from `base`, at `corner` of the neighbour, starting at `change`."""
     height, width, channels = noise.shape
     change = np.ascontiguousarray(change.transpose(2, 0, 1))
     dual = np.zeros((4, height + 1, width + 1), np.float32)

@@ -264,10 +264,7 @@ class FrameDenoiser:
     def _correct(
         self, denoised: Denoised, frame: PreparedFrame, result: WindowResult, moving: tuple[Mask, Mask] | None
     ) -> Denoised:
-        """The denoised frame with the means of its samples, and with the samples where they are certain.
-
-        Moving lights are as rendered, and their light belongs to no other pixel.
-        """
+        """The denoised frame with its samples' means, and samples where they are certain, as in moving lights."""
         color, timings = denoised.color, self.stream.timings
         exposure, sides, rendered = measure_exposure(color), result.neighbour_samples, frame.rendered
         self.stream.keeper.release()  # the frame's own layers, of which this is made
@@ -294,10 +291,7 @@ class FrameDenoiser:
         return _changed(denoised, color, CORRECTED)
 
     def _moving_lights(self, frame: PreparedFrame) -> tuple[Mask, Mask] | None:
-        """The bright pixels (H, W) that the neighbouring frames show to move together, if there are any.
-
-        With them the pixels at which aligned neighbours show lights that pass.
-        """
+        """The bright pixels (H, W) that neighbours show to move together, or to pass when aligned, if any."""
         number, step = frame.number, self.stream.shot.step
         others = [n for n in (number - step, number + step) if self.stream.shot.has(n)]
         with self.stream.timings.stage("blend-samples"):

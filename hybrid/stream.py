@@ -81,10 +81,7 @@ class FrameStream:
         self._cache: dict[tuple[str, tuple[int, ...]], object] = {}
 
     def keep(self, numbers: Collection[int]) -> None:
-        """Drop every value that belongs to another frame.
-
-        Frames with their fireflies are kept as long as the removal of fireflies from later ones reads them.
-        """
+        """Drop the values of other frames; those with fireflies stay as long as fireflies of later ones are removed."""
         kept = {*numbers}
         loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
         first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
@@ -347,10 +344,7 @@ def plan_shot(
     context: Context = DENOISED,
     advance: Callable[[], object] = lambda: None,
 ) -> Plan:
-    """Plan every frame of a shot, with the frames on which each stage runs.
-
-    All frames are read; each decision has the figure of the window that calls for it most.
-    """
+    """Plan every frame of a shot: each decision has the figure that calls for it most, and the frames where it runs."""
     stream = FrameStream(shot, rules or Rules(), radius=context.radius)
     plans = {}
     for number in shot.numbers:

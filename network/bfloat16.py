@@ -40,10 +40,7 @@ def round_unet(unet: OidnUNet) -> OidnUNet:
 
 
 def round_taps(weight: Tensor) -> Tensor:
-    """Round ``(O, I, H, W)`` weights to bfloat16 so that sums over the taps are kept.
-
-    Taps are rounded in descending order of size, and each takes over the rounding error of the greater ones.
-    """
+    """Round ``(O, I, H, W)`` weights to bfloat16, greatest taps first, each error carried on, so that sums are kept."""
     taps = weight.flatten(2)
     order = taps.abs().argsort(2, descending=True)
     rounded, error = torch.empty_like(taps, dtype=torch.bfloat16), torch.zeros_like(taps[..., 0])

@@ -1,7 +1,4 @@
-"""A model in one safetensors file: weights, and in the metadata its description and the notes on its training.
-
-Files are untrusted: nothing in them is run, and a description is checked before anything of its size is built.
-"""
+"""A model in a safetensors file: weights, its description and notes on its training, all untrusted when read."""
 
 from __future__ import annotations
 
@@ -135,21 +132,14 @@ def new_partial(path: Path) -> Path:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
-    """Write tensors over an empty file of `new_partial`, and keep its mode.
-
-    safetensors replaces the file by one that only its owner may read, whatever the umask.
-    """
+    """Write tensors over an empty file of `new_partial`, and keep its mode, which safetensors would narrow."""
     mode = stat.S_IMODE(path.stat().st_mode)
     save_file(dict(tensors), path, dict(metadata))
     path.chmod(mode)
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:
-    """Load a model from a file of `save_model`, in float32.
-
-    Raises FileNotFoundError if there is no such file, and ValueError if it is cut short, no file of ours, of another
-    version, or its weights do not fit the model that it describes.
-    """
+    """Load a model of `save_model`, in float32; FileNotFoundError, or ValueError for another or damaged file."""
     where = f"weights {os.fspath(path)!r}"
     with _open(path) as (file, metadata):
         try:

@@ -77,11 +77,7 @@ def build_unet(tensors: dict[str, Tensor]) -> OidnUNet:
 
 
 def load_oidn(name: str) -> OidnUNet:
-    """Load a network of OIDN, one of `OIDN_WEIGHTS`, in float32.
-
-    Raises ValueError if there is no such network, or the library does not hold its weights; FileNotFoundError if there
-    is no such library.
-    """
+    """Load a network of OIDN, one of `OIDN_WEIGHTS`, in float32; ValueError or FileNotFoundError if it is not there."""
     if name not in OIDN_WEIGHTS:
         raise ValueError(f"OIDN's weights: expected one of {', '.join(OIDN_WEIGHTS)}, got {name!r}")
     path = find_library()

@@ -320,10 +320,7 @@ def start_from_oidn(model: RobustUNet) -> RobustUNet:
 
 
 def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
-    """Prepare a model for running: channels last, no gradients; changes and returns it.
-
-    `bfloat16` rounds weights (`network.bfloat16.round_unet`); it pays only on processors that compute in bfloat16.
-    """
+    """Make a model channels last, without gradients, with `bfloat16` rounded (`round_unet`), in place; return it."""
     model.eval().requires_grad_(False)
     if bfloat16:
         model.backbone = round_unet(model.backbone)

@@ -106,10 +106,7 @@ class OidnUNet(nn.Module):
         return in_strips(lambda x, skip: head(finest.upsample(x, self.input_skip(skip))), 3, x, network_input)
 
     def input_skip(self, x: Tensor) -> Tensor:
-        """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`).
-
-        Returns a skip connection itself.
-        """
+        """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
         if self.first.weight.dtype == torch.bfloat16:
             return x if x.dtype == torch.bfloat16 else with_low_bits(x, 3)
         return x.to(self.first.weight.dtype, memory_format=torch.channels_last)

@@ -113,10 +113,7 @@ def follow_motion(lights: Highlights, moved: Points) -> Places:
 
 
 def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask:
-    """Return where (K,) a neighbouring frame shows the same highlight as the first, which `moved` leads to.
-
-    Within 0.75 pixels of the moved position, with 0.6 to 1.7 times the light: Σ |a − b| ≤ Σ (a + b) / 4 over channels.
-    """
+    """Return where (K,) a highlight, moved by up to 0.75 pixels, is shown: Σ |a − b| ≤ Σ (a + b) / 4 over channels."""
     far = np.hypot(*(second.points - first.points - moved).T)
     difference, total = np.abs(first.light - second.light).sum(axis=1), (first.light + second.light).sum(axis=1)
     return np.asarray((far <= NEAR) & (difference <= DIFFERENT * total))
@@ -184,10 +181,7 @@ def remove_highlights(color: Floats, pixels: Places) -> Floats:
 
 
 def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
-    """Clamp a denoised picture (H, W, C) around highlights to the brightest pixel of the ring around a halo's radius.
-
-    Ring pixels as near to another place do not count.
-    """
+    """Clamp a picture (H, W, C) around highlights to the brightest of the ring, if nearest to them, around a halo."""
     held = picture.copy()
     middles = np.zeros(picture.shape[:2], np.uint8)
     middles[places[:, 0], places[:, 1]] = 1

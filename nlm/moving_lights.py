@@ -32,10 +32,7 @@ _STEADY, _FEW = 1, 9
 
 
 def find_bright(excess: Floats) -> Mask:
-    """Find the bright pixels (H, W) of a frame; none where too few or too many are bright to detect a motion.
-
-    `excess` (H, W) is what the frame shows beyond its denoised picture, relative to the light.
-    """
+    """Find bright pixels (H, W) of the excess over a picture, relative to the light; none if too few or too many."""
     rows = excess[:: max(len(excess) // _ROWS, 1)]
     bulk = 1.4826 * float(np.median(np.abs(rows)))
     bright = excess > max(_ABOVE, _DEVIATIONS * bulk)

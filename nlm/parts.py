@@ -55,10 +55,7 @@ def share_outside(part: Floats, whole: Floats, exposure: float) -> float:
 
 
 def shares_noise(part: Floats, whole: Floats) -> bool:
-    """Return whether a picture contains a layer's noise: the slope of second differences is a half or more.
-
-    The slope of the regression is 1 for a part and 0 for other light. Both are (H, W, 3) as rendered, finite.
-    """
+    """Return whether a picture holds a layer's noise: the slope of second differences, 1 for parts, is over a half."""
     of_part, of_whole = (_second_differences(layer).astype(np.float64) for layer in (part, whole))
     # Clipped near the median: a single bright sample must not decide.
     most = 10 * np.median(np.abs(of_part)) or np.inf
@@ -84,10 +81,7 @@ def is_noisy(layer: Floats) -> bool:
 
 
 def is_textured(layer: Floats, albedo: Floats) -> bool:
-    """Return whether a layer includes the albedo: the slope of layer/mean on albedo/mean is a half or more.
-
-    Means are over 9×9 pixels; the slope is 1 for albedo times light, and 0 for light alone.
-    """
+    """Return whether a layer includes the albedo: the slope of layer/mean on albedo/mean, 9×9, is at least a half."""
     color = albedo if layer.shape[-1] == albedo.shape[-1] else albedo.mean(axis=-1, keepdims=True)
     light, level = np.abs(_blur(layer)), _blur(color)
     lit = (light > 0) & (level > _DARK)
@@ -160,10 +154,7 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
 def filter_layers(
     layers: Sequence[Floats], guide: Floats, *, moments: NDArray[np.float64] | None = None
 ) -> list[Floats]:
-    """Denoise layers, averaged over time, each within its own range and with its own mean, by the guided filter.
-
-    The guide holds the denoised light and more; `moments` as for `nlm.guided.guided_filter`.
-    """
+    """Denoise layers, averaged over time, each within its range and with its mean, by `nlm.guided.guided_filter`."""
     if not layers:
         return []
     steered = guided_filter(np.concatenate(layers, axis=-1), guide, radius=_RADIUS, eps=_EPS, moments=moments)
@@ -251,11 +242,7 @@ def _second_differences(layer: Floats) -> Floats:
 
 
 def limit_change(own: Floats, color: Floats, most: float, *, with_factor: bool) -> tuple[Floats, Floats]:
-    """Change a picture `own` (H, W, C) to another color by a factor of `most` at most, and return the factor.
-
-    Where the picture is 0 or less the color is taken as it is. The factor, by which the parts of the picture change, is
-    empty unless `with_factor`.
-    """
+    """Change a picture (H, W, C), or black, to a color by a factor of at most `most`, and return that `with_factor`."""
     changed, factor = np.empty_like(own), np.empty(own.shape if with_factor else (0, 0, 0), np.float32)
     run_bands(_limit_change, len(own), own, np.ascontiguousarray(color), np.float32(most), changed, factor)
     return changed, factor

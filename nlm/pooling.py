@@ -76,10 +76,7 @@ class SampleRange(NamedTuple):
         return cls(np.empty(shape, np.float32), np.empty(shape, np.float32))
 
     def add(self, estimates: Floats, residuals: Floats, top: int) -> None:
-        """Fill the rows from `top` on by residuals (T, h, W, 3) of these and all estimates, those of `pool_samples`.
-
-        Non-finite values do not count.
-        """
+        """Fill the rows from `top` on by residuals (T, h, W, 3) and all estimates of `pool_samples`, where finite."""
         check_strip(residuals, estimates, top)
         run_bands(_range, residuals.shape[1], estimates, residuals, *self, top)
 

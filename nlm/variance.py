@@ -121,10 +121,7 @@ def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
 
 
 def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confidence: Floats) -> Floats:
-    """As `prefilter_guide`; `read` returns the window (T, h, W, F) of some rows, and is called for rows around noise.
-
-    The centre's guide (H, W, F) alone shows where noise may be, as the lesser variance counts.
-    """
+    """As `prefilter_guide`; `read` returns the window (T, h, W, F) of rows around noise that the guide shows."""
     spatial, filtered = variance_from_residual(centre), centre.copy()
     for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):
         guides, trusted = check_window(read(rows), confidence[:, rows], "confidence")
@@ -145,10 +142,7 @@ def _around(rows: NDArray[np.bool_]) -> Iterator[slice]:
 
 
 def gaussian_mean(image: Floats, sigma: float) -> Floats:
-    """Mean (H, W) with Gaussian weights, which end at three deviations; the image is mirrored at its borders.
-
-    The squares of the weights are those of a Gaussian narrower by √2, over 4πσ².
-    """
+    """Mean (H, W) with Gaussian weights up to three deviations; the image is mirrored at its borders."""
     side = 2 * int(3 * sigma) + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
 

@@ -215,10 +215,7 @@ def aligned_planes(layers: Layers) -> float:
 
 
 def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:
-    """Measure how far the light of a frame (H, W) stands still, by the weight of the next frame.
-
-    Without `AlignedWindow.drift_weight` nothing is known: 0 everywhere, and 1 for the whole.
-    """
+    """Measure how far the light of a frame (H, W) stands still by the next frame's weight; 0, in all 1, if unknown."""
     if drift_weight is None:
         return Stillness(np.zeros(shape, np.float32), np.float32(1))
     still = np.reciprocal(drift_weight)  # 1 / (1 + DRIFTED (1 / w − 1)), in place: frames are large
@@ -285,10 +282,7 @@ def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, t
 def _warp_first_pass(
     window: Window, first_pass: Sequence[Array | None], coverage: Array, rows: slice, timings: Timings
 ) -> Array:
-    """Warp denoised frames to these rows of the centre, (T, h, W, 3); its own where a frame shows or has none.
-
-    Where a neighbour has none its coverage becomes 0.
-    """
+    """Warp first passes to these rows, (T, h, W, 3); the centre's, with coverage 0, where a neighbour has none."""
     middle = first_pass[len(first_pass) // 2]
     if middle is None:
         raise ValueError(f"frame {window.centre.number} has no estimate, expected one like its neighbours")

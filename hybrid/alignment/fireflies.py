@@ -37,11 +37,7 @@ WITNESSES, REACH = 2, 2
 def remove_fireflies(
     frame: PreparedFrame, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
 ) -> PreparedFrame:
-    """Remove the single bright samples of a prepared frame, and set its one-pixel highlights apart.
-
-    `neighbour` maps −2, −1, 1 or 2 to the prepared frame so many frames away, fireflies included; None if there is
-    none.
-    """
+    """Remove single bright samples and set highlights apart, by `neighbour`: frames at −2, −1, 1, 2, or None."""
     with timings.stage("prepare"):
         places, isolated = find_bright_samples(frame.irradiance)
     if not len(places):

@@ -50,10 +50,7 @@ class PairFlows(NamedTuple):
 def measure_flows(
     earlier: PreparedFrame, later: PreparedFrame, stages: Collection[str], refine: Callable[..., Array]
 ) -> PairFlows:
-    """Find the flows between two neighbouring frames; `refine` corrects vectors as `flow.tvl1.refine_flow` does.
-
-    The stages are those that the pair calls for, so that its flow is the same in every window.
-    """
+    """Find the flows between two neighbouring frames, by the pair's own stages; `refine` as `flow.tvl1.refine_flow`."""
     shape = earlier.irradiance.shape[:2]
     if "warp" not in stages:
         still = Flow(np.zeros((*shape, 2), np.float32), np.ones(shape, bool))

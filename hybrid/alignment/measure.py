@@ -1,7 +1,4 @@
-"""Measurements of frames and of pairs of neighbouring frames, from which stages are chosen (`hybrid.plan`).
-
-Each depends only on its frame or pair: the stages of a window are the same whatever part of a shot is denoised.
-"""
+"""Measurements of frames and pairs, from which stages are chosen alike in every part of a shot (`hybrid.plan`)."""
 
 from __future__ import annotations
 
@@ -319,11 +316,7 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
 
 
 def _coverage(here: SmallFrame, there: SmallFrame) -> Mask:
-    """Where the first of two frames is lit; where either is, if the first is lit in less than half as many pixels.
-
-    Outside a render region, and behind an object, frames are black: background that an object uncovers there is no
-    change of light.
-    """
+    """Where the first of two frames is lit; where either is, if less than half of that: uncovered background."""
     # Closed: noise leaves single pixels of lit surfaces black.
     lit = ((frame.valid & (channel_mean(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
     shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]

@@ -27,10 +27,7 @@ SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 
 
 def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:
-    """Layers of a frame that are warped, by name.
-
-    With `light`, which the gate compares where there is no first pass.
-    """
+    """Layers of a frame that are warped, by name; with `light`, which is compared where there is no first pass."""
     named = {
         "color": frame.irradiance,
         "light": frame.light if light else None,
@@ -43,10 +40,7 @@ def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False)
 
 
 def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> None:
-    """Warp a neighbour's layers to some rows of the centre, into `warped`.
-
-    The flow (h, W, 2) leads from these rows to the neighbour; names are those of `layers_of`.
-    """
+    """Warp a neighbour's `layers_of` to some rows of the centre, along their flow (h, W, 2), into `warped`."""
     layers = layers_of(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
     moves = bool(warped) and flow.any()
     for name, out in warped.items():

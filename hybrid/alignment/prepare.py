@@ -205,10 +205,7 @@ def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -
 
 
 def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
-    """Return the renderer's flow (H, W, 2) between neighbouring frames, and where it is known; None without vectors.
-
-    Vectors span one frame; if only every n-th frame was rendered they are multiplied by n.
-    """
+    """Return the renderer's flow (H, W, 2) over n frames, n times its vectors, and where it is known; None without."""
     step = abs(there.number - here.number)
     forward = there.number > here.number
     direct = here.motion and (here.motion.to_next if forward else here.motion.to_previous)

@@ -120,10 +120,7 @@ def measure_exposure(radiance: Array) -> float:
 
 
 def measure_gain(picture: Array) -> float:
-    """Return the factor of a denoised picture (H, W, 3) before OIDN's transfer curve: `autoexposure` of its lit part.
-
-    ``measure_gain(a·x) = measure_gain(x) / a``. Denoisers leave tiny values on black, which are no light.
-    """
+    """Return a picture's (H, W, 3) factor before OIDN's transfer curve: `autoexposure` without tiny values on black."""
     exposure = measure_exposure(picture)
     return autoexposure(picture, dark=LIT, exposure=exposure) / exposure
 

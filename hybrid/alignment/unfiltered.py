@@ -54,10 +54,7 @@ class Unfiltered:
         return 0 if self.beyond is None else int(np.count_nonzero(self.beyond == np.float32(HALF_MAX)))
 
     def restore(self, picture: Array, guide: Array | None) -> Array:
-        """Restore the light in a denoised picture (H, W, 3), with the local mean of the negative light.
-
-        `guide` (H, W, G) or None is albedo and normal, finite.
-        """
+        """Restore the light, of negative light the mean within `guide`, in a denoised picture (H, W, 3)."""
         if "color" in self.gray:
             picture = as_gray(picture)
         if "color" in self.negative:
@@ -82,10 +79,7 @@ class Unfiltered:
 
 
 def find_region(color: Array) -> Region | None:
-    """Return rows and columns of the rectangle outside of which a frame (H, W, 3) is black, as of a render region.
-
-    None if the whole frame is lit, or if the lit area is no rectangle.
-    """
+    """Return rows and columns of the rectangle around which a frame (H, W, 3) is black; None if there is none."""
     # Channel by channel: numpy takes long over the short axis.
     some = np.logical_or.reduce([plane != 0 for plane in np.moveaxis(color, -1, 0)])
     # Closed: noise leaves single pixels of lit surfaces black.

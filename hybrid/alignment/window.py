@@ -74,10 +74,7 @@ class WarpSources:
     rows: slice  # of the centre
 
     def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
-        """Warp "albedo", "normal" or "irradiance" of all frames, (T, h, W, 3); the centre's where there is no flow.
-
-        `part` are rows of the centre's layer; all, if not given.
-        """
+        """Warp a layer of all frames, (T, h, W, 3), to rows of the centre, or all; its own where there is no flow."""
         here = centre_layer[part]
         first = self.rows.start + part.indices(len(centre_layer))[0]
         window = np.empty((len(self.frames), *here.shape), np.float32)
