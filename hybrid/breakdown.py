@@ -49,10 +49,7 @@ class Breakdown:
 
 
 def layers_of(parts: Array, weights: Array) -> dict[str, Array]:
-    """Return the layers for a frame's file: ``contribution.before2`` and so on, ``weight.before2`` and so on.
-
-    From the radiance (T, H, W, 3) that each frame contributes, and the weight (T, H, W) of each; these sum to 1.
-    """
+    """Return layers ``contribution.before2`` … of radiance (T, H, W, 3), and ``weight.before2`` … that sum to 1."""
     names = frame_names(len(parts))
     layers = {f"contribution.{name}": part for name, part in zip(names, parts, strict=True)}
     return {**layers, **{f"weight.{name}": weight for name, weight in zip(names, weights, strict=True)}}

@@ -249,10 +249,7 @@ def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) ->
 
 
 def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:
-    """Return a function from a frame's number to all files within its temporal support.
-
-    `earlier` is the same for the frames of the shot, where an earlier pass made them.
-    """
+    """Return a function from a frame to all files of its temporal support, or those of an `earlier` pass."""
     shot, support = views[0].shot, temporal_support(views[0].first_pass, radius, rules)
 
     def sources(number: int) -> dict[str, Source]:

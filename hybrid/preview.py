@@ -51,10 +51,7 @@ def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = R
 
 
 def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
-    """Write a PNG of at most `SHEET_FRAMES` frames with their numbers, row by row, from the first to the last.
-
-    The left half of each frame is noisy, the right half denoised; the exposure is that of `write_preview`.
-    """
+    """Write a PNG of at most `SHEET_FRAMES` numbered frames, each noisy left and denoised right, as `write_preview`."""
     check_png(path, "contact")
     pairs = _Pairs(shot, output)
     count = min(len(shot.numbers), SHEET_FRAMES)

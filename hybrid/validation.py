@@ -90,10 +90,7 @@ class ValidationReport:
         return tuple(finding.message for finding in self.findings if finding.warning)
 
     def readings(self) -> list[tuple[str, str, str]]:
-        """Rows of the motion conventions that were tried, the best first: "taken" or "", convention, unexplained share.
-
-        The chosen one, or else the best, is always among them; of fitted scales only the best is.
-        """
+        """Rows of the best motion conventions, with the chosen one: "taken" or "", convention, unexplained share."""
         if self.motion is None:
             return []
         chosen = self.motion.convention
@@ -400,10 +397,7 @@ def _edges_of(colors: Sequence[Array]) -> list[Array]:
 
 
 def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
-    """Correlate edges that were found with those of two frames.
-
-    The better of both frames counts as the own one: a black or dim frame matches nothing, the other one anything still.
-    """
+    """Correlate edges that were found with those of two frames; the better is the own, as dim frames match anything."""
     centre = max(_correlate(found[0], shown[0]), _correlate(found[1], shown[1]))
     return _EdgeMatch(centre, _correlate(found[1], shown[0]), _correlate(found[0], shown[1]))
 

@@ -144,10 +144,7 @@ def _cut(image: Array, box: Box) -> Array:
 
 
 def to_codes(image: Array, level: float) -> Codes:
-    """Encode radiance as integers in [0, `CODES`), uniform in log(1 + x / black); `NOT_FINITE` for NaN and infinity.
-
-    Black is 1/64 of the shot's mean level; negative values count as 0.
-    """
+    """Encode radiance in [0, `CODES`) by log(1 + x / black), black 1/64 of the mean level; else `NOT_FINITE`."""
     finite = np.isfinite(image)
     scaled = np.maximum(np.where(finite, image, 0), 0) / (level / 64)
     codes = np.minimum(np.rint(np.log2(1 + scaled) * CODES_PER_STOP), NOT_FINITE - 1)

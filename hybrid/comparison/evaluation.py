@@ -198,10 +198,7 @@ def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list
 def find_static_pixels(
     store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
 ) -> NDArray[np.bool_]:
-    """Find pixels (H, W) without motion and without a change of the reference's light in any frame.
-
-    Unless all neighbouring frames have a flow (`store_flows`), no pixel counts as static.
-    """
+    """Find pixels (H, W) without motion or change of the reference's light in any frame; none without all flows."""
     shape = store.load(REFERENCE, numbers[0]).shape
     if not pairs or len(pairs) < len(numbers) - 1:
         return np.zeros(shape[:2], bool)

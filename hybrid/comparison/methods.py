@@ -115,10 +115,7 @@ class Classical:
 
 @dataclass(frozen=True)
 class Network:
-    """Denoise with a network and the weights of a preset; the other settings are those of `hybrid.neural.open_network`.
-
-    The radius of the windows is that of the network.
-    """
+    """Denoise with a preset's weights and windows of its radius; others are options of `hybrid.neural.open_network`."""
 
     preset: str
     window: WindowSettings = field(default_factory=WindowSettings)

@@ -39,10 +39,7 @@ def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
 
 
 def psnr(image: Array, reference: Reference, *, exposure: float = 1.0) -> float:
-    """Peak signal-to-noise ratio of the tone-mapped image: −10 log₁₀ mean (T(x) − T(r))² dB, with peak 1.
-
-    Infinite where the error is zero, or where the estimate from two halves is not positive.
-    """
+    """Peak signal-to-noise ratio −10 log₁₀ mean (T(x) − T(r))² dB, with peak 1; infinite for errors not above zero."""
     errors = _tone_errors(image, reference, exposure)
     return _decibels(np.mean(errors[0] * errors[-1]))
 

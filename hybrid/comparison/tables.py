@@ -143,10 +143,7 @@ def ladder_table(rows: Sequence[Sequence[str]]) -> Table:
 
 
 def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
-    """Write the README's table: PSNR and temporal PSNR on each shot, then the costs on the first one.
-
-    The best of a column is bold, ties are marked "≈"; absent methods follow with the reason.
-    """
+    """Write the README's table: measures on each shot, best bold, ties "≈", and the costs on the first one."""
     shots = [_Columns.of([r for r in c.results if not r.sweep], MARKDOWN_METRICS) for c in comparisons]
     cpu = cost == "cpu_seconds_per_megapixel"
     heads = [

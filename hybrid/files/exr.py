@@ -86,10 +86,7 @@ class Part:
         return self.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile)
 
     def would_lose(self, replaced: Collection[str]) -> str | None:
-        """Return the compression that would change kept channels when the part is written again, or None.
-
-        `replaced` names channels as in the part; alpha counts as kept, as it is in some frames.
-        """
+        """Return the compression that would change channels kept beside `replaced`, alpha among them, or None."""
         compression = self.header["compression"].name
         # DWA and its like keep alpha exactly.
         exact = {name for name in self.channels if component_of(name) == "A" and not compression.startswith("B44")}

@@ -90,10 +90,7 @@ class Profile:
 
 
 def parse_motion(words: str) -> dict[str, Any]:
-    """Return parts of a `flow.motion.MotionConvention` from words such as ``next,ndc,y-up,scale=2``.
-
-    Raises ValueError if a word is unknown, or contradicts another.
-    """
+    """Return parts of a `MotionConvention` from words such as ``next,ndc,y-up,scale=2``; ValueError if impossible."""
     tables = {"direction": DIRECTIONS, "unit": UNITS, "encoding": ENCODINGS}
     known: dict[str, tuple[str, Any]] = {word: (part, word) for part, table in tables.items() for word in table}
     known |= {f"y-{side}": ("y", side) for side in VERTICAL} | {"premultiplied": ("premultiplied", True)}

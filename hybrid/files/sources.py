@@ -30,10 +30,7 @@ _SECONDS = 2.0
 
 @dataclass(frozen=True)
 class Source:
-    """A file as it was when it was read: name without folder, bytes, modification time in seconds, hash (`HASHED`).
-
-    The inode tells files of one name apart during a run, and is not recorded.
-    """
+    """A file as it was read: name, bytes, modification time, hash (`HASHED`), and inode, which is not recorded."""
 
     name: str
     size: int

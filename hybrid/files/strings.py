@@ -42,10 +42,7 @@ def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
 
 @contextmanager
 def readable_copy(path: Path, *, header_only: bool) -> Iterator[tuple[Path, dict[tuple[int, str], str]]]:
-    """Yield a copy of a file whose strings are UTF-8, and (part, name) → original string of the changed ones.
-
-    With `header_only` the copy need not have anything behind the headers.
-    """
+    """Yield a copy, or its headers, with UTF-8 strings, and (part, name) → original string of the changed ones."""
     with path.open("rb") as file:
         data = bytearray(file.read(_HEADERS if header_only else -1))
     strings = {}

@@ -50,10 +50,7 @@ def prepare_libraries() -> None:
 
 
 def limit_threads(count: int) -> None:
-    """Limit numba, OpenCV and torch to `count` threads; OIDN's limit is set with each picture (`hybrid.oidn`).
-
-    numba uses no more threads than it was started with.
-    """
+    """Limit numba (to what it was started with), OpenCV and torch to `count` threads; OIDN is limited at each call."""
     import cv2
     import numba
 

@@ -43,10 +43,7 @@ class Timings:
 
     @contextmanager
     def background(self, name: str) -> Iterator[None]:
-        """Count the CPU time of the ``with`` block, in a background thread, as stage `name`.
-
-        Threads that libraries start in the block are counted with the stage of the main thread.
-        """
+        """Count the CPU time of a background thread's block, not of threads that libraries start in it, as a stage."""
         thread, start, clock = threading.get_ident(), time.thread_time(), thread_clock()
         with self._lock:
             self._running[thread] = clock, start

@@ -99,10 +99,7 @@ class Sequence:
         return place(encoded, data_window(part), Window(0, 0, width - 1, height - 1))
 
     def values(self, number: int, name: str, x: int, y: int) -> dict[str, float | None]:
-        """Return the values of a layer's pixel by component, None if not finite; {} outside of the data window.
-
-        `x` and `y` count from the top left of the display window. Errors are those of `picture`.
-        """
+        """Return a pixel's values by component, None if not finite, {} outside; (0, 0) is the display's top left."""
         image, layer, pixels = self._read_layer(number, name)
         part = image.parts[layer.part]
         column, row = x - data_window(part).left, y - data_window(part).top
