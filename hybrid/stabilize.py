@@ -267,6 +267,7 @@ class FrameDenoiser:
         """The denoised frame with its samples' means, and samples where they are certain, as in moving lights."""
         color, timings = denoised.color, self.stream.timings
         exposure, sides, rendered = measure_exposure(color), result.neighbour_samples, frame.rendered
+        radiance = frame.radiance if frame.removed_samples else rendered
         self.stream.keeper.release()  # the frame's own layers, of which this is made
         shown = [rendered] if sides is None else [rendered, sides.mean]
         color = limit_lamps(color, shown, exposure)
@@ -276,11 +277,11 @@ class FrameDenoiser:
                 # What is wrong beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
                 far = counted & ~beside_lamps(color, exposure)
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
-                for noisy in (frame.radiance, rendered) if frame.removed_samples else (rendered,):
+                for noisy in (radiance, rendered) if frame.removed_samples else (rendered,):
                     color = restore_mean(color, _where(far, noisy, color), exposure)
         if sides is not None:
             with timings.stage("blend-samples"):
-                noisy = _where(counted, frame.radiance if frame.removed_samples else rendered, color)
+                noisy = _where(counted, radiance, color)
                 if not counted.all():
                     fresh = counted if moving is None else counted & ~moving[1]
                     sides = sides._replace(nearest=sides.nearest * fresh)
@@ -428,4 +429,5 @@ def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
         # Shared out of the picture, which had no negative light, parts have none.
         aovs[name] = np.maximum(aovs[name], 0) + unfiltered.smooth_negative(name, denoised.color, frame.guide)
     aovs = {name: unfiltered.without_outside(layer) for name, layer in aovs.items()}
-    return replace(denoised, color=unfiltered.restore(denoised.color, frame.guide), aovs=aovs)
+    guide = frame.guide if unfiltered.negative else None
+    return replace(denoised, color=unfiltered.restore(denoised.color, guide), aovs=aovs)

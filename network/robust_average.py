@@ -118,17 +118,21 @@ class ChannelAverage(nn.Module):
         super().__init__()
         self.blend = nn.Parameter(torch.full((channels,), log(blend / (1 - blend))))
 
-    def forward(self, x: Tensor, frames: int, centre: bool = False) -> Tensor:
-        """Blend ``(T·N, C, H, W)`` over time; with `centre`, return ``(N, C, H, W)`` of the centre frame alone."""
-        if frames == 1:
-            return x
+    def forward(self, x: Tensor, frames: int, centre: bool = False, common: Tensor | None = None) -> Tensor:
+        """Blend ``(T·N, C, H, W)`` over time; with `centre`, return ``(N, C, H, W)`` of the centre frame alone.
+
+        With `common` ``(N, C, H, W)`` that is added to each frame returned, and a ReLU follows.
+        """
         weight, order = torch.sigmoid(self.blend), outermost_first(frames)
         if not torch.is_grad_enabled() and can_blend(x, frames):
-            return blend_channels(x, frames, order, weight, [frames // 2] if centre else range(frames))
+            return blend_channels(x, frames, order, weight, [frames // 2] if centre else range(frames), common)
         state, weight = list(x.chunk(frames)), weight.to(x.dtype)[:, None, None]
-        for i in order:
+        for i in order if frames > 1 else ():
             state[i] = torch.lerp(state[i], ravg(state[:i] + state[i + 1 :]), weight)
-        return state[frames // 2] if centre else torch.cat(state)
+        returned = [state[frames // 2]] if centre else state
+        if common is not None:
+            returned = [torch.relu(image + common) for image in returned]
+        return torch.cat(returned)
 
 
 def outermost_first(frames: int) -> list[int]:

@@ -214,12 +214,14 @@ class RobustUNet(nn.Module):
         frames, shared = (part.to(first.weight.dtype, memory_format=layout) for part in (frames, shared))
         frame_weight = torch.cat([first.weight[:, :3], aux[:, 3:4]], 1).contiguous(memory_format=layout)
         shared_weight = torch.cat([first.weight[:, 3:], aux[:, :3], aux[:, 4:]], 1).contiguous(memory_format=layout)
-        # Ten of a frame's 14 channels are the same in all frames: they are convolved once.
-        once = functional.conv2d(shared, shared_weight, first.bias, padding=1).permute(0, 2, 3, 1)
-        repeated = once.repeat(len(frames) // len(shared), 1, 1, 1).permute(0, 3, 1, 2)
-        x = convolve(frames, frame_weight, None, repeated, relu=False)
+        # Ten of a frame's 14 channels are the same in all frames: they are convolved once, and added behind the block,
+        # because an average of frames that have a term in common is that term plus the average of the rest.
+        common = functional.conv2d(shared, shared_weight, first.bias, padding=1)
+        x = convolve(frames, frame_weight, None, relu=False)
         if "0" in self.robust_average:
-            x = self.robust_average["0"](x, count, last == 0)
+            x = self.robust_average["0"](x, count, last == 0, common)
+        else:
+            x = torch.relu(x + common.repeat(len(frames) // len(shared), 1, 1, 1))
         return halve(cast(Stage, self.backbone.encoder[0]).after_first(x))
 
     def decode(self, x: Tensor, static: Tensor) -> tuple[Tensor, Tensor]:

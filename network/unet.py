@@ -136,8 +136,8 @@ class Stage(nn.Sequential):
             self.register_buffer(name, None, persistent=False)
 
     def after_first(self, x: Tensor) -> Tensor:
-        """Run all layers behind the first convolution on its output."""
-        return self._run(torch.relu(x), list(self)[2:])
+        """Run all layers behind the first convolution and its ReLU."""
+        return self._run(x, list(self)[2:])
 
     def upsample(self, x: Tensor, skip: Tensor) -> Tensor:
         """Enlarge features to twice their size, concatenate the skip connection, and run all layers."""

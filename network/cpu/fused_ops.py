@@ -33,15 +33,21 @@ def can_blend(x: Tensor, frames: int) -> bool:
     return supported and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
 
 
-def blend_channels(x: Tensor, frames: int, order: Sequence[int], weight: Tensor, returned: Sequence[int]) -> Tensor:
+def blend_channels(
+    x: Tensor, frames: int, order: Sequence[int], weight: Tensor, returned: Sequence[int], common: Tensor | None = None
+) -> Tensor:
     """Run a `network.robust_average.ChannelAverage` block on ``(T·N, C, H, W)``, time first, T 3, 5 or 7.
 
-    Frames are blended in the given order with the ``(C,)`` weight of the robust average; those in `returned` come back.
+    Frames are blended in the given order with the ``(C,)`` weight of the robust average; those in `returned` come back,
+    with `common` ``(N, C, H, W)`` added and then a ReLU.
     """
     pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
     batch, (height, width, channels) = len(x) // frames, pixels.shape[1:]
     result = pixels.new_empty(len(returned) * batch, height, width, channels)
-    rows = [_bits(values).reshape(-1, batch * height, width * channels) for values in (pixels, result)]
+    added = pixels[:0] if common is None else common.permute(0, 2, 3, 1).contiguous()
+    lengths = frames, len(returned), int(common is not None)
+    layers = zip((pixels, result, added), lengths, strict=True)
+    rows = [_bits(values).reshape(n, batch * height, width * channels) for values, n in layers]
     tiled = np.tile(weight.detach().float().numpy(), max(_VALUES // channels, 1))
     run_bands(_blend, batch * height, *rows, np.asarray(order), np.asarray(returned), tiled)
     return result.permute(0, 3, 1, 2)
@@ -173,15 +179,21 @@ def _blend_six(x: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, share: An
         x[p] += share[p] * (np.float32(0.25) * total - x[p])
 
 
+@njit(nogil=True)
+def _add(x: Any, y: Any) -> None:
+    for p in range(len(x)):
+        x[p] = max(x[p] + y[p], np.float32(0))
+
+
 @njit(cache=True, nogil=True)
 def _blend(
-    first: int, stop: int, source: NDArray[Any], result: NDArray[Any], order: NDArray[Any], returned: NDArray[Any],
-    share: NDArray[np.float32],
+    first: int, stop: int, source: NDArray[Any], result: NDArray[Any], added: NDArray[Any], order: NDArray[Any],
+    returned: NDArray[Any], share: NDArray[np.float32],
 ) -> None:  # fmt: skip
     # Input and result are bits of float32, or of bfloat16, which is the upper half of a float32.
     T, _, row = source.shape
     low = np.uint32(32 - 8 * source.itemsize)
-    bits = np.zeros((T, len(share)), np.uint32)
+    bits = np.zeros((T + 1, len(share)), np.uint32)
     state = bits.view(np.float32)
     others = np.empty((T, T - 1), np.intp)
     for t in range(T):
@@ -202,6 +214,10 @@ def _blend(
                     _blend_six(
                         state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], state[o[4]], state[o[5]], share
                     )
+            if len(added):
+                _widen(bits[T], added[0, y][part], low)
+                for n in returned:
+                    _add(state[n], state[T])
             for n in range(len(returned)):
                 _narrow(result[n, y][part], bits[returned[n]], low)
 

@@ -213,7 +213,8 @@ def test_shared_channels_are_convolved_once() -> None:
     each = torch.cat([*parts, found.samples.expand(5, -1, -1, -1)], 1)
     weight = torch.cat([model.backbone.first.weight, model.aux_conv.weight], 1)
     entered: list[torch.Tensor] = []
-    model.robust_average["0"].register_forward_pre_hook(lambda _, given: entered.append(given[0].clone()))
+    # The terms of each frame, and those that frames share, which the block adds to its result.
+    model.robust_average["0"].register_forward_pre_hook(lambda _, given: entered.append(given[0] + given[3]))
     model.encode_and_fuse(inputs.frames, inputs.shared)
     wanted = functional.conv2d(each, weight, model.backbone.first.bias, padding=1)
     # Sums of 126 products of about 1, in another order.

@@ -42,6 +42,19 @@ def test_it_gives_what_torch_gives(frames: int, centre: bool, channels: int) -> 
     assert float((found - given).abs().mean()) > 0.1  # it does something
 
 
+@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("frames", [1, 3, 5, 7])
+def test_a_common_term_commutes_with_the_block(frames: int, centre: bool) -> None:
+    """Added to all frames beforehand or to the results, it gives the same; a ReLU follows."""
+    block, x = block_and_features(frames)
+    common = torch.randn(2, *x.shape[1:], generator=torch.Generator().manual_seed(2))
+    wanted = torch.relu(block(x + common.repeat(frames, 1, 1, 1), frames, centre)).detach()
+    torch.testing.assert_close(block(x, frames, centre, common).detach(), wanted, rtol=0, atol=1e-5)
+    with torch.no_grad():
+        torch.testing.assert_close(block(x, frames, centre, common), wanted, rtol=0, atol=1e-5)
+    assert float((wanted == 0).float().mean()) > 0.1
+
+
 @pytest.mark.parametrize("frames", [5, 7])
 def test_in_bfloat16_it_is_nearer_to_exact_than_torch_is(frames: int) -> None:
     block, x = block_and_features(frames, torch.bfloat16)
