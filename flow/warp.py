@@ -171,8 +171,7 @@ def warp(
     ----------
     image : (H, W) or (H, W, C) float array
         Taken as float32. Remove NaN and Inf first: a non-finite pixel spreads to every pixel that samples it.
-    flow : (H, W, 2) or (h, W, 2) float array
-        Pixels, x right then y down; of all rows, or of some.
+    flow : (H, W, 2) or (h, W, 2) float array, pixels, x right then y down; of all rows, or of some
     interpolation : str
         "bilinear"; "bicubic": Catmull-Rom clamped to the range of the four pixels around the position, so that it never
         rings (nor goes below zero) beside a firefly; or "nearest", which keeps the statistics of noise.
