@@ -188,7 +188,7 @@ class Patches:
         pictures = tuple(self.pictures[index] for index in order)
         lit = tuple((shown or self.shown)[index] for index in order)
         difference = np.empty(len(at), np.float32)
-        _compare(pictures, lit, flow, unit, self.rows[at], self.columns[at], difference)
+        _compare(pictures, lit, np.ascontiguousarray(flow), unit, self.rows[at], self.columns[at], difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 

@@ -165,7 +165,7 @@ def _add_moments(sums: Doubles, image: Floats, guide: Floats, weight: float) -> 
         sums[n + c] += weight * image[c]
 
 
-@njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+@njit(cache=True, nogil=True, boundscheck=False, error_model="numpy", inline="always")
 def _solve_box(out: Floats, sums: Doubles, matrix: Doubles, right: Doubles, G: int, C: int, eps: float) -> None:
     """Coefficients of one box, a (C × G) then b (C) then 1; all 0 where nothing is trusted."""
     if not sums[0] > 0:
@@ -220,28 +220,24 @@ def _solve(
         columns = np.zeros((W, 1 + G + G * (G + 1) // 2 + C + G * C))
         box = np.empty(columns.shape[1])
         matrix, right = np.empty((G, G)), np.empty((G, C))
-        for y in range(max(top - radius, 0), min(top + radius, H)):
-            for x in range(W):
-                _add_moments(columns[x], image[y, x], guide[y, x], float(weight[y, x, 0]))
-        for y in range(top, bottom):
-            enter, leave = y + radius, y - radius - 1
-            for x in range(W):
-                if enter < H:
-                    _add_moments(columns[x], image[enter, x], guide[enter, x], float(weight[enter, x, 0]))
-                if leave >= max(top - radius, 0):
-                    _add_moments(columns[x], image[leave, x], guide[leave, x], -float(weight[leave, x, 0]))
+        # Each sum has one statement for what enters and what leaves: a copy of it costs a second of compilation.
+        for y in range(max(top - radius, 0) - radius, bottom):
+            for sign in (1.0, -1.0):
+                row = y + radius if sign > 0 else y - radius - 1
+                if max(top - radius, 0) <= row < H:
+                    for x in range(W):
+                        _add_moments(columns[x], image[row, x], guide[row, x], np.float32(sign) * weight[row, x, 0])
+            if y < top:
+                continue
             box[:] = 0
-            for x in range(min(radius, W)):
-                for m in range(box.size):
-                    box[m] += columns[x, m]
-            for x in range(W):
-                if x + radius < W:
-                    for m in range(box.size):
-                        box[m] += columns[x + radius, m]
-                if x - radius - 1 >= 0:
-                    for m in range(box.size):
-                        box[m] -= columns[x - radius - 1, m]
-                _solve_box(out[y, x], box, matrix, right, G, C, eps)
+            for x in range(-radius, W):
+                for sign in (1.0, -1.0):
+                    column = x + radius if sign > 0 else x - radius - 1
+                    if 0 <= column < W:
+                        for m in range(box.size):
+                            box[m] += sign * columns[column, m]
+                if x >= 0:
+                    _solve_box(out[y, x], box, matrix, right, G, C, eps)
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -251,32 +247,25 @@ def _box_sum(first: int, last: int, values: Floats, radius: int, out: Floats) ->
     for strip in range(first, last):
         top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
         columns, box = np.zeros((W, M)), np.empty(M)
-        for y in range(max(top - radius, 0), min(top + radius, H)):
-            for x in range(W):
-                for m in range(M):
-                    columns[x, m] += values[y, x, m]
-        for y in range(top, bottom):
-            enter, leave = y + radius, y - radius - 1
-            for x in range(W):
-                if enter < H:
-                    for m in range(M):
-                        columns[x, m] += values[enter, x, m]
-                if leave >= max(top - radius, 0):
-                    for m in range(M):
-                        columns[x, m] -= values[leave, x, m]
+        for y in range(max(top - radius, 0) - radius, bottom):
+            for sign in (1.0, -1.0):
+                row = y + radius if sign > 0 else y - radius - 1
+                if max(top - radius, 0) <= row < H:
+                    for x in range(W):
+                        for m in range(M):
+                            columns[x, m] += sign * values[row, x, m]
+            if y < top:
+                continue
             box[:] = 0
-            for x in range(min(radius, W)):
-                for m in range(M):
-                    box[m] += columns[x, m]
-            for x in range(W):
-                if x + radius < W:
+            for x in range(-radius, W):
+                for sign in (1.0, -1.0):
+                    column = x + radius if sign > 0 else x - radius - 1
+                    if 0 <= column < W:
+                        for m in range(M):
+                            box[m] += sign * columns[column, m]
+                if x >= 0:
                     for m in range(M):
-                        box[m] += columns[x + radius, m]
-                if x - radius - 1 >= 0:
-                    for m in range(M):
-                        box[m] -= columns[x - radius - 1, m]
-                for m in range(M):
-                    out[y, x, m] = box[m]
+                        out[y, x, m] = box[m]
 
 
 @njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")

@@ -286,7 +286,7 @@ def _filter(first: int, last: int, given: _Inputs, radius: int, patch: int, k: n
             _filter_tile(given, radius, patch, k, (top, begin), out[top:bottom, begin:end])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner: tuple[int, int], out: Floats) -> None:
     """Average all taps of the tile at `corner`."""
     T, F, (th, tw, C), margin = len(given.window), given.features.shape[2], out.shape, radius + patch
@@ -312,7 +312,7 @@ def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner:
                 out[y, x, c] = centre.values[c, y + margin, x + margin] + mean
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _add_taps(
     centre: _Tile, frame: _Tile, scale: Floats, patch: int, step: tuple[int, int], k: np.float32, total: Floats,
     weight: Floats,

@@ -417,7 +417,10 @@ def _sum_differences(
                         cell[4] += share * power
                         cell[5] += share * (power * power)
                         cell[6] += share * cut
-        sums[1:, row] = cells.T
+        # Not `cells.T` at once: numba would compile the text of an error about shapes, for two seconds.
+        for plane in range(cells.shape[1]):
+            for column in range(len(cells)):
+                sums[1 + plane, row, column] = cells[column, plane]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

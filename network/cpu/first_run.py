@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import torch
 
 from network.devices import has_bfloat16
@@ -22,4 +24,5 @@ def compile_loops() -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()
     compile_loops()

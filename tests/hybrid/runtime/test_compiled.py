@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from hybrid.runtime.compiled import _FirstRun
 
 ROOT = Path(__file__).parents[3]
 NOBODY = 65534
@@ -153,3 +156,20 @@ def test_the_longest_loop_is_compiled_beside_the_first_run_and_found_there(shot_
     assert "_filter" not in made[0]
     assert made[1] == []
     assert list((tmp_path / "cache").rglob("nonlocal_means._filter-*.nbc"))
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_no_garbage_is_looked_for_while_a_loop_is_compiled(collects):
+    """It took a fifth of the compilation; a loop that calls others compiles these first."""
+    watch, was = _FirstRun(), gc.isenabled()
+    watch.begun = True  # no helper processes
+    try:
+        (gc.enable if collects else gc.disable)()
+        watch.on_start(None)
+        watch.on_start(None)
+        watch.on_end(None)
+        assert not gc.isenabled()
+        watch.on_end(None)
+        assert gc.isenabled() == collects
+    finally:
+        (gc.enable if was else gc.disable)()
