@@ -277,7 +277,12 @@ class _Checks:
         """Return the findings so far, and choose the motion convention from patches of light, or of surfaces."""
         variance_scale, variance_findings = self._scale_variance()
         factors, grade_findings = self._grade_estimate()
-        findings = [*self._findings(), *variance_findings, *grade_findings]
+        findings = [*variance_findings, *grade_findings]
+        for role, messages in self.wrong.items():
+            if all(messages):
+                findings.append(self._leave_out(role, str(messages[0])))
+            elif role in self.edges and (other := _other_frame(self.edges[role])):
+                findings.append(self._leave_out(role, f"belongs to {other}"))
         layers, choice = self.layers, None
         if layers.motion_convention is not None and light:
             sound = [role for role in ("albedo", "normal") if role not in {finding.role for finding in findings}]
@@ -295,14 +300,6 @@ class _Checks:
         passes, words = classify_passes(self.passes)
         lines = (Finding("aov", f"aov {name}: {said}", warning=False, left_out=False) for name, said in words.items())
         return replace(report, findings=(*report.findings, *lines), passes=passes)
-
-    def _findings(self) -> Iterator[Finding]:
-        """Layers that fail their check in every frame, or belong to another frame."""
-        for role, messages in self.wrong.items():
-            if all(messages):
-                yield self._leave_out(role, str(messages[0]))
-            elif role in self.edges and (other := _other_frame(self.edges[role])):
-                yield self._leave_out(role, f"belongs to {other}")
 
     def _scale_variance(self) -> tuple[float | None, list[Finding]]:
         """Estimate the variance scale if the profile does not state it."""

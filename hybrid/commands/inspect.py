@@ -10,9 +10,9 @@ from rich.console import Console
 from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress, print_table, printable
 from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, split_stages, views_of
-from hybrid.files.layers import Layers, describe_layers
+from hybrid.files.layers import describe_layers
 from hybrid.job import validate_views
-from hybrid.plan import STAGES, Decision, Plan, Rules
+from hybrid.plan import STAGES, Decision, Rules
 from hybrid.stream import plan_shot
 
 
@@ -57,7 +57,14 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
         findings += log_cuts(plans[-1], findings, strict=read.strict)
     layers = [view.layers(view.numbers[0]) for view in views]
     if as_json:
-        first, *others = (_as_json(found, plan) for found, plan in zip(layers, plans, strict=True))
+        keys = "role", "layer", "note"
+        first, *others = (
+            {
+                "layers": [dict(zip(keys, row, strict=True)) for row in describe_layers(found)],
+                "plan": [asdict(decision) for decision in plan.decisions],
+            }
+            for found, plan in zip(layers, plans, strict=True)
+        )
         document = {
             "frames": shot.numbers,
             "width": width,
@@ -91,13 +98,6 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
             ("on" if x.on else "off", x.stage, _measured(x), f"{x.reason} ({STAGES[x.stage]})") for x in plan.decisions
         ]
         print_table(("", "stage", "measured", "why"), rows, f"Plan{name}")
-
-
-def _as_json(layers: Layers, plan: Plan) -> dict[str, object]:
-    return {
-        "layers": [dict(zip(("role", "layer", "note"), row, strict=True)) for row in describe_layers(layers)],
-        "plan": [asdict(decision) for decision in plan.decisions],
-    }
 
 
 def _measured(decision: Decision) -> str:

@@ -66,10 +66,17 @@ def start_log(
     form: LogFormat = "text", file: Path | None = None, *, quiet: bool = False, verbose: bool = False
 ) -> None:
     """Send records to standard error, and to a file; raise ValueError if the file is no text."""
-    handlers = [_on_stderr(form)]
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    on_terminal = form == "text" and console.is_terminal and not console.is_dumb_terminal
+    handlers: list[logging.Handler] = [_Terminal(console) if on_terminal else _Lines(sys.stderr, form)]
     handlers[0].setLevel(logging.WARNING if quiet else logging.NOTSET)
     if file is not None:
-        handlers.append(_into(file, form))
+        if file.exists() and (not file.is_file() or b"\0" in file.open("rb").read(4096)):
+            raise ValueError(f"log-file {str(file)!r} is there and no text, expected a log or a new name")
+        form = "json" if form == "json" else "text"
+        handlers.append(_Lines(file.open("a", encoding="utf-8"), form, owns_stream=True))
     end_log()  # not before: errors of the file go to the old handlers
     LOG.setLevel(logging.DEBUG if verbose else logging.INFO)
     for handler in handlers:
@@ -117,21 +124,6 @@ def one_line(error: BaseException) -> str:
 def printable(words: str) -> str:
     """Escape control characters: a name from a file may hold sequences that control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
-
-
-def _on_stderr(form: LogFormat) -> logging.Handler:
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if form == "text" and console.is_terminal and not console.is_dumb_terminal:
-        return _Terminal(console)
-    return _Lines(sys.stderr, form)
-
-
-def _into(file: Path, form: LogFormat) -> logging.Handler:
-    if file.exists() and (not file.is_file() or b"\0" in file.open("rb").read(4096)):
-        raise ValueError(f"log-file {str(file)!r} is there and no text, expected a log or a new name")
-    return _Lines(file.open("a", encoding="utf-8"), form if form == "json" else "text", owns_stream=True)
 
 
 class _Lines(logging.StreamHandler[Any]):

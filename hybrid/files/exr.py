@@ -480,7 +480,8 @@ def write_exr(
     parts = []
     recompressed = source.recompressed(replaced)
     for index, part in enumerate(source.parts):
-        header = _writable(part.header)
+        # The binding makes the channel list, and cannot know the type of empty lists.
+        header = {k: v for k, v in part.header.items() if k != "channels" and not (isinstance(v, list) and not v)}
         if index in recompressed:
             header["compression"] = OpenEXR.ZIP_COMPRESSION
         for key, value in (attributes or {}).items() if index == 0 else ():
@@ -506,11 +507,6 @@ _SHARED = (
     "timeCode",
     "view",
 )
-
-
-def _writable(header: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes without the channel list, which the binding makes, and empty lists, whose type it cannot know."""
-    return {k: v for k, v in header.items() if k != "channels" and not (isinstance(v, list) and not v)}
 
 
 def _is_vector(name: str) -> bool:

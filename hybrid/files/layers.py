@@ -131,7 +131,8 @@ def find_layers(
     for role in ROLES[1:]:
         if role not in found:
             found[role] = _find_guide(image, role, color, profile)
-    found["alpha"] = found["alpha"] or _alpha_of(image, color)
+    whole = [x for x in image.layers if x.part == color.part and {*color.channels} <= {*x.channels}]
+    found["alpha"] = found["alpha"] or (_fit(image, "alpha", whole[0], named=False) if whole else None)
     found["target"] = color
     if "estimate" not in overrides and "noisyimage" in _tails(image, color):
         found["estimate"] = _find_denoised(image, color)
@@ -190,12 +191,6 @@ def _find_any_color(image: ExrImage, profile: Profile, notes: list[str]) -> Laye
     if color is None:
         raise ExrError(f"{image.path}: no color layer (--layer color=NAME); {image.listing()}")
     return color
-
-
-def _alpha_of(image: ExrImage, color: Layer) -> Layer | None:
-    """The A of the layer that the color is of."""
-    whole = [x for x in image.layers if x.part == color.part and set(color.channels) <= set(x.channels)]
-    return _fit(image, "alpha", whole[0], named=False) if whole else None
 
 
 def _find_denoised(image: ExrImage, color: Layer) -> Layer | None:

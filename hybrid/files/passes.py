@@ -1,6 +1,6 @@
 """How AOVs relate to the beauty: parts that add up to it, light of their own, or no light."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -40,9 +40,7 @@ class Passes:
         `color` (H, W, 3) is the noisy beauty, finite; `lights` are AOVs times their pass colors; `exposure` is the
         radiance of middle brightness.
         """
-        return replace(self, sums=tuple(self._holding(color, lights, exposure)))
-
-    def _holding(self, color: Array, lights: Mapping[str, Array], exposure: float) -> Iterator[Sum]:
+        sums = []
         for found in self.sums:
             if not {*found.parts, found.whole} <= {*lights, BEAUTY}:
                 continue
@@ -52,8 +50,8 @@ class Passes:
                 holds = sums_to(parts, whole, exposure)
             else:
                 holds = all(few_differ(share_outside(part, whole, exposure)) for part in parts)
-            if holds:
-                yield found
+            sums += [found] if holds else []
+        return replace(self, sums=tuple(sums))
 
 
 NO_PASSES = Passes()

@@ -254,10 +254,7 @@ NODES_OF_LOBE = {
     "volumes": {"VOLUME_SCATTER", "VOLUME_ABSORPTION", "PRINCIPLED_VOLUME", "VOLUME_COEFFICIENTS"},
 }
 LOBE_OF_INPUT = {
-    "Metallic": "glossy",
-    "Specular IOR Level": "glossy",
-    "Coat Weight": "glossy",
-    "Sheen Weight": "glossy",
+    **dict.fromkeys(("Metallic", "Specular IOR Level", "Coat Weight", "Sheen Weight"), "glossy"),
     "Transmission Weight": "transmissive",
     "Subsurface Weight": "subsurface",
     "Emission Strength": "emission",

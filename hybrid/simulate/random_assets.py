@@ -11,37 +11,24 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from hybrid.simulate.scene_assets import (
-    Point,
-    Rng,
-    add_mesh,
-    add_object,
-    add_strands,
-    grid_faces,
-    new_material,
-    new_world,
-    node,
-    plain,
-    sample_image_coarsely,
-    studio_light,
-)
+from hybrid.simulate import scene_assets as assets
 
 # Blender's other two environment images, courtyard and night, are reserved for the test shots.
 SKIES = ("city", "forest", "interior", "studio", "sunrise", "sunset")
 
 
-def weighted_choice(rng: Rng, weights: dict[str, float]) -> str:
+def weighted_choice(rng: assets.Rng, weights: dict[str, float]) -> str:
     """Draw a key with probability proportional to its value."""
     values = np.array(list(weights.values()))
     return str(rng.choice(list(weights), p=values / values.sum()))
 
 
-def log_uniform(rng: Rng, low: float, high: float) -> float:
+def log_uniform(rng: assets.Rng, low: float, high: float) -> float:
     """Draw from [low, high], uniformly in the logarithm."""
     return float(np.exp(rng.uniform(math.log(low), math.log(high))))
 
 
-def color(rng: Rng, brightness: float | None = None) -> tuple[float, float, float, float]:
+def color(rng: assets.Rng, brightness: float | None = None) -> tuple[float, float, float, float]:
     """Draw a linear, mostly muted RGBA color; its largest component is `brightness`, by default 0.04 to 0.85."""
     hue, saturation = rng.random(), rng.beta(1.2, 2.6)
     rgb = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
@@ -49,7 +36,7 @@ def color(rng: Rng, brightness: float | None = None) -> tuple[float, float, floa
     return (float(rgb[0]), float(rgb[1]), float(rgb[2]), 1.0)
 
 
-def painted_image(rng: Rng) -> Any:
+def painted_image(rng: assets.Rng) -> Any:
     """Draw an image texture of 512×512: spectral noise, stripes, plaid, patches or rows of marks like writing."""
     size = 512
     y, x = np.mgrid[:size, :size] / size
@@ -81,7 +68,7 @@ def painted_image(rng: Rng) -> Any:
     return _new_image("painted", pixels)
 
 
-def painted_sky(rng: Rng) -> Any:
+def painted_sky(rng: assets.Rng) -> Any:
     """Draw an environment image of 256×128: a gradient over a ground, and some bright windows or blobs."""
     height = 128
     y, x = np.mgrid[:height, : 2 * height] / height
@@ -106,26 +93,26 @@ def _new_image(name: str, pixels: np.ndarray, linear: bool = False) -> Any:
     return image
 
 
-def printed(rng: Rng) -> Any:
+def printed(rng: assets.Rng) -> Any:
     """Make a material of a painted image: labels, spines, pictures."""
-    made = plain("printed", (1, 1, 1), Roughness=0.6)
+    made = assets.plain("printed", (1, 1, 1), Roughness=0.6)
     tree = made.node_tree
-    image = node(tree, "TexImage", Vector=node(tree, "TexCoord").outputs["Generated"])
+    image = assets.node(tree, "TexImage", Vector=assets.node(tree, "TexCoord").outputs["Generated"])
     image.image, image.projection = painted_image(rng), "BOX"
     tree.links.new(image.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
     return made
 
 
-def texture(rng: Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, Any]:
+def texture(rng: assets.Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, Any]:
     """Add a texture of `scale` features per unit of the coordinates; return its color and its scalar socket."""
     kind = weighted_choice(
         rng, {"Noise": 4, "Voronoi": 2, "Wave": 1.5, "Checker": 1, "Brick": 1.5, "Magic": 0.5, "Image": 3}
     )
-    made = node(tree, f"Tex{kind}")
+    made = assets.node(tree, f"Tex{kind}")
     if kind == "Image":
         made.image, made.projection = painted_image(rng), "BOX"
         turn = (0, 0, rng.uniform(0, 0.3))
-        mapping = node(tree, "Mapping", Scale=(min(scale / 4, 4),) * 3, Rotation=turn, Vector=coordinates)
+        mapping = assets.node(tree, "Mapping", Scale=(min(scale / 4, 4),) * 3, Rotation=turn, Vector=coordinates)
         tree.links.new(mapping.outputs["Vector"], made.inputs["Vector"])
         return made.outputs["Color"], made.outputs["Color"]
     tree.links.new(coordinates, made.inputs["Vector"])
@@ -146,7 +133,7 @@ def texture(rng: Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, A
     if kind in ("Checker", "Brick"):
         return made.outputs["Color"], made.outputs[1]
     scalar = made.outputs["Fac"] if "Fac" in made.outputs else made.outputs["Distance"]
-    ramp = node(tree, "ValToRGB")
+    ramp = assets.node(tree, "ValToRGB")
     ramp.color_ramp.interpolation = str(rng.choice(["LINEAR", "CONSTANT", "EASE"]))
     first, last = sorted(rng.uniform(0.1, 0.9, 2))
     ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = float(first), float(last)
@@ -164,7 +151,7 @@ SURFACES = {
 }  # fmt: skip
 
 
-def _shader_inputs(rng: Rng, surface: str) -> dict[str, Any]:
+def _shader_inputs(rng: assets.Rng, surface: str) -> dict[str, Any]:
     """Draw the inputs of the Principled shader that make a kind of surface."""
     if surface == "diffuse":
         return {"Roughness": 1.0, "Specular IOR Level": 0.0}
@@ -188,21 +175,21 @@ def _shader_inputs(rng: Rng, surface: str) -> dict[str, Any]:
     return {}
 
 
-def material(rng: Rng, surface: str | None = None, in_world: bool = False) -> Any:
+def material(rng: assets.Rng, surface: str | None = None, in_world: bool = False) -> Any:
     """Draw a material; its kind too, unless given.
 
     With `in_world` its texture uses world coordinates, 1 to 60 features per metre: for static objects. Otherwise the
     texture follows the object, 2 to 60 features across it.
     """
     surface = surface or weighted_choice(rng, SURFACES)
-    made, tree = new_material(surface)
+    made, tree = assets.new_material(surface)
     inputs = tree.nodes["Principled BSDF"].inputs
     values = {"Base Color": color(rng), "Roughness": rng.uniform(0.25, 0.8)}
     for name, value in {**values, **_shader_inputs(rng, surface)}.items():
         inputs[name].default_value = value
     if surface in ("mirror", "glass", "emission") and rng.random() < 0.7:
         return made
-    where = node(tree, "NewGeometry" if in_world else "TexCoord")
+    where = assets.node(tree, "NewGeometry" if in_world else "TexCoord")
     coordinates = where.outputs["Position" if in_world else "Generated"]
     if rng.random() < 0.85:
         shade, scalar = texture(rng, tree, coordinates, log_uniform(rng, 1 if in_world else 2, 60))
@@ -210,22 +197,22 @@ def material(rng: Rng, surface: str | None = None, in_world: bool = False) -> An
             tree.links.new(shade, inputs["Base Color"])
         if surface in ("plastic", "metal", "coated") and rng.random() < 0.35:
             low = rng.uniform(0.02, 0.5)
-            spread = node(tree, "MapRange", To_Min=low, To_Max=low + 0.4, Value=scalar)
+            spread = assets.node(tree, "MapRange", To_Min=low, To_Max=low + 0.4, Value=scalar)
             tree.links.new(spread.outputs["Result"], inputs["Roughness"])
     if rng.random() < 0.35:
-        grain = node(tree, "TexNoise", Scale=log_uniform(rng, 5, 120), Vector=coordinates)
-        bump = node(tree, "Bump", Strength=rng.uniform(0.1, 0.8), Distance=0.01, Height=grain.outputs["Fac"])
+        grain = assets.node(tree, "TexNoise", Scale=log_uniform(rng, 5, 120), Vector=coordinates)
+        bump = assets.node(tree, "Bump", Strength=rng.uniform(0.1, 0.8), Distance=0.01, Height=grain.outputs["Fac"])
         tree.links.new(bump.outputs["Normal"], inputs["Normal"])
     return made
 
 
-def set_emission(surface: Any, rgba: Point, strength: float) -> None:
+def set_emission(surface: Any, rgba: assets.Point, strength: float) -> None:
     """Set the emission of a material with a Principled shader."""
     inputs = surface.node_tree.nodes["Principled BSDF"].inputs
     inputs["Emission Color"].default_value, inputs["Emission Strength"].default_value = rgba, strength
 
 
-def random_lathe(rng: Rng, surface: Any) -> Any:
+def random_lathe(rng: assets.Rng, surface: Any) -> Any:
     """Add a surface of revolution about one unit high: a vase, a bottle, a bowl, a pawn."""
     heights = np.linspace(-0.5, 0.5, 40)
     radius = 0.12 + 0.3 * rng.random() * np.abs(np.sin(heights * rng.uniform(1, 6) + rng.uniform(0, 6)))
@@ -237,10 +224,12 @@ def random_lathe(rng: Rng, surface: Any) -> Any:
     ring = np.stack([np.cos(angles) * wave, np.sin(angles) * wave], -1)
     vertices = [(r * x, r * y, z) for r, z in zip(radius, heights, strict=True) for x, y in ring]
     bottom, top = np.arange(turns)[::-1], (len(heights) - 1) * turns + np.arange(turns)
-    return add_mesh("turned", vertices, [*grid_faces(len(heights), turns, closed=True), bottom, top], surface, True)
+    return assets.add_mesh(
+        "turned", vertices, [*assets.grid_faces(len(heights), turns, closed=True), bottom, top], surface, True
+    )
 
 
-def hair_ball(rng: Rng, surface: Any) -> Any:
+def hair_ball(rng: assets.Rng, surface: Any) -> Any:
     """Add a ball of hair: strands on a sphere, bent by gravity."""
     strands, points = 3000, 5
     root = rng.standard_normal((strands, 3))
@@ -249,10 +238,10 @@ def hair_ball(rng: Rng, surface: Any) -> Any:
     length = rng.uniform(0.1, 0.3)
     path = root[:, None] * (1 + along * length / 0.32) + along * rng.normal(0, 0.03, (strands, 1, 3))
     path[..., 2] -= along[..., 0] ** 2 * rng.uniform(0, 0.15)
-    return add_strands(path, np.linspace(0.0025, 0.0006, points), surface)
+    return assets.add_strands(path, np.linspace(0.0025, 0.0006, points), surface)
 
 
-def random_wire(rng: Rng, surface: Any) -> Any:
+def random_wire(rng: assets.Rng, surface: Any) -> Any:
     """Add a round wire through random points."""
     data = bpy.data.curves.new("curve", "CURVE")
     data.dimensions, data.bevel_depth, data.bevel_resolution = "3D", rng.uniform(0.01, 0.08), 3
@@ -261,16 +250,16 @@ def random_wire(rng: Rng, surface: Any) -> Any:
     for point in spline.points:
         point.co = (*rng.uniform(-0.5, 0.5, 3), 1)
     spline.use_endpoint_u = True
-    return add_object("curve", data, surface)
+    return assets.add_object("curve", data, surface)
 
 
-def random_text(rng: Rng, surface: Any) -> Any:
+def random_text(rng: assets.Rng, surface: Any) -> Any:
     """Add one to four upright letters."""
     data = bpy.data.curves.new("text", "FONT")
     letters = rng.choice(list("ABCDEGHKMNPRSTXZabdefghkpq0123456789&"), int(rng.integers(1, 5)))
     data.body, data.align_x, data.align_y = "".join(letters), "CENTER", "CENTER"
     data.size, data.extrude, data.bevel_depth = 0.9 / len(letters) + 0.3, rng.uniform(0.02, 0.2), 0.01
-    item = add_object("text", data, surface)
+    item = assets.add_object("text", data, surface)
     item.rotation_euler.x = math.pi / 2
     return item
 
@@ -282,7 +271,7 @@ KINDS = {
 }  # fmt: skip
 
 
-def add_asset(rng: Rng, surface: Any, kind: str | None = None) -> Any:
+def add_asset(rng: assets.Rng, surface: Any, kind: str | None = None) -> Any:
     """Add an object of about unit size at the origin; its kind is drawn, unless given."""
     kind = kind or weighted_choice(rng, KINDS)
     if kind in BUILT:
@@ -319,13 +308,13 @@ def add_asset(rng: Rng, surface: Any, kind: str | None = None) -> Any:
     return item
 
 
-def add_bulb_sphere(radius: float, position: Point, surface: Any) -> None:
+def add_bulb_sphere(radius: float, position: assets.Point, surface: Any) -> None:
     """Add a small sphere of an emissive material."""
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, radius=radius, location=position)
     bpy.context.active_object.data.materials.append(surface)
 
 
-def scatter(rng: Rng, count: int, draw_place: Callable[[], tuple[Point, float]], kinds: int = 3) -> None:
+def scatter(rng: assets.Rng, count: int, draw_place: Callable[[], tuple[assets.Point, float]], kinds: int = 3) -> None:
     """Add `count` instances of `kinds` random objects; `draw_place` returns a position and a size."""
     originals = [add_asset(rng, material(rng)) for _ in range(kinds)]
     for number in range(count):
@@ -338,7 +327,9 @@ def scatter(rng: Rng, count: int, draw_place: Callable[[], tuple[Point, float]],
         item.rotation_euler = (item.rotation_euler.x, item.rotation_euler.y, rng.uniform(0, 2 * math.pi))
 
 
-def clutter(rng: Rng, center: Point, half: tuple[float, float], count: int, sizes: tuple[float, float]) -> None:
+def clutter(
+    rng: assets.Rng, center: assets.Point, half: tuple[float, float], count: int, sizes: tuple[float, float]
+) -> None:
     """Stand up to `count` random objects on a plane of ±`half` around `center`, the largest first, without overlap."""
     placed: list[tuple[float, float, float]] = []
     surfaces = [material(rng) for _ in range(max(count // 2, 4))]
@@ -360,35 +351,35 @@ def clutter(rng: Rng, center: Point, half: tuple[float, float], count: int, size
         item["mobile"] = True
 
 
-def warm(rng: Rng) -> tuple[float, float, float]:
+def warm(rng: assets.Rng) -> tuple[float, float, float]:
     """Draw the tint of a lamp, from candle to overcast sky."""
     t = rng.uniform(-1, 1)
     return (1.0, 1 + 0.35 * t, 1 + 0.7 * t) if t < 0 else (1 - 0.4 * t, 1 - 0.15 * t, 1.0)
 
 
-def set_world(rng: Rng, kind: str, strength: float) -> None:
+def set_world(rng: assets.Rng, kind: str, strength: float) -> None:
     """Give the scene a world of light: none, constant, image (Blender's or painted) or sky."""
-    world = new_world()
+    world = assets.new_world()
     if kind == "image":
-        sample_image_coarsely(world)
+        assets.sample_image_coarsely(world)
     tree = world.node_tree
     background = tree.nodes["Background"]
     background.inputs["Strength"].default_value = strength if kind != "none" else 0.0
     background.inputs["Color"].default_value = color(rng, 1.0)
     if kind in ("none", "constant"):
         return
-    coordinates = node(tree, "TexCoord")
-    mapping = node(tree, "Mapping", Rotation=(0, 0, rng.uniform(0, 2 * math.pi)))
+    coordinates = assets.node(tree, "TexCoord")
+    mapping = assets.node(tree, "Mapping", Rotation=(0, 0, rng.uniform(0, 2 * math.pi)))
     if kind == "sky":
-        light = node(tree, "TexSky")
+        light = assets.node(tree, "TexSky")
         light.sky_type = str(rng.choice(["SINGLE_SCATTERING", "MULTIPLE_SCATTERING"]))
         light.sun_elevation = rng.uniform(0.06, 1.3)
         light.sun_rotation = rng.uniform(0, 2 * math.pi)
         light.sun_disc = bool(rng.random() < 0.75)
         light.sun_size = log_uniform(rng, 0.009, 0.08)
     else:
-        light = node(tree, "TexEnvironment")
-        light.image = studio_light(str(rng.choice(SKIES))) if rng.random() < 0.6 else painted_sky(rng)
+        light = assets.node(tree, "TexEnvironment")
+        light.image = assets.studio_light(str(rng.choice(SKIES))) if rng.random() < 0.6 else painted_sky(rng)
         tree.links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
         tree.links.new(mapping.outputs["Vector"], light.inputs["Vector"])
     tree.links.new(light.outputs["Color"], background.inputs["Color"])

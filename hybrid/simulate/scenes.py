@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from hybrid.simulate import scene_assets as assets
 from hybrid.simulate.effects import visible_points
 from hybrid.simulate.fixed_shots import FIXED_SHOTS
 from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera, set_crop
@@ -28,20 +29,6 @@ from hybrid.simulate.random_assets import (
     warm,
     weighted_choice,
 )
-from hybrid.simulate.scene_assets import (
-    Hair,
-    Point,
-    Rng,
-    add_box,
-    add_lamp,
-    add_mesh,
-    add_object,
-    fill_with_fog,
-    fill_with_smoke,
-    fur,
-    grid_faces,
-    hair_material,
-)
 from hybrid.simulate.shot import ShotSettings
 
 FOG_BOX = ((0, 0, 4), (28, 28, 9))  # center and size
@@ -54,61 +41,63 @@ class View(NamedTuple):
     eye: Vector
 
 
-def room_set(rng: Rng) -> View:
+def room_set(rng: assets.Rng) -> View:
     """Build a room with windows, furniture and objects on it; lit from outside, by lamps, or both."""
     w, d, h = rng.uniform(3, 7), rng.uniform(4, 8), rng.uniform(2.4, 3.6)
     walls, floor, ceiling = (material(rng, surface, True) for surface in ("diffuse", None, "diffuse"))
     if floor.name.startswith(("glass", "emission", "mirror")):
         floor = material(rng, "plastic", True)
     for z, surface in ((-0.05, floor), (h + 0.05, ceiling)):
-        add_box((0, 0, z), (w + 0.4, d + 0.4, 0.1), surface)
+        assets.add_box((0, 0, z), (w + 0.4, d + 0.4, 0.1), surface)
     for y in (d / 2 + 0.1, -d / 2 - 0.1):
-        add_box((0, y, h / 2), (w + 0.4, 0.2, h), walls)
+        assets.add_box((0, y, h / 2), (w + 0.4, 0.2, h), walls)
     daylight = rng.random() < 0.7
     for side in (-1, 1):
         x = side * (w / 2 + 0.1)
         if daylight and (side < 0 or rng.random() < 0.3):
             sill, top, width = rng.uniform(0.2, 1.0), rng.uniform(1.9, h - 0.2), rng.uniform(1.0, d - 1)
-            add_box((x, 0, sill / 2), (0.2, d, sill), walls)
-            add_box((x, 0, (h + top) / 2), (0.2, d, h - top), walls)
+            assets.add_box((x, 0, sill / 2), (0.2, d, sill), walls)
+            assets.add_box((x, 0, (h + top) / 2), (0.2, d, h - top), walls)
             for end in (-1, 1):
-                add_box((x, end * (d + width) / 4, (sill + top) / 2), (0.2, (d - width) / 2, top - sill), walls)
+                assets.add_box((x, end * (d + width) / 4, (sill + top) / 2), (0.2, (d - width) / 2, top - sill), walls)
             bars, frame = int(rng.integers(0, 14)), material(rng, "plastic")
             across = rng.random() < 0.5
             for k in range(bars):
                 t = (k + 0.5) / bars - 0.5
                 if across:
-                    add_box((x, 0, (sill + top) / 2 + t * (top - sill)), (0.08, width, 0.04), frame)
+                    assets.add_box((x, 0, (sill + top) / 2 + t * (top - sill)), (0.08, width, 0.04), frame)
                 else:
-                    add_box((x, t * width, (sill + top) / 2), (0.08, 0.05, top - sill), frame)
+                    assets.add_box((x, t * width, (sill + top) / 2), (0.08, 0.05, top - sill), frame)
         else:
-            add_box((x, 0, h / 2), (0.2, d, h), walls)
+            assets.add_box((x, 0, h / 2), (0.2, d, h), walls)
     if daylight:
         set_world(rng, weighted_choice(rng, {"sky": 2, "image": 2, "constant": 1}), 1.0)
         if rng.random() < 0.4:
             aim = Vector((rng.uniform(0.4, 1), rng.uniform(-0.5, 0.5), -rng.uniform(0.3, 0.9)))
-            add_lamp("SUN", -10 * aim, log_uniform(rng, 2, 12), log_uniform(rng, 0.005, 0.05), (0, 0, 0), warm(rng))
+            assets.add_lamp(
+                "SUN", -10 * aim, log_uniform(rng, 2, 12), log_uniform(rng, 0.005, 0.05), (0, 0, 0), warm(rng)
+            )
     else:
         set_world(rng, "none", 0)
     for _ in range(int(rng.integers(0 if daylight else 1, 5))):
         lamp = weighted_choice(rng, {"AREA": 2, "POINT": 2, "SPOT": 1})
         position = (rng.uniform(-0.4, 0.4) * w, rng.uniform(-0.4, 0.4) * d, h - rng.uniform(0.05, 0.8))
         size = rng.uniform(0.2, 1.2) if lamp == "AREA" else log_uniform(rng, 0.01, 0.15)
-        add_lamp(lamp, position, log_uniform(rng, 10, 80), size, (position[0], position[1], 0), warm(rng))
+        assets.add_lamp(lamp, position, log_uniform(rng, 10, 80), size, (position[0], position[1], 0), warm(rng))
     wood = material(rng, "plastic")
     x, y, height = rng.uniform(-0.15, 0.15) * w, rng.uniform(0, 0.25) * d, rng.uniform(0.4, 0.9)
     tw, td = rng.uniform(1.0, 2.2), rng.uniform(0.7, 1.3)
-    add_box((x, y, height - 0.03), (tw, td, 0.06), wood)
+    assets.add_box((x, y, height - 0.03), (tw, td, 0.06), wood)
     for sx in (-1, 1):
         for sy in (-1, 1):
-            add_box((x + sx * (tw / 2 - 0.05), y + sy * (td / 2 - 0.05), height / 2), (0.06, 0.06, height), wood)
+            assets.add_box((x + sx * (tw / 2 - 0.05), y + sy * (td / 2 - 0.05), height / 2), (0.06, 0.06, height), wood)
     clutter(rng, (x, y, height), (tw / 2 - 0.1, td / 2 - 0.1), int(rng.integers(8, 22)), (0.07, 0.4))
     clutter(rng, (0, 0, 0), (w / 2 - 0.4, d / 2 - 0.4), int(rng.integers(4, 14)), (0.2, 0.9))
     shelf = material(rng, "plastic")
     for k in range(int(rng.integers(0, 4))):
         z = 0.8 + 0.5 * k
         if z < h - 0.4:
-            add_box((x, d / 2 - 0.15, z), (rng.uniform(1, 3), 0.3, 0.03), shelf)
+            assets.add_box((x, d / 2 - 0.15, z), (rng.uniform(1, 3), 0.3, 0.03), shelf)
             clutter(rng, (x, d / 2 - 0.17, z + 0.015), (0.8, 0.05), int(rng.integers(4, 12)), (0.1, 0.35))
     for _ in range(int(rng.integers(1, 5))):
         hang_picture(rng, (rng.uniform(-0.4, 0.4) * w, d / 2 - 0.02, rng.uniform(0.4, 0.8) * h))
@@ -116,27 +105,27 @@ def room_set(rng: Rng) -> View:
     return View(Vector((x + rng.uniform(-0.3, 0.3) * tw, y, height + rng.uniform(-0.1, 0.4))), eye)
 
 
-def hang_picture(rng: Rng, position: Point) -> None:
+def hang_picture(rng: assets.Rng, position: assets.Point) -> None:
     """Hang a framed picture, or now and then a mirror, around `position` on a wall that faces −y."""
     w, h = rng.uniform(0.3, 1.0), rng.uniform(0.3, 0.8)
     inside = material(rng, "mirror" if rng.random() < 0.2 else None)
-    add_box(position, (w, 0.02, h), inside, "picture")
+    assets.add_box(position, (w, 0.02, h), inside, "picture")
     edge = material(rng)
     for sign in (-1, 1):
-        add_box((position[0] + sign * w / 2, position[1], position[2]), (0.04, 0.05, h + 0.04), edge)
-        add_box((position[0], position[1], position[2] + sign * h / 2), (w + 0.04, 0.05, 0.04), edge)
+        assets.add_box((position[0] + sign * w / 2, position[1], position[2]), (0.04, 0.05, h + 0.04), edge)
+        assets.add_box((position[0], position[1], position[2] + sign * h / 2), (w + 0.04, 0.05, 0.04), edge)
 
 
-def studio_set(rng: Rng) -> View:
+def studio_set(rng: assets.Rng) -> View:
     """Build a backdrop with a group of objects on plinths, lit by area lamps, one perhaps behind slats."""
     radius = log_uniform(rng, 0.5, 2.0)
     floor = material(rng, weighted_choice(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True)
-    add_box((0, 0, -0.05), (30, 30, 0.1), floor)
+    assets.add_box((0, 0, -0.05), (30, 30, 0.1), floor)
     if rng.random() < 0.7:
-        add_box((0, radius * 2.5, 5), (30, 0.1, 10), material(rng, "diffuse", True))
+        assets.add_box((0, radius * 2.5, 5), (30, 0.1, 10), material(rng, "diffuse", True))
     for _ in range(int(rng.integers(0, 4))):
         x, y, height, side = *rng.uniform(-0.8, 0.8, 2) * radius, rng.uniform(0.1, 0.7) * radius, radius * 0.5
-        add_box((x, y, height / 2), (side, side, height), material(rng))
+        assets.add_box((x, y, height / 2), (side, side, height), material(rng))
         clutter(rng, (x, y, height), (side / 3, side / 3), 4, (0.12 * radius, 0.4 * radius))
     clutter(rng, (0, 0, 0), (radius, radius), int(rng.integers(14, 36)), (0.08 * radius, 0.6 * radius))
     set_world(rng, weighted_choice(rng, {"none": 2, "constant": 1, "image": 3}), log_uniform(rng, 0.05, 1))
@@ -145,11 +134,13 @@ def studio_set(rng: Rng) -> View:
         position = Vector((distance * math.cos(angle), distance * math.sin(angle), radius * rng.uniform(0.8, 3)))
         kind = weighted_choice(rng, {"AREA": 3, "SPOT": 1, "POINT": 1})
         size = radius * (rng.uniform(0.2, 1.5) if kind == "AREA" else log_uniform(rng, 0.01, 0.1))
-        add_lamp(kind, position, 60 * distance**2 * log_uniform(rng, 0.3, 3), size, (0, 0, 0.2 * radius), warm(rng))
+        assets.add_lamp(
+            kind, position, 60 * distance**2 * log_uniform(rng, 0.3, 3), size, (0, 0, 0.2 * radius), warm(rng)
+        )
         if k == 0 and rng.random() < 0.3:
             slats, toward = material(rng, "diffuse"), Vector((0, 0, 0.2 * radius)) - position
             for t in np.linspace(-1, 1, 11):
-                slat = add_box((0, 0, 0), (radius * 2, 0.02, radius * 0.09), slats)
+                slat = assets.add_box((0, 0, 0), (radius * 2, 0.02, radius * 0.09), slats)
                 slat.rotation_euler = toward.to_track_quat("Y", "Z").to_euler()
                 slat.location = position + 0.35 * toward + Vector((0, 0, float(t) * radius))
     angle, distance = rng.uniform(-0.8, 0.8), radius * rng.uniform(1.6, 3)
@@ -157,7 +148,7 @@ def studio_set(rng: Rng) -> View:
     return View(Vector((*rng.uniform(-0.4, 0.4, 2) * radius, radius * rng.uniform(0.1, 0.4))), eye)
 
 
-def outdoor_set(rng: Rng) -> View:
+def outdoor_set(rng: assets.Rng) -> View:
     """Build rough ground under a sky, with scattered instances, walls and objects."""
     side, n = 24.0, 160
     y, x = np.mgrid[:n, :n] / (n - 1) - 0.5
@@ -169,9 +160,9 @@ def outdoor_set(rng: Rng) -> View:
     height *= rng.uniform(0.1, 1.0) * np.clip(np.hypot(x, y) * 4, 0.1, 1)
     vertices = np.stack([x * side, y * side, height], -1).reshape(-1, 3)
     ground = material(rng, weighted_choice(rng, {"diffuse": 4, "plastic": 1}), True)
-    add_mesh("ground", vertices, grid_faces(n, n), ground, smooth=True)
+    assets.add_mesh("ground", vertices, assets.grid_faces(n, n), ground, smooth=True)
 
-    def on_ground(spread: float, sizes: tuple[float, float]) -> tuple[Point, float]:
+    def on_ground(spread: float, sizes: tuple[float, float]) -> tuple[assets.Point, float]:
         px, py = rng.normal(0, spread, 2).clip(-0.48 * side, 0.48 * side)
         size = log_uniform(rng, *sizes)
         i, j = int((py / side + 0.5) * (n - 1)), int((px / side + 0.5) * (n - 1))
@@ -183,25 +174,25 @@ def outdoor_set(rng: Rng) -> View:
     for _ in range(int(rng.integers(1, 6))):
         size = tuple(map(float, rng.uniform(1, 5, 3)))
         position = (rng.uniform(-8, 8), rng.uniform(3, 11), size[2] / 2 - 0.2)
-        add_box(position, size, material(rng, weighted_choice(rng, {"diffuse": 3, "plastic": 1}), True))
+        assets.add_box(position, size, material(rng, weighted_choice(rng, {"diffuse": 3, "plastic": 1}), True))
     set_world(rng, weighted_choice(rng, {"sky": 3, "image": 2}), 1.0)
     if rng.random() < 0.3:
-        add_lamp("SUN", (0, 0, 9), log_uniform(rng, 1, 6), 0.01, (*rng.normal(0, 5, 2), 0.0), warm(rng))
+        assets.add_lamp("SUN", (0, 0, 9), log_uniform(rng, 1, 6), 0.01, (*rng.normal(0, 5, 2), 0.0), warm(rng))
     angle, distance = rng.uniform(-0.7, 0.7), rng.uniform(2.5, 6)
     eye = Vector((distance * math.sin(angle), -distance * math.cos(angle), rng.uniform(0.7, 2.2)))
     return View(Vector((*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.1, 0.6))), eye)
 
 
-def night_set(rng: Rng) -> View:
+def night_set(rng: assets.Rng) -> View:
     """Build columns and blocks on a glossy floor, lit by many small bright lights."""
     floor = material(rng, weighted_choice(rng, {"plastic": 2, "coated": 1, "metal": 1}), True)
-    add_box((0, 0, -0.05), (40, 40, 0.1), floor)
-    add_box((0, 8, 3), (30, 0.2, 8), material(rng, "diffuse", True))
+    assets.add_box((0, 0, -0.05), (40, 40, 0.1), floor)
+    assets.add_box((0, 8, 3), (30, 0.2, 8), material(rng, "diffuse", True))
     stone = [material(rng, weighted_choice(rng, {"diffuse": 2, "plastic": 2, "metal": 1}), True) for _ in range(3)]
     for _ in range(int(rng.integers(8, 24))):
         x, y = rng.uniform(-6, 6), rng.uniform(0.5, 7.5)
         size = (*rng.uniform(0.2, 1.0, 2), rng.uniform(0.3, 4))
-        add_box((x, y, size[2] / 2), size, stone[int(rng.integers(3))])
+        assets.add_box((x, y, size[2] / 2), size, stone[int(rng.integers(3))])
     clutter(rng, (0, 0, 0), (2.5, 1.8), int(rng.integers(14, 32)), (0.12, 0.9))
     hues = [color(rng, 1.0) for _ in range(4)]
     bulbs = int(log_uniform(rng, 8, 70))
@@ -211,7 +202,7 @@ def night_set(rng: Rng) -> View:
     for number in range(bulbs):
         position = (rng.uniform(-5, 5), rng.uniform(-3, 7), rng.uniform(0.2, 3.5))
         if number % 2:
-            add_lamp("POINT", position, log_uniform(rng, 2, 40), 0.03, (0, 0, 0), hues[number % 4][:3])
+            assets.add_lamp("POINT", position, log_uniform(rng, 2, 40), 0.03, (0, 0, 0), hues[number % 4][:3])
         else:
             add_bulb_sphere(rng.uniform(0.015, 0.06), position, glow[number % 4])
     set_world(rng, "constant", 0.02)
@@ -219,14 +210,14 @@ def night_set(rng: Rng) -> View:
     return View(Vector((rng.uniform(-1, 1), rng.uniform(-0.5, 1), rng.uniform(0.1, 0.8))), eye)
 
 
-def wall_set(rng: Rng) -> View:
+def wall_set(rng: assets.Rng) -> View:
     """Build a wall with relief, pictures, writing and pipes, lit from the side."""
-    add_box((0, 0.1, 2), (14, 0.2, 6), material(rng, None if rng.random() < 0.3 else "diffuse", True))
-    add_box((0, -3, -0.05), (14, 8, 0.1), material(rng, "plastic", True))
+    assets.add_box((0, 0.1, 2), (14, 0.2, 6), material(rng, None if rng.random() < 0.3 else "diffuse", True))
+    assets.add_box((0, -3, -0.05), (14, 8, 0.1), material(rng, "plastic", True))
     for _ in range(int(rng.integers(3, 9))):
         hang_picture(rng, (rng.uniform(-3, 3), -0.02, rng.uniform(0.5, 2.6)))
 
-    def on_wall() -> tuple[Point, float]:
+    def on_wall() -> tuple[assets.Point, float]:
         return (rng.uniform(-3.5, 3.5), -rng.uniform(0, 0.15), rng.uniform(0.2, 3.2)), log_uniform(rng, 0.06, 0.5)
 
     scatter(rng, int(rng.integers(30, 120)), on_wall, 6)
@@ -235,13 +226,13 @@ def wall_set(rng: Rng) -> View:
     for _ in range(int(rng.integers(1, 4))):
         position = (rng.choice([-1, 1]) * rng.uniform(1, 5), -rng.uniform(0.5, 3), rng.uniform(1, 4))
         kind = weighted_choice(rng, {"AREA": 2, "SPOT": 1, "POINT": 1})
-        add_lamp(kind, position, log_uniform(rng, 100, 900), rng.uniform(0.05, 0.8), (0, 0, 1.2), warm(rng))
+        assets.add_lamp(kind, position, log_uniform(rng, 100, 900), rng.uniform(0.05, 0.8), (0, 0, 1.2), warm(rng))
     x = rng.uniform(-2, 2)
     eye = Vector((x + rng.uniform(-1.5, 1.5), -rng.uniform(1.8, 4), rng.uniform(0.8, 2)))
     return View(Vector((x, -0.1, rng.uniform(0.5, 2))), eye)
 
 
-SETS: dict[str, tuple[float, Callable[[Rng], View]]] = {
+SETS: dict[str, tuple[float, Callable[[assets.Rng], View]]] = {
     "room": (0.32, room_set),
     "studio": (0.26, studio_set),
     "outdoor": (0.18, outdoor_set),
@@ -298,7 +289,7 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
             open_aperture(camera, distances, log_uniform(hard_rng, 4, 25) / film[0])
     if rng.random() < 0.04:
         density = log_uniform(rng, 0.1, 0.6) / (view.focus - view.eye).length  # the optical depth up to the focus
-        fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
+        assets.fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
     motion = {"motion": "keep"} if shot.motion == "keep" else add_motion(rng, shot, own_objects=True)
     return {
         "set": kind,
@@ -319,7 +310,7 @@ def open_aperture(camera: Any, distances: list[float], blur: float) -> None:
     data.dof.aperture_fstop = max(data.lens / 1000 / diameter, 0.1)
 
 
-def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
+def make_hard(rng: assets.Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
     """Add one of `HARD`, but the aperture of `lens`, to a scene with a camera; return added objects' motion."""
     if name == "dim":
         light_by_bulbs(rng)
@@ -339,19 +330,19 @@ def make_hard(rng: Rng, shot: ShotSettings, name: str) -> list[dict[str, Any]]:
     return motions
 
 
-def add_random_fur(rng: Rng, item: Any) -> None:
+def add_random_fur(rng: assets.Rng, item: Any) -> None:
     """Cover an object with hair of random color, length and curl."""
     if rng.random() < 0.7:
-        coat = hair_material(float(rng.uniform(0.05, 0.95)), float(rng.uniform(0, 1)), rng.uniform(0.15, 0.5))
+        coat = assets.hair_material(float(rng.uniform(0.05, 0.95)), float(rng.uniform(0, 1)), rng.uniform(0.15, 0.5))
     else:
         coat = material(rng, "diffuse")
     lean, length = [*rng.normal(0, 0.3, 2), rng.normal(-0.4, 0.3)], log_uniform(rng, 0.06, 0.35)
     strands, radius = int(log_uniform(rng, 3000, 16000)), log_uniform(rng, 0.0012, 0.005)
     wave, clumps, clump = rng.uniform(0, 0.6), int(log_uniform(rng, 40, 400)), rng.uniform(0, 0.8)
-    fur(rng, item, Hair(strands, length, radius, lean, wave, clumps, clump), coat)
+    assets.fur(rng, item, assets.Hair(strands, length, radius, lean, wave, clumps, clump), coat)
 
 
-def add_volume(rng: Rng, shot: ShotSettings) -> None:
+def add_volume(rng: assets.Rng, shot: ShotSettings) -> None:
     """Fill the scene with fog or smoke, and add a spot light's beam from the side that crosses the view."""
     scene = bpy.context.scene
     points = visible_points(scene)
@@ -360,18 +351,20 @@ def add_volume(rng: Rng, shot: ShotSettings) -> None:
     distance = (focus - eye).length
     density = log_uniform(rng, 0.15, 1.0) / distance  # the optical depth up to the focus
     if rng.random() < 0.5:
-        fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
+        assets.fill_with_fog(*FOG_BOX, density, rng.uniform(0, 0.7))
     else:
         scale = log_uniform(rng, 1, 5) / distance
-        fill_with_smoke(shot.keyed, *FOG_BOX, (0.2 * density, 2 * density), scale, rng.uniform(0, 0.7))
+        assets.fill_with_smoke(shot.keyed, *FOG_BOX, (0.2 * density, 2 * density), scale, rng.uniform(0, 0.7))
     aim = eye.lerp(focus, float(rng.uniform(0.5, 1)))
     side = Vector(scene.camera.matrix_world.to_3x3().col[0]) * float(rng.choice([-1, 1]) * rng.uniform(0.4, 1))
     source = aim + distance * (side + Vector((0, 0, rng.uniform(0.2, 0.9))))
-    beam = add_lamp("SPOT", source, 400 * distance**2 * log_uniform(rng, 0.3, 3), 0.02 * distance, aim, warm(rng))
+    beam = assets.add_lamp(
+        "SPOT", source, 400 * distance**2 * log_uniform(rng, 0.3, 3), 0.02 * distance, aim, warm(rng)
+    )
     beam.data.spot_size, beam.data.spot_blend = float(rng.uniform(0.12, 0.6)), float(rng.uniform(0, 0.4))
 
 
-def light_by_bulbs(rng: Rng) -> None:
+def light_by_bulbs(rng: assets.Rng) -> None:
     """Replace all lights of a scene by small bulbs, some of them visible."""
     scene = bpy.context.scene
     for item in [item for item in scene.objects if item.type == "LIGHT"]:
@@ -390,7 +383,7 @@ def light_by_bulbs(rng: Rng) -> None:
         where.z = max(where.z, 0.03)
         radius = distance * log_uniform(rng, 0.002, 0.01)
         if number % 2:
-            add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
+            assets.add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
         else:
             add_bulb_sphere(radius, where, shades[number // 2 % 3])
 
@@ -403,7 +396,7 @@ def fixed_shot(shot: ShotSettings) -> dict[str, Any]:
     scene.frame_start, scene.frame_end = shot.keyed[0], shot.keyed[-1]
     film, center = shot.film or shot.size, shot.center or (0.5, 0.5)
     scene.render.resolution_x, scene.render.resolution_y = film
-    scene.camera = add_object("camera", bpy.data.cameras.new("camera"))
+    scene.camera = assets.add_object("camera", bpy.data.cameras.new("camera"))
     # Not `shot.keyed`: Blender's frame_start is never below 0, and the shots are built around the middle of this range.
     frames = range(scene.frame_start, scene.frame_end + 1)
     FIXED_SHOTS[kind][name](np.random.default_rng(7), frames)  # the shot's seed is that of the samples alone

@@ -102,12 +102,8 @@ class ViewServer(ThreadingHTTPServer):
             except (OSError, ExrError):
                 continue
             break
-        return {
-            "frames": versions,
-            "layers": layers,
-            "layer": first,
-            "record": sequence.record() if sequence.finished else {},
-        }
+        record = sequence.record() if sequence.finished else {}
+        return {"frames": versions, "layers": layers, "layer": first, "record": record}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -154,12 +150,8 @@ class _Handler(BaseHTTPRequestHandler):
             return 200, "application/json", json.dumps(sequence.facts(int(number))).encode(), False
         if what == "values" and suffix == "json":
             x, y = (int(query[axis][0]) for axis in "xy")
-            return (
-                200,
-                "application/json",
-                json.dumps(sequence.values(int(number), query["layer"][0], x, y)).encode(),
-                False,
-            )
+            values = sequence.values(int(number), query["layer"][0], x, y)
+            return 200, "application/json", json.dumps(values).encode(), False
         if what != "frame" or suffix not in KINDS:
             raise KeyError(rest)
         ev = float(query["ev"][0])

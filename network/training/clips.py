@@ -317,12 +317,8 @@ class Clips:
         middle = slice(outer, outer + self.frames)
         try:
             with safe_open(shard.path, framework="pt") as file:
-                values = {
-                    name: file.get_slice(name)[number, level, middle]
-                    if FIELDS[name].window
-                    else file.get_slice(name)[number, level]
-                    for name in INPUTS
-                }
+                places = {name: (number, level, *([middle] if FIELDS[name].window else [])) for name in INPUTS}
+                values = {name: file.get_slice(name)[place] for name, place in places.items()}
                 stored_target = file.get_slice(target[1])[number, target[0]]
         except (SafetensorError, OSError) as error:
             raise ValueError(f"clips {os.fspath(shard.path)!r}: cut short ({error})") from error
