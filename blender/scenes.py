@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,55 +37,53 @@ def problems(scene: bpy.types.Scene) -> list[Problem]:
     return [*_of_frames(scene), *_of_passes(scene)]
 
 
-def _of_frames(scene: bpy.types.Scene) -> list[Problem]:
-    """Return the problems of the frames on disk, and of those that a render would replace."""
-    found = []
+def _of_frames(scene: bpy.types.Scene) -> Iterator[Problem]:
+    """Yield the problems of the frames on disk, and of those that a render would replace."""
     if reason := refused(scene):
-        found.append(Problem(f"{reason} (Render and Denoise renders all again)", False))
+        yield Problem(f"{reason} (Render and Denoise renders all again)", False)
     missing = set(frame_numbers(scene)) - rendered_files(scene).keys()
     if 0 < len(missing) < len(frame_numbers(scene)):
-        found.append(Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False))
+        yield Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False)
     if scene.render.use_multiview:
-        found.append(Problem(f"Stereo: both eyes are denoised, but {STEREO}", False))
+        yield Problem(f"Stereo: both eyes are denoised, but {STEREO}", False)
     if scene.render.use_sequencer and scene.sequence_editor is not None and _strips(scene):
         remedy = "switch Post Processing > Sequencer off for the movie"
-        found.append(Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False))
+        yield Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False)
     if not scene.ravg.lent and would_be_written_over(scene):  # `override` sets this path for ravg's own render
-        found.append(Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False))
+        yield Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False)
     if nodes := file_outputs(scene):
         text = f"{', '.join(nodes)}: the folder is that of ravg's frames, and nothing is written, name another"
-        found.append(Problem(text, False))
-    return found
+        yield Problem(text, False)
 
 
-def _of_passes(scene: bpy.types.Scene) -> list[Problem]:
-    """Return the problems of a render with the scene's current settings."""
-    render, found = scene.render, []
+def _of_passes(scene: bpy.types.Scene) -> Iterator[Problem]:
+    """Yield the problems of a render with the scene's current settings."""
+    render = scene.render
     if render.engine != "CYCLES":
-        return [Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)]
+        yield Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)
+        return
     layers = _layers(scene)
     if any(not layer.cycles.denoising_store_passes for layer in layers):
-        found.append(Problem("Denoising Data is off: textures blur, and noise that Blender removed is lost", True))
+        yield Problem("Denoising Data is off: textures blur, and noise that Blender removed is lost", True)
     vectors = [layer.use_pass_vector for layer in layers]
     if render.use_motion_blur and any(vectors):
-        found.append(Problem("Motion Blur leaves the Vector pass empty: nothing would seem to move", True))
+        yield Problem("Motion Blur leaves the Vector pass empty: nothing would seem to move", True)
     elif not render.use_motion_blur and not all(vectors):
-        found.append(Problem("Vector pass is off: motion has to be found in the pictures", True))
+        yield Problem("Vector pass is off: motion has to be found in the pictures", True)
     if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
-        found.append(Problem("Seed is constant: noise that stands still cannot be averaged away", True))
+        yield Problem("Seed is constant: noise that stands still cannot be averaged away", True)
     if _wrong_denoise(scene):
         text = "Render > Denoise is off: Fast is more accurate with Blender's own denoised frames"
         if scene.cycles.use_denoising:
             text = "Render > Denoise is on, but this Blender has no denoiser: the render would fail"
-        found.append(Problem(text, True))
+        yield Problem(text, True)
     if scene.ravg.light_passes and scene.ravg.preset == "average":
-        found.append(Problem(f"Light Passes: {NO_LIGHT_PASSES}", False))
+        yield Problem(f"Light Passes: {NO_LIGHT_PASSES}", False)
     elif scene.ravg.light_passes and not any(_light_passes(layer) for layer in layers):
-        found.append(Problem("Light Passes: no view layer renders any, choose them in View Layer > Passes", False))
+        yield Problem("Light Passes: no view layer renders any, choose them in View Layer > Passes", False)
     if render.use_motion_blur and not any(vectors):
         text = "Motion Blur is on: motion has to be found in the pictures, switch it off and blur afterwards"
-        found.append(Problem(text, False))
-    return found
+        yield Problem(text, False)
 
 
 def set_up(scene: bpy.types.Scene) -> list[str]:

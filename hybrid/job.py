@@ -67,10 +67,6 @@ class DenoiseOptions:
         Stages that are forced on, whatever was measured.
     no_stages : collection of str
         Stages that are forced off.
-    device : str
-        For ravg's networks and OIDN's: cpu, cuda, hip, sycl, metal, or auto, the first that is there.
-    strict : bool
-        Refuse layers that make no sense, and cuts, instead of working around them.
     reuse_freed_memory : bool
         Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
     threads : int or None

@@ -31,10 +31,8 @@ class KernelConfig:
     def __post_init__(self) -> None:
         if self.activation not in ("relu", "softmax"):
             raise ValueError(f"activation: expected relu or softmax, got {self.activation!r}")
-        for name in ("frames", "size"):
-            value = getattr(self, name)
-            if value < 1 or value % 2 == 0:
-                raise ValueError(f"{name}: expected an odd number >= 1, got {value}")
+        _check_odd("frames", self.frames)
+        _check_odd("size", self.size)
         check_threshold(self.threshold)
 
     @property
@@ -79,7 +77,7 @@ class RAResNetConfig:
             raise ValueError(f"ra_after: expected ascending blocks 1 to {self.blocks}, got {self.ra_after}")
         if not 0 <= self.skips <= len(self.ra_after):
             raise ValueError(f"skips: expected 0 to {len(self.ra_after)}, got {self.skips}")
-        _check_odd(self.conv_size)
+        _check_odd("conv_size", self.conv_size)
 
 
 @dataclass(frozen=True)
@@ -113,12 +111,12 @@ class TKPCNConfig:
             raise ValueError(
                 f"blocks, temporal_blocks: expected 0 or more, got {self.blocks} and {self.temporal_blocks}"
             )
-        _check_odd(self.conv_size)
+        _check_odd("conv_size", self.conv_size)
 
 
-def _check_odd(conv_size: int) -> None:
-    if conv_size < 1 or conv_size % 2 == 0:
-        raise ValueError(f"conv_size: expected an odd number >= 1, got {conv_size}")
+def _check_odd(name: str, value: int) -> None:
+    if value < 1 or value % 2 == 0:
+        raise ValueError(f"{name}: expected an odd number >= 1, got {value}")
 
 
 class KernelHead(nn.Module):
