@@ -17,11 +17,16 @@ from hybrid.runtime.threads import check_thread_counts, prepare_libraries
 
 
 class Entry(NamedTuple):
-    """A command: its function ``module:name``, its group in the help, and the first line of its help."""
+    """A command: its function ``module:name``, its group in the help of all commands, and its own help."""
 
     function: str
     panel: str
-    summary: str
+    help: str
+
+    @property
+    def summary(self) -> str:
+        """The first line of the help."""
+        return self.help.partition("\n")[0]
 
 
 COMMANDS = {name: Entry(**entry) for name, entry in TEXTS["commands"].items()}
@@ -78,7 +83,7 @@ class LazyCommand(TyperCommand):
         module, _, function = self._entry.function.partition(":")
         command = getattr(import_module(f"hybrid.commands.{module}"), function)
         single = typer.Typer(add_completion=False)
-        single.command(self.name, cls=Command)(command)
+        single.command(self.name, cls=Command, help=self._entry.help)(command)
         made: Any = typer.main.get_command(single)
         for parameter in made.params:
             if getattr(parameter, "is_flag", False):

@@ -117,18 +117,7 @@ def compare(
     name: str | None = None,
     **how: Any,
 ) -> None:
-    """Compare denoisers with a reference: accuracy, stability and time, as a table and a page.
-
-    Examples:
-
-    ravg compare "noisy.####.exr" --reference "clean.####.exr" -o report
-
-    ravg compare "noisy.####.exr" --reference "clean.####.exr" --methods "OIDN high" --external "mine=mine.####.exr"
-
-    ravg compare "s008.####.exr" --level "s032.####.exr" --level "s128.####.exr" --ladder --reference "clean.####.exr"
-
-    ravg compare --with-report one --with-report two -o both   (join finished reports)
-    """
+    """Run the methods, or join finished comparisons, and show the results."""
     report = _Report(**opt.take(_Report, how))
     report.check()
     if shot is None or not reference:

@@ -76,20 +76,7 @@ def denoise(
     chunk: int = 10,
     **settings: Any,
 ) -> None:
-    """Denoise the frames of a shot, and write each as an EXR file with all its other layers.
-
-    Examples:
-
-    ravg denoise "shot.####.exr" -o "out.####.exr"
-
-    ravg denoise "shot.####.exr" -o out --preset quality --frames 1001-1010 --preview look.mp4
-
-    ravg denoise "shot.####.exr" -o out --method classical --preset final   (without torch and OIDN)
-
-    ravg denoise "shot.####.exr" -o out --method classical --first-pass oidn-clean   (stabilize OIDN's frames)
-
-    ravg denoise "shot.####.exr" -o out --aov all --aov-sum beauty
-    """
+    """Denoise each view of a shot, here or on a cluster."""
     how = opt.take(opt.ReadOptions, settings)
     with opt.usage():
         options = DenoiseOptions(

@@ -25,14 +25,7 @@ def inspect(
     max_pixels: int | None = None,
     **how: Any,
 ) -> None:
-    """Check a shot before denoising: its layers, motion vectors, and the stages that it needs.
-
-    Examples:
-
-    ravg inspect "shot.####.exr"
-
-    ravg inspect "shot.####.exr" --json > shot.json
-    """
+    """Print layers, findings and plan of each view of a shot."""
     read = ShotInput(shot=shot, max_pixels=max_pixels, **how)
     with opt.usage():
         rules = Rules(frozenset(split_stages(stages)), frozenset(split_stages(no_stages)))

@@ -34,14 +34,7 @@ def simulate(
     scheduler: str | None = None,
     **fields: Any,
 ) -> None:
-    """Render shots with Cycles for training and comparison: several noise levels, and references.
-
-    Examples:
-
-    ravg simulate random -o shots --shots 36 --levels n,n,n/e,4
-
-    ravg simulate scene.blend -o shot --frames 1-7 --spp 32 --reference 512
-    """
+    """Render the shots, here or on a cluster."""
     from hybrid.files.sequences import parse_frames
 
     known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]

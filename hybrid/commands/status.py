@@ -14,15 +14,7 @@ from hybrid.records import Status, gather_status, is_running, sequence_name
 
 @opt.command("status")
 def status(output: str, frames: str | None = None, as_json: bool = False) -> None:
-    """Show which frames are finished, running, missing and failed.
-
-    Reads the records that runs write next to their frames. The exit code is 0 if all frames that were asked for are
-    finished, else 1.
-
-    Example:
-
-    ravg status out --frames 1001-1100
-    """
+    """Print the status of the runs; exit with 1 if frames are left."""
     folder, name = Path(output), None
     if not folder.is_dir():
         if folder.suffix != ".exr":

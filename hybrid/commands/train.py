@@ -78,19 +78,7 @@ def make_clips(
     scheduler: str | None = None,
     **how: Any,
 ) -> None:
-    """Make training clips of shots at several noise levels.
-
-    Clips are aligned windows with first passes and pseudo-references.
-
-    Levels must be independent renders. A shot at a single level can be trained on too: towards its pseudo-reference.
-    Shots that have clips already are skipped, so that the same command continues an interrupted run.
-
-    Examples:
-
-    ravg make-clips shots/* -o clips
-
-    ravg make-clips "mine.####.exr" -o clips   (your own footage)
-    """
+    """Write the clips of each shot, here or on a cluster."""
     if window not in (1, 3, 5, 7):
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
     if reference and target is not None:
@@ -178,16 +166,7 @@ def train(
     resume: bool = False,
     **settings: Any,
 ) -> None:
-    """Train a network on clips.
-
-    Examples:
-
-    ravg train clips -o mine.safetensors --init oidn --minutes 60
-
-    ravg train clips -o mine.safetensors --init fast --rate 1e-4   (fine-tune on your own footage)
-
-    torchrun -m hybrid.cli train clips -o mine.safetensors   (in several processes)
-    """
+    """Train a network, and log how it goes."""
     neural = import_neural()
     if init in (None, "oidn") and preset not in neural.TRAINING_PRESETS:
         known = ", ".join(neural.TRAINING_PRESETS)

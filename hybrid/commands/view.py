@@ -13,15 +13,7 @@ from hybrid.viewer.server import ViewServer
 
 @command("view")
 def view(output: str, beside: list[str] | None = None, fps: float = 24, port: int = 0, browser: bool = True) -> None:
-    """Play denoised frames beside noisy ones in a browser, also while they are being made.
-
-    OUT may still be empty: frames appear as they are finished. The page is served to this machine alone and loads
-    nothing from elsewhere. Ctrl-C ends the server.
-
-    Example:
-
-    ravg view out --beside "shot.####.exr"
-    """
+    """Serve the page until Ctrl-C."""
     sequences = [Sequence(output, finished=True), *(Sequence(spec, finished=False) for spec in beside or ())]
     if not any(sequence.files() for sequence in sequences):
         raise FileNotFoundError(f"no frames in {' or '.join(sequence.spec for sequence in sequences)}")

@@ -9,14 +9,6 @@ from network.paper import TKPCN_WEIGHTS
 from network.presets import PRESETS as TRAINING_PRESETS
 
 __all__ = [
-    "TKPCN_WEIGHTS",
-    "TRAINING_PRESETS",
-    "ClipSource",
-    "TrainInputs",
-    "bundled_preset",
-    "denoise_bundled",
-    "open_network",
-    "shipped_weights",
-    "train_network",
-    "write_clips",
-]
+    "TKPCN_WEIGHTS", "TRAINING_PRESETS", "ClipSource", "TrainInputs", "bundled_preset", "denoise_bundled",
+    "open_network", "shipped_weights", "train_network", "write_clips",
+]  # fmt: skip
