@@ -106,9 +106,8 @@ def refine_flow(
 def dense_flow(guides: GuidePair) -> np.ndarray:
     """Estimate the flow (H, W, 2), pixels, from the guides alone, for renderers without vectors.
 
-    Dense inverse search on 8 bits of the last guide, the least noisy, finds the displacement (Kroeger et al.: Fast
-    optical flow using dense inverse search. 2016. doi:10.1007/978-3-319-46493-0_29); TV-L1 on the flow itself refines
-    it.
+    Dense inverse search on 8 bits of the last guide, the least noisy (Kroeger et al. 2016.
+    doi:10.1007/978-3-319-46493-0_29), refined by TV-L1 on the flow itself.
     """
     guides = _blurred(guides)
     height, width = guides.centre.shape[:2]

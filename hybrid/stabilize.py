@@ -1,8 +1,7 @@
 """The result of a frame: its window denoised, averaged with the neighbouring results, and corrected by its samples.
 
-The errors of denoisers change from frame to frame more than the frames do, so results of neighbouring frames that show
-the same are averaged. Denoisers and averages lose light that few samples carry, and detail that looks like noise: the
-samples restore both last, as far as they are certain.
+The errors of denoisers change from frame to frame more than the frames do, so results that show the same are averaged.
+The samples restore light that few samples carry and detail that looks like noise, as far as they are certain.
 """
 
 from __future__ import annotations
@@ -135,11 +134,7 @@ class FrameDenoiser:
         self._results: dict[int, WindowResult] = {}
 
     def make(self, number: int) -> FrameResult:
-        """Denoise frame `number`.
-
-        Raises ValueError or OSError if the frame, or a neighbour, cannot be denoised, or its light is not that of the
-        noisy frame (`hybrid.validation.find_lost_light`).
-        """
+        """Denoise a frame; ValueError or OSError if it, or a neighbour, fails, or its light is not the samples'."""
         averaged = self.neighbours(number)
         # Of the frame before only what the average reads is left.
         self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}

@@ -1,7 +1,6 @@
 """The frames of a shot in memory, and everything that is made of each once, while windows slide over them.
 
-`FrameStream` is the only owner of what a window leaves to the next one. Each value is made when it is first read, and
-dropped when one of the frames it belongs to leaves the kept ones.
+`FrameStream` alone owns it: each value is made when first read, and dropped with one of the frames it belongs to.
 """
 
 from __future__ import annotations
@@ -53,11 +52,7 @@ class FirstPass:
 
 
 class FrameStream:
-    """The frames of a shot, read lazily, and what is made of each.
-
-    `radius` counts the frames on each side of the centre of a window; `refine` corrects vectors as
-    `flow.tvl1.refine_flow` does.
-    """
+    """The frames of a shot, read lazily, and what is made of each; `radius` of windows, `refine` as `refine_flow`."""
 
     def __init__(
         self,

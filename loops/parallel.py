@@ -1,8 +1,7 @@
-"""Run a compiled loop on all cores.
+"""Run a compiled loop on all cores: a plain loop, compiled once, which threads run on bands of rows.
 
 numba's own ``parallel=True`` makes loops no faster, and takes three to six times as long to compile: each ``prange``
-becomes a function of its own, which passes the whole compiler again. Here a plain loop is compiled once, and threads
-run it on bands of rows.
+becomes a function of its own, which passes the whole compiler again.
 """
 
 import os

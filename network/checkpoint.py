@@ -120,8 +120,7 @@ def save_model(path: str | os.PathLike[str], model: Model, notes: Mapping[str, A
 def new_partial(path: Path) -> Path:
     """Create an empty file beside `path`, to be written and renamed to it; removes one of an earlier process.
 
-    The file is created exclusively, so that nothing is written through a link at its place. Raises OSError if `path`
-    exists and is no file, or the folder cannot be written to.
+    Exclusively, so that nothing is written through a link. OSError if `path` is no file, or the folder not writable.
     """
     if path.exists() and not path.is_file():
         raise OSError(f"{path} is there and no file, expected a file or a new name")

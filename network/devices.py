@@ -11,10 +11,9 @@ DEVICES = ("auto", "cpu", "cuda", "hip", "sycl", "metal")
 
 
 def find_device(name: str) -> tuple[str, torch.device]:
-    """Find a device, one of `DEVICES`, and its name.
+    """Find a device, one of `DEVICES`, and its name; ValueError, with those available, if it is not.
 
-    "auto" is the first available of cuda, hip, sycl and cpu; Metal, on which this is untested, has to be named. Raises
-    ValueError, with the available devices, if the device is not among them.
+    "auto" is the first available of cuda, hip, sycl and cpu; Metal, on which this is untested, has to be named.
     """
     import torch  # here, so that `DEVICES` is available without torch
 

@@ -1,7 +1,6 @@
 """The robust average, and the Robust Average block with one weight per channel, which connects the frames of a window.
 
-Frames are stacked along the batch: ``(T·N, C, H, W)``, all samples of the first frame, then all of the second. Spatial
-layers see a larger batch and need not know about time; splitting into frames is a view.
+Frames are stacked along the batch, ``(T·N, C, H, W)``, all samples of the first frame first: splitting them is a view.
 """
 
 from __future__ import annotations

@@ -203,10 +203,9 @@ class RobustUNet(nn.Module):
         return max(self.config.ra_scales, default=-1)
 
     def encode_and_fuse(self, frames: Tensor, shared: Tensor) -> Tensor:
-        """Run the finest scale of the encoder and its RA block; a row depends on two rows on each side.
+        """Run the finest scale of the encoder and its RA block, at any even height; a row depends on two on each side.
 
-        Returns the input of the next scale, ``(T·N, width, H / 2, W / 2)``, or ``(N, width, H / 2, W / 2)`` where all
-        frames are fused. The height may be any even one.
+        Returns the input of the next scale, ``(T·N, width, H / 2, W / 2)``, or of one frame where all are fused.
         """
         count, last = self.frames, self._last_fused
         first, aux, layout = self.backbone.first, self.aux_conv.weight, torch.channels_last

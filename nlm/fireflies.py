@@ -122,8 +122,7 @@ def same_highlight(first: Highlights, moved: Points, second: Highlights) -> Mask
 def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: Floats) -> Mask:
     """Return around which highlights (K,) of a frame the other frame has no bright samples of its lights at `pixels`.
 
-    At most 3 of the 17×17 pixels there are above a quarter of the highlight's brightest pixel where the
-    frame has no pixel above an eighth within a pixel's distance.
+    At most 3 of 17×17 pixels are above a quarter of the brightest where the frame has none above an eighth beside.
     """
     count = np.zeros(len(pixels), np.intp)
     run_bands(_count_strangers, len(count), lights.pixels, color, pixels, other, STRANGER_WINDOW // 2, count)

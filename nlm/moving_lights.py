@@ -41,10 +41,10 @@ def find_bright(excess: Floats) -> Mask:
 
 
 def shared_motions(here: Mask, there: Mask) -> list[tuple[int, int]]:
-    """Find the motions, rows and columns, that many bright pixels of one frame share on the way to another.
+    """Find the motions, above one pixel, that many bright pixels of one frame share on the way to another.
 
     The cross-correlation of both masks counts the pixels of each motion. Independent bright pixels, N and M of A, give
-    N M / A with Poisson's deviation. Motions of at most one pixel are left out: noise of one seed has these too.
+    N M / A with Poisson's deviation.
     """
     rows, columns = (_busiest(here.sum(axis=1 - axis)) for axis in (0, 1))
     a, b = (mask[rows, columns].astype(np.float64) for mask in (here, there))

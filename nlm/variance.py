@@ -88,8 +88,7 @@ def ratio(a: Floats, b: Floats) -> Floats:
 def smooth_variance(variance: Floats) -> Floats:
     """Means over 5×5 pixels of a finite variance (H, W, C) of few degrees of freedom, with outliers cut.
 
-    A pixel is cut at 16 times the 5×5 median of the 3×3 means. These means keep the level of noise where most pixels
-    happen to be 0, and an isolated outlier touches fewer than half of them.
+    A pixel is cut at 16 times the 5×5 median of the 3×3 means, which an isolated outlier cannot move.
     """
     # Squares of more than 1e18 overflow, and an infinity would spoil the filters' running sums.
     variance = np.minimum(variance, np.float32(1e36))

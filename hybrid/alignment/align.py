@@ -1,8 +1,4 @@
-"""Align a window of frames to its centre, and denoised results of neighbouring frames to each other.
-
-`align` runs once for each frame, or once for each band of rows. The classical filters and the networks both read the
-`AlignedWindow` that it returns; nothing else warps the frames.
-"""
+"""Align a window of frames to its centre (`align`, for all filters and networks), and results of frames to each other."""
 
 from __future__ import annotations
 

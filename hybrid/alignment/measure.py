@@ -290,9 +290,8 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Share of the picture in areas whose mean light differs by more than noise, along `vectors`.
 
-    Areas are of 32×32 pixels, or the whole picture. Differences are relative to the light of both, or to a twentieth of
-    the exposure in the dark. They are not tone-mapped: the mean of tone-mapped noise depends on its variance, which
-    warping reduces.
+    Areas are of 32×32 pixels, or the whole picture; differences are relative to the light of both, or to a twentieth of
+    the exposure in the dark: the mean of tone-mapped noise would depend on its variance, which warping reduces.
     """
     shape = here.light.shape[:2]
     both, light, inside = [here.irradiance, there.irradiance], there.light, np.ones(shape, bool)

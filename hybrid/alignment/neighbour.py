@@ -81,10 +81,9 @@ def trust_light(
     *,
     agreeing: float = AGREEING,
 ) -> Array:
-    """Combine confidence and coverage of geometry with the gate, each (T, h, W): max(c g, min(coverage, agreeing) g).
+    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, min(coverage, agreeing) g); c without "gate".
 
-    Coverage is an upper bound of the confidence; `agreeing` is the confidence that geometry leaves at least where the
-    light agrees. Without the stage "gate" the confidence of geometry stands.
+    `agreeing` is the confidence that geometry leaves at least where the light agrees.
     """
     trust = np.empty_like(confidence)
     given = confidence, coverage, np.ascontiguousarray(gate), np.float32(agreeing), "gate" in stages

@@ -27,11 +27,7 @@ ALPHA = "alpha"
 
 
 class Brightness(NamedTuple):
-    """Exposure of a frame's irradiance (`measure_exposure`), and moments.
-
-    `moments` (2, G + 1) are mean and deviation over the frame of `PreparedFrame.guide`'s channels, and of the
-    tone-mapped irradiance.
-    """
+    """Exposure of a frame's irradiance, and mean and deviation (2, G + 1) of `PreparedFrame.guide` and the irradiance."""
 
     exposure: float
     moments: NDArray[np.float64]

@@ -1,8 +1,7 @@
 """Parts of a frame's color that are not filtered: removed before denoising, and restored in the finished picture.
 
-Outside a render region a frame is black, which filters would mix into its edges. A sun beyond the range of half would
-spread over the frame, the negative light of a color outside of the gamut would be clipped by every denoiser, and a gray
-picture would be tinted by networks that were trained on colors.
+Filters would mix the black outside a render region into its edges, and spread a sun beyond the range of half; every
+denoiser would clip the negative light of a color outside of the gamut, and tint a gray picture.
 """
 
 from __future__ import annotations
@@ -120,9 +119,8 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
 def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
     """Split a frame's color (H, W, 3) into radiance to denoise, not finite where it is lost, and unfiltered light.
 
-    A color outside of the gamut has negative channels and light in others: the negative part of a channel counts up to
-    the light of the brightest one. A pixel that is negative in all channels is the trace of a filter with negative
-    lobes next to a lamp, and stays.
+    Of a color outside of the gamut the negative part counts up to the light of the brightest channel. A pixel that is
+    negative in all channels is the trace of a filter with negative lobes next to a lamp, and stays.
     """
     layers = {"color": frame.color, **frame.aovs}
     negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}

@@ -119,10 +119,9 @@ class WarpSources:
 
 @dataclass(frozen=True)
 class AlignedWindow:
-    """A window of 2k + 1 frames, every one warped to the centre; or some rows of it.
+    """A window of 2k + 1 frames, every one warped to the centre; or some rows of it, for the same pixels.
 
-    Figures of the whole frame (`exposure`, `moments`) are measured before: everything done with a window is local, so
-    that a part of it gives the same pixels as the whole.
+    Figures of the whole frame (`exposure`, `moments`) are measured before: everything done with a window is local.
     """
 
     number: int  # the centre frame's number
@@ -163,10 +162,7 @@ class AlignedWindow:
 
     @cached_property
     def color(self) -> Array:
-        """Irradiance of all frames, aligned, (T, H, W, 3). A missing one holds the centre's, with confidence 0.
-
-        Without outliers where the plan rejects them. Warped at the first access where there is a first pass.
-        """
+        """Irradiance (T, H, W, 3) without rejected outliers; a missing frame is the centre's, with confidence 0."""
         if self.aligned_color is not None:
             return self.aligned_color
         color = self.sources.warp("irradiance", self.centre_irradiance)

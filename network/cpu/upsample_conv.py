@@ -28,8 +28,7 @@ class UpsampleTaps(NamedTuple):
 def merge_taps(weight: Tensor, channels: int) -> UpsampleTaps:
     """Add the taps ``(O, C + D, 3, 3)`` that read the same feature of the C upsampled channels.
 
-    The three taps of an even row 2i read rows i − 1, i and i of the features, those of an odd row 2i + 1 rows i, i
-    and i + 1; columns likewise.
+    Those of an even row 2i read rows i − 1, i and i, of an odd row 2i + 1 rows i, i and i + 1; columns likewise.
     """
     kernels = [half for rows in _halves(weight[:, :channels], 2) for half in _halves(rows, 3)]
     layout = torch.channels_last
