@@ -1,4 +1,4 @@
-"""Align a window of frames to its centre (`align`, for all filters and networks), and results of frames to each other."""
+"""Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
 
 from __future__ import annotations
 

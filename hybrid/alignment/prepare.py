@@ -27,7 +27,7 @@ ALPHA = "alpha"
 
 
 class Brightness(NamedTuple):
-    """Exposure of a frame's irradiance, and mean and deviation (2, G + 1) of `PreparedFrame.guide` and the irradiance."""
+    """Exposure of a frame's irradiance; mean and deviation (2, G + 1) of `PreparedFrame.guide` and irradiance."""
 
     exposure: float
     moments: NDArray[np.float64]
