@@ -62,9 +62,7 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     ``stage.network``: difference r of the result from the average a of first passes (else colors), |r − a| / (a +
     exposure).
     """
-    sides = [
-        index for index, trust in enumerate(aligned.geometric_confidence) if index != aligned.centre and trust.any()
-    ]
+    sides = [i for i, trust in enumerate(aligned.geometric_confidence) if i != aligned.centre and trust.any()]
     mean = average(aligned.color if aligned.first_pass is None else aligned.first_pass, aligned.confidence)
     changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)
     nothing = np.zeros(irradiance.shape[:2], np.float32)
@@ -83,9 +81,8 @@ def write_breakdown(pictures: Sequence[Shot], output: str | Path, frames: int, p
     """
     sheets = [_sheet(shot, output, frame_names(frames)) for shot in pictures]
     width = max(sheet.shape[1] for sheet in sheets)
-    write_png(
-        path, np.vstack([np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=1) for s in sheets])
-    )
+    wide = [np.pad(sheet, ((0, 0), (0, width - sheet.shape[1]), (0, 0)), constant_values=1) for sheet in sheets]
+    write_png(path, np.vstack(wide))
 
 
 def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:

@@ -53,9 +53,8 @@ def measure_presets(
     for preset in presets:
         denoiser, source = load(preset)
         # A sequence holds whole frames, and only a part is measured.
-        given: FirstPass | None = (
-            PerFrame(lambda frame: frame.color) if source.name == "sequence" else source.first_pass
-        )
+        whole = source.name == "sequence"
+        given: FirstPass | None = PerFrame(lambda frame: frame.color) if whole else source.first_pass
         frames, spent = FrameDenoiser(FrameStream(part, rules, given, radius=denoiser.radius), denoiser), []
         for number in numbers:
             start = time.perf_counter()

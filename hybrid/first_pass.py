@@ -168,9 +168,8 @@ def named_first_pass(
         reason, run = "asked for", partial(denoise_oidn, device=device)
         in_torch = spec == "auto" and backends.torch is not None and device == "cpu"
         if spec == "auto":
-            reason = (
-                f"no denoised picture in the file; {'its networks run in torch' if in_torch else 'OIDN is installed'}"
-            )
+            why = "its networks run in torch" if in_torch else "OIDN is installed"
+            reason = f"no denoised picture in the file; {why}"
         name = mode if spec == "auto" else spec
         store = None if keep is None else keep(name, in_torch, device)
         source = _oidn(name, (backends.torch or run) if in_torch else run, in_torch, store)

@@ -67,16 +67,15 @@ def command(name: str, *configs: type) -> Callable[[Callable[..., None]], Callab
                 LOG.warning(line)
             function(**arguments, **({"context": context} if "context" in own else {}))
 
+        keyword = inspect.Parameter.KEYWORD_ONLY
         parameters = {item.name: item for item in own.values() if item.kind is not inspect.Parameter.VAR_KEYWORD}
         for config in (*configs, LogOptions):
             hints = get_type_hints(config, include_extras=True)
             for item in fields(config):
                 if item.name in texts and item.name not in parameters:
-                    kind, annotation = inspect.Parameter.KEYWORD_ONLY, hints[item.name]
-                    parameters[item.name] = inspect.Parameter(
-                        item.name, kind, default=item.default, annotation=annotation
-                    )
-        context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+                    field = inspect.Parameter(item.name, keyword, default=item.default, annotation=hints[item.name])
+                    parameters[item.name] = field
+        context = inspect.Parameter("context", keyword, annotation=typer.Context)
         options = [_as_option(item, dict(texts[key])) for key, item in parameters.items() if key != "context"]
         run.__signature__ = inspect.Signature([*options, context])  # type: ignore[attr-defined]
         return run

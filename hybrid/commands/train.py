@@ -175,9 +175,8 @@ def train(
         sampler = SamplerConfig(**opt.take(SamplerConfig, settings))
         config = TrainConfig(**settings, device=device, sampler=sampler)
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
-    read += [
-        (what, Path(path)) for what, path in (("init", init), ("vgg", config.vgg)) if path and Path(path).is_file()
-    ]
+    given = {"init": init, "vgg": config.vgg}
+    read += [(what, Path(path)) for what, path in given.items() if path and Path(path).is_file()]
     check_outputs([("output", output), ("state", Path(f"{output}.state"))], read)
     writer = None
     if tensorboard is not None:

@@ -163,9 +163,8 @@ class Shot:
         reader = self.reader
         files = replace(reader.files, layers={**reader.files.layers, "color": color})
         headers = ShotHeaders(files, reader.headers.sources)
-        return replace(
-            self, reader=ShotReader(headers, reader.interpretation, reader.keep), view=color.name or str(color)
-        )
+        made = ShotReader(headers, reader.interpretation, reader.keep)
+        return replace(self, reader=made, view=color.name or str(color))
 
     def header(self, number: int) -> ExrImage:
         """Read parts and channels of a frame's file, without pixels."""

@@ -1,10 +1,10 @@
 """Sidecar sequences that hold one layer each: a file or a folder for each AOV, RenderMan's variance file."""
 
+import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 
 from hybrid.files.exr import ExrError, ExrImage, Layer, read_exr
@@ -180,9 +180,7 @@ def _label(folder: Path, direct: Sequence[Pattern]) -> list[tuple[str, Pattern]]
             rests = {pattern: _rest(pattern, color) for pattern in direct if pattern != color}
             if all(rests.values()):
                 return [("", color), *((plain_name(rest), pattern) for pattern, rest in rests.items())]
-        alike = "".join(
-            letters[0] for letters in takewhile(lambda letters: len({*letters}) == 1, zip(*stems, strict=False))
-        )
+        alike = os.path.commonprefix(stems)  # noqa: RUF071 - letter by letter
         # Whole words only: albedo and alpha begin alike.
         start = max(alike.rfind(separator) for separator in "._-") + 1
         return [(plain_name(stem[start:]), pattern) for stem, pattern in zip(stems, direct, strict=True)]

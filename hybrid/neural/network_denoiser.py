@@ -102,9 +102,8 @@ class NetworkDenoiser(WindowDenoiser):
             if black or ("skip" in aligned.stages and not aligned.variance[outer].any()):
                 irradiance[inner], filtered[inner] = aligned.centre_irradiance[inner], aovs[inner]
                 if parts is not None:
-                    parts[aligned.centre][inner] = np.dstack(
-                        [irradiance[inner], np.ones_like(irradiance[inner][..., :1])]
-                    )
+                    weight = np.ones_like(irradiance[inner][..., :1])
+                    parts[aligned.centre][inner] = np.dstack([irradiance[inner], weight])
                 continue
             with torch.inference_mode():
                 tile = self._run_tile(aligned, window, outer)

@@ -288,7 +288,7 @@ def brick_material() -> Any:
     tree = bricks.node_tree
     where = assets.node(tree, "Mapping", Vector=assets.node(tree, "TexCoord").outputs["Object"], Rotation=FACING)
     laid = assets.node(tree, "TexBrick", Vector=where.outputs["Vector"], Scale=6.5, Color1=(0.3, 0.11, 0.07, 1),
-                Color2=(0.16, 0.07, 0.05, 1), Mortar=(0.3, 0.28, 0.25, 1), Mortar_Size=0.025)  # fmt: skip
+                       Color2=(0.16, 0.07, 0.05, 1), Mortar=(0.3, 0.28, 0.25, 1), Mortar_Size=0.025)  # fmt: skip
     relief = assets.node(tree, "Bump", Height=laid.outputs["Fac"], Strength=1.0, Distance=-0.006)
     shader = tree.nodes["Principled BSDF"]
     tree.links.new(laid.outputs["Color"], shader.inputs["Base Color"])
