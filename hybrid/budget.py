@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from hybrid.denoisers import WindowDenoiser
 from hybrid.files.frame import cut_middle
@@ -17,8 +17,7 @@ from hybrid.stream import FirstPass, FrameStream
 SIDE = 512
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """A preset, and the seconds of wall clock that one frame takes, without writing it."""
 
     preset: str

@@ -5,6 +5,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -58,8 +59,7 @@ class ShotImages:
         return self.frames[len(self.frames) // 2]
 
 
-@dataclass(frozen=True)
-class Embedded:
+class Embedded(NamedTuple):
     """Data for the page: `info` for its script, and (id, text) of the elements that hold the encoded images."""
 
     info: Mapping[str, object]

@@ -8,9 +8,8 @@ Andersson et al. 2020, FLIP: A Difference Evaluator for Alternating Images, doi:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -88,8 +87,7 @@ def find_exposures(reference: Array) -> NDArray[np.float64]:
     return np.linspace(first, last, max(2, int(np.ceil(last - first))))
 
 
-@dataclass(frozen=True)
-class _Perceived:
+class _Perceived(NamedTuple):
     """An image as perceived: (H, W, 3) color in L*a*b* after Hunt, and strength of edges and points, (H, W) each."""
 
     color: Array

@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,8 +14,7 @@ LADDER_METRICS = ("psnr", "temporal_psnr", "flip")
 LEAST_ERROR = 10**-6.5  # 65 dB: below, an error against two references is mostly their noise
 
 
-@dataclass(frozen=True)
-class Factor:
+class Factor(NamedTuple):
     """A factor on samples, or a bound of it where the samples lie outside the measured ones."""
 
     value: float

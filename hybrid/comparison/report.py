@@ -6,10 +6,9 @@ templates are in `hybrid.comparison.page`.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
@@ -44,8 +43,7 @@ MOVIES = "movies"  # folder next to the page
 FILES = ("report.html", "results.json", "chart.png", "ladder.png")
 
 
-@dataclass(frozen=True)
-class Report:
+class Report(NamedTuple):
     """Content of a report."""
 
     # the shot of the page, methods in the order of the tables. Gains are relative to the method "noisy".
@@ -156,8 +154,7 @@ def _page(
     )
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """Head of the page: the best method by the first measure, its rival, its ties, and (figure, unit, label)."""
 
     leader: str
@@ -187,8 +184,7 @@ def _verdict(
     return Verdict(best, pair and pair[1], [r.name for r in results if r.name in ties], figures)
 
 
-@dataclass(frozen=True)
-class Plot:
+class Plot(NamedTuple):
     """A chart, None without finite values, and (budget, method, figure) of the recommendations."""
 
     metric: Metric
@@ -209,8 +205,7 @@ def _plot(results: Sequence[MethodResult], metric: Metric, cost: Cost, prefix: s
     return Plot(metric, cost, None if figure is None else chart.to_svg(figure, prefix), advice)
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """A measure as a column of a table: the best method, its ties, and the range of all values."""
 
     metric: Metric
@@ -240,8 +235,7 @@ def _columns(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list
     return columns
 
 
-@dataclass(frozen=True)
-class MethodTable:
+class MethodTable(NamedTuple):
     """Methods by family, the measures as columns, and the number of methods that are points of a sweep."""
 
     columns: list[Column]
@@ -264,8 +258,7 @@ def _sweep_tables(present: Sequence[MethodResult], metrics: Sequence[Metric]) ->
     return tables
 
 
-@dataclass(frozen=True)
-class ShotTable:
+class ShotTable(NamedTuple):
     """Joined results of several shots, and the results of each shot by name."""
 
     columns: list[Column]

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -26,8 +25,7 @@ ENOUGH = 5.0
 WARM_UP = 384
 
 
-@dataclass(frozen=True)
-class RunCost:
+class RunCost(NamedTuple):
     """Cost of one run over all frames; seconds exclude reading of files."""
 
     megapixels: float
@@ -36,8 +34,7 @@ class RunCost:
     peak_bytes: int
 
 
-@dataclass(frozen=True)
-class Seconds:
+class Seconds(NamedTuple):
     """Seconds per megapixel over runs: median, least and most wall time, and median CPU time."""
 
     median: float
@@ -88,8 +85,7 @@ def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore |
     return RunCost(pixels / 1e6, run.seconds - read.seconds, run.cpu_seconds - read.cpu_seconds, run.peak_bytes)
 
 
-@dataclass(frozen=True)
-class TimedRuns:
+class TimedRuns(NamedTuple):
     """Runs of each method that ran, round by round, and the reasons why the others are absent."""
 
     runs: Mapping[str, Sequence[RunCost]]
