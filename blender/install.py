@@ -4,8 +4,8 @@ import os
 import re
 import shutil
 import sys
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 _CURRENT = "current.txt"  # holds the name of the complete environment
 # pip's output, after its retries, when no package index was reached.
@@ -15,8 +15,7 @@ _NO_NETWORK = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """The source that ravg is installed from."""
 
     version: str  # of this extension, such as 0.2.0

@@ -5,8 +5,8 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 
@@ -22,8 +22,7 @@ NO_LIGHT_PASSES = "Without Network does not denoise them, choose another preset 
 STEREO = "Blender's compositor shows the left eye's image in both: composite the frames in another program"
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """A problem of a scene, in one line; `fixable` if `set_up` repairs it."""
 
     text: str

@@ -1,7 +1,7 @@
 """Color grade of denoised pictures: factors that bring them to the level of their samples."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ ONE_LEVEL = 1.5
 SPREAD, NOISE = 0.15, 1.0
 
 
-@dataclass(frozen=True)
-class Grade:
+class Grade(NamedTuple):
     """Factors by channel that bring denoised pictures to the level of their samples; None if no factor does."""
 
     factors: tuple[float, float, float] | None

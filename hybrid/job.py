@@ -381,8 +381,7 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """The state of a job after a frame of pass `run` of `runs`; `done` of `total` frames of all passes."""
 
     result: Finished | Failed

@@ -12,9 +12,8 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import typer
@@ -28,8 +27,7 @@ NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbo
 PATIENCE = 10
 
 
-@dataclass(frozen=True)
-class Chunk:
+class Chunk(NamedTuple):
     """A part of the work: arguments of its command, and its size in frames or samples."""
 
     arguments: Sequence[str]

@@ -3,8 +3,8 @@
 import gc
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -17,8 +17,7 @@ from network.training.config import TrainConfig
 from network.training.loop import train
 
 
-@dataclass(frozen=True)
-class TrainInputs:
+class TrainInputs(NamedTuple):
     """Clips and initial weights of a training."""
 
     clips: Path  # from `write_clips`

@@ -249,8 +249,7 @@ def _pack(clip: Clip) -> dict[str, Tensor]:
     return packed
 
 
-@dataclass(frozen=True)
-class _Shard:
+class _Shard(NamedTuple):
     """Metadata of a shard."""
 
     path: Path
@@ -371,8 +370,7 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
     return clips.of(training), clips.of(validation)
 
 
-@dataclass(frozen=True)
-class _Variation:
+class _Variation(NamedTuple):
     """How a sample varies: flips, transposition, permuted channels; normals, of any space, get a signed permutation."""
 
     flips: tuple[int, ...]

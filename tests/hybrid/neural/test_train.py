@@ -1,7 +1,6 @@
 """Weights that trainings begin with."""
 
 import importlib.util
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,7 +42,7 @@ def test_a_preset_begins_with_the_weights_of_its_seed():
 @pytest.mark.oidn
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_is_the_backbone_that_training_begins_with():
-    model = _initial_model(replace(INPUTS, init="oidn"), FiveFrames(), seed=3)
+    model = _initial_model(INPUTS._replace(init="oidn"), FiveFrames(), seed=3)
     assert equal(weights(model.backbone), load_oidn("rt_hdr_alb_nrm_small").state_dict())
     assert not equal(weights(model.backbone), weights(build_preset("fast", seed=3).backbone))
 
@@ -51,18 +50,18 @@ def test_oidn_is_the_backbone_that_training_begins_with():
 def test_oidn_is_asked_for_its_weights(monkeypatch):
     given = []
     monkeypatch.setattr(module, "start_from_oidn", given.append)
-    model = _initial_model(replace(INPUTS, init="oidn"), FiveFrames(), seed=3)
+    model = _initial_model(INPUTS._replace(init="oidn"), FiveFrames(), seed=3)
     assert given == [model]
     with pytest.raises(ValueError, match="init is 'oidn', expected with it a preset on OIDN's backbone, not 'unet'"):
-        _initial_model(replace(INPUTS, preset="unet", init="oidn"), FiveFrames(), seed=3)
+        _initial_model(INPUTS._replace(preset="unet", init="oidn"), FiveFrames(), seed=3)
 
 
 def test_a_preset_that_ships_is_what_training_begins_with():
-    model = _initial_model(replace(INPUTS, init="balanced"), FiveFrames(), seed=3)
+    model = _initial_model(INPUTS._replace(init="balanced"), FiveFrames(), seed=3)
     assert equal(weights(model), weights(load_model(shipped_weights("balanced"))))
 
 
 def test_windows_of_another_length_are_asked_for_by_name():
     with pytest.raises(ValueError, match="expected windows of 7 frames, as quality has, got 5; --window 5 trains"):
-        _initial_model(replace(INPUTS, preset="quality"), FiveFrames(), seed=3)
-    assert _initial_model(replace(INPUTS, preset="quality", window=5), FiveFrames(), seed=3).frames == 5
+        _initial_model(INPUTS._replace(preset="quality"), FiveFrames(), seed=3)
+    assert _initial_model(INPUTS._replace(preset="quality", window=5), FiveFrames(), seed=3).frames == 5
