@@ -4,8 +4,7 @@ import bpy
 
 from . import scenes
 
-# Socket of a Render Layers node → socket of an Image node, where they differ.
-_NAMES = {"Image": "Combined"}
+_NAMES = {"Image": "Combined"}  # socket of a Render Layers node → socket of an Image node, where they differ
 
 
 def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:

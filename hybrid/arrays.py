@@ -16,8 +16,7 @@ from hybrid.plan import Plan
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
 
-# Layers of each frame, by index or number.
-Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]
+Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]  # layers of each frame, by index or number
 # Names of layers that are no AOVs.
 LAYERS = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
 

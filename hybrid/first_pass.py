@@ -26,8 +26,7 @@ from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequ
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Highlights, clamp_halos
 
-# Frames on each side that tell whether a frame's guides hold noise.
-GUIDE_RADIUS = 1
+GUIDE_RADIUS = 1  # frames on each side that tell whether a frame's guides hold noise
 
 # Quality of each mode of OIDN, and of the filters that its guides go through first.
 OIDN_MODES: dict[str, dict[str, Any]] = {

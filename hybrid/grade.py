@@ -8,17 +8,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-# Sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise.
-TILE = 8
-# Fewer tiles are no evidence.
-FEWEST = 16
-# Tiles below this share of the mean light are excluded: empty areas are equal in any grade.
-LIT = 0.01
+TILE = 8  # sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise
+FEWEST = 16  # fewer tiles are no evidence
+LIT = 0.01  # tiles below this share of the mean light are excluded: empty areas are equal in any grade
 # Levels that differ by less than this factor, or by fewer standard errors, are no grade: denoisers are off by some
 # percent, and skewed noise moves a median by as much. The stage that restores the mean corrects them.
 LEVEL, ERRORS = 1.1, 5.0
-# Frames whose levels relative to their samples differ by more than this factor have no common grade.
-ONE_LEVEL = 1.5
+ONE_LEVEL = 1.5  # frames whose levels relative to their samples differ by more than this factor have no common grade
 # Median deviation of tiles from one factor, in units of the logarithm, plus a multiple of their noise; above it no
 # factor explains half of the light.
 SPREAD, NOISE = 0.15, 1.0

@@ -46,10 +46,8 @@ METHOD_OF_PRESET = {preset: method for method, presets in PRESETS.items() for pr
 FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-fast"}
 CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
 LEAST = {"passes": 1, "tile": 16, "threads": 1}
-# Options that only a network has.
-OF_NETWORKS = ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile")
-# Presets that a budget chooses from, the most accurate first.
-MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))
+OF_NETWORKS = ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile")  # options that only a network has
+MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))  # presets that a budget chooses from, the most accurate first
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,12 @@ from hybrid.files.shots import Shot
 from hybrid.oidn import HOLDS, HOLDS_FAST
 from hybrid.stream import FirstPass, can_refine, kept_planes
 
-# Rows are taken in whole strips of the guided filter.
-STRIP = 64
+STRIP = 64  # rows are taken in whole strips of the guided filter
 # Bytes of a process that has read nothing: Python, the libraries, the compiled code; and with torch.
 BASE, BASE_NEURAL = 220 * 2**20, 470 * 2**20
 # Bytes of OIDN: its code, most of which torch loads anyway; and for each pixel, up to its limit, in its slowest mode.
 OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 230 * 2**20, 80 * 2**20, 750
-# The part of it that stays when OIDN has run.
-CODE = 64 * 2**20
+CODE = 64 * 2**20  # the part of it that stays when OIDN has run
 # Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once: at 960×540
 # the peak is 4 % above the plan.
 SHARE = 0.94

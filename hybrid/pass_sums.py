@@ -10,8 +10,7 @@ from hybrid.files.passes import BEAUTY, Passes, Sum
 from nlm.average import replace_nonfinite
 from nlm.parts import few_differ, find_sums, is_noisy, is_textured, share_outside, shares_noise
 
-# Height of the bands of rows in which frames are sampled, and most rows of all bands together.
-_BAND, _ROWS = 27, 540
+_BAND, _ROWS = 27, 540  # height of the bands of rows in which frames are sampled, and most rows of all bands together
 
 
 def sample_rows(frame: Frame) -> Frame:

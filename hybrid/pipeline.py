@@ -22,8 +22,7 @@ from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
 from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import find_nonfinite
 
-# In a header: the frames whose pictures were averaged with this one's.
-BESIDE = "ravg/beside"
+BESIDE = "ravg/beside"  # in a header: the frames whose pictures were averaged with this one's
 # From a frame's number to the files that it was made from, by what they are.
 SourcesOf = Callable[[int], dict[str, Source]]
 

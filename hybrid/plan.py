@@ -33,22 +33,18 @@ STAGES = {
 }
 #: Old names of stages, accepted for one release.
 OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
-#: Stages of networks alone.
-NEURAL_STAGES = frozenset({"stabilize", "alpha", "skip"})
+NEURAL_STAGES = frozenset({"stabilize", "alpha", "skip"})  # stages of networks alone
 
-# Motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast.
-STILL = 0.05
+STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
 REFINE_ABOVE = 0.01
 GATE_ABOVE = 0.002
-# One firefly in a hundred thousand pixels is twenty in a 1080p frame: visible.
-OUTLIERS_ABOVE = 1e-5
+OUTLIERS_ABOVE = 1e-5  # one firefly in a hundred thousand pixels is twenty in a 1080p frame: visible
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003
-# Frames on each side of a window as it is planned for a whole shot.
-RADIUS = 2
+RADIUS = 2  # frames on each side of a window as it is planned for a whole shot
 
 
 class Context(NamedTuple):

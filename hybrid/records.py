@@ -22,12 +22,9 @@ from hybrid.runtime.system import peak_memory, process_lives
 from hybrid.runtime.timing import Timings
 
 FOLDER = "ravg"
-# Name of a sequence whose file names are numbers alone.
-NAMELESS = "frames"
-# All packages whose versions are recorded.
-ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")
-# A longer list of frames is named by its ends and a hash in the record's name.
-LONGEST = 60
+NAMELESS = "frames"  # name of a sequence whose file names are numbers alone
+ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")  # all packages whose versions are recorded
+LONGEST = 60  # a longer list of frames is named by its ends and a hash in the record's name
 
 
 class Record:

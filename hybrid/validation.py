@@ -32,18 +32,15 @@ Mask = NDArray[np.bool_]
 # Pairs that are read, spread over all files of the shot and not over the frames that were asked for: the result must
 # not depend on the chunk that a frame comes in.
 PAIRS = 2
-# Pixels above which the frames of these pairs lie in temporary files: four of 7680×4320 take 7 GiB.
-LARGE = 2**24
+LARGE = 2**24  # pixels above which the frames of these pairs lie in temporary files: four of 7680×4320 take 7 GiB
 # Rows for shares and bounds, and for the comparison of edges; larger frames are reduced to about so many.
 THIN, EDGE_ROWS = 270, 540
 # A layer whose values lie within this of each other, relative to the largest, is constant: half floats round by 5e-4.
 SAME = 1e-3
-# Share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges.
-STRAY = 0.01
+STRAY = 0.01  # share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges
 # Reflectance is below 1; emitters and skies are written as brighter albedos by some, but not as half of a picture.
 BRIGHT = 2.0
-# Averages over a pixel are shorter than 1, rounding makes them longer by less than this.
-LENGTH = 1.1
+LENGTH = 1.1  # averages over a pixel are shorter than 1, rounding makes them longer by less than this
 # Correlation of edges, of a guide with the colors of two frames: on the bundled shot an albedo has 0.61 with its own
 # frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35. Below the second nothing matches: at few samples
 # albedos of rooms have 0.00 to 0.07 with their own frame, and by chance up to 0.20 with the next.
@@ -55,10 +52,8 @@ VARIANCE = 4.0
 # filter and denoisers make neighbours alike), and by a share of the brightest frame around it, whose light leaks into a
 # dark one.
 LIGHT, ERRORS, LEAK = 2.5, 10.0, 0.05
-# Share of its pixels that an estimate may have lost.
-LOST = 0.01
-# Number of motion conventions that are listed.
-SHOWN = 6
+LOST = 0.01  # share of its pixels that an estimate may have lost
+SHOWN = 6  # number of motion conventions that are listed
 # Two pictures of which so many pixels are equal are the same, black pixels excluded: empty areas of all layers agree.
 EQUAL = 0.99
 

@@ -13,12 +13,9 @@ Floats = NDArray[np.float32]
 
 # Cells of 8×8 pixels, smoothed by σ = 2 of them: σ of 8, 16 and 32 pixels are as good to 0.05 dB.
 _CELL, _SIGMA = 8, 2.0
-# Deviations of its own noise subtracted from the measured drift: 1 and 2 differ by 0.03 dB.
-_DEVIATIONS = 1.5
-# At least this share of two estimates' difference is their own error: no frame gets the weight 0.
-_ERROR = 0.1
-# A sample counts up to so many times the light: fireflies carry no evidence of drift.
-_LIMIT = np.float32(12)
+_DEVIATIONS = 1.5  # deviations of its own noise subtracted from the measured drift: 1 and 2 differ by 0.03 dB
+_ERROR = 0.1  # at least this share of two estimates' difference is their own error: no frame gets the weight 0
+_LIMIT = np.float32(12)  # a sample counts up to so many times the light: fireflies carry no evidence of drift
 
 
 def drift_weights(

@@ -31,8 +31,7 @@ DIFFERENT = 0.25
 # A sample that another frame shows within 3 pixels at a quarter of its brightness is ordinary noise and no firefly:
 # kitchens at 8 samples a pixel lose a tenth of their light, and 2 dB, without such samples.
 SPREAD, RECURS = 7, 0.25
-# Pixels of a 3×3 pattern below this share of its brightest pixel are noise of the surroundings.
-DIM = 1 / 16
+DIM = 1 / 16  # pixels of a 3×3 pattern below this share of its brightest pixel are noise of the surroundings
 # Two frames may agree by chance where noise is so strong that the other has more than 3 samples of a quarter of the
 # highlight's brightness within 8 pixels that the frame lacks: kitchens have 3 to 90 there. Fireflies on a hundredth of
 # the pixels are 2.

@@ -11,19 +11,15 @@ Mask = NDArray[np.bool_]
 
 # A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
-# About so many rows are taken for the median: all rows of 1920×1080 pixels cost 20 ms.
-_ROWS = 256
-# Fewer bright pixels show no motion; a greater share of all pixels is noise.
-LEAST, _MOST = 20, 0.05
-# Search radius, pixels a frame, and side of the searched block.
-_REACH, _BLOCK = 32, 512
+_ROWS = 256  # about so many rows are taken for the median: all rows of 1920×1080 pixels cost 20 ms
+LEAST, _MOST = 20, 0.05  # fewer bright pixels show no motion; a greater share of all pixels is noise
+_REACH, _BLOCK = 32, 512  # search radius, pixels a frame, and side of the searched block
 # This share of the bright pixels must share a motion, and more than chance by six deviations and eight pixels.
 _SHARE, _SIGMAS, _MORE = 0.2, 6.0, 8
 # Bright pixels that move within so many pixels of the surfaces' motion are highlights with noisy samples: added back as
 # rendered they cost 2.5 dB of a pan over a bar with many lamps.
 _APART = 2.5
-# The same light differs by a factor of two at most.
-_ALIKE = 2.0
+_ALIKE = 2.0  # the same light differs by a factor of two at most
 # Where this share of the bright pixels move together, the others are content too: hidden, or leaving the frame.
 CONTENT = 0.6
 # Motions to the frames before and after are opposite but for so many pixels. A drop three pixels long has five motions

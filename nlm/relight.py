@@ -11,8 +11,7 @@ from nlm.variance import gaussian_mean, ratio
 
 Floats = NDArray[np.float32]
 
-# Means over σ = 1.5 cells of 4×4 pixels; 4 to 10 pixels are alike to 0.03 dB.
-_CELL, _SIGMA = 4, 1.5
+_CELL, _SIGMA = 4, 1.5  # means over σ = 1.5 cells of 4×4 pixels; 4 to 10 pixels are alike to 0.03 dB
 
 
 def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, first_row: int = 0) -> None:

@@ -23,8 +23,7 @@ from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
-# Seconds that a connection may take.
-PATIENCE = 10
+PATIENCE = 10  # seconds that a connection may take
 
 
 class Chunk(NamedTuple):

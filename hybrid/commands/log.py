@@ -108,8 +108,7 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], title: str 
     Console().print(table)
 
 
-# Most characters of a message, which may quote a file.
-LONGEST = 2000
+LONGEST = 2000  # most characters of a message, which may quote a file
 
 
 def one_line(error: BaseException) -> str:

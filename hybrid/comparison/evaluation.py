@@ -44,8 +44,7 @@ MEASURES: dict[str, Measure] = {
 # Static light: 9×9 means of the reference change by less than this on the tone curve. Well above their noise (a ninth
 # of the pixels'), well below a visible change.
 STATIC_CHANGE = 0.02
-# Gain of the map of changes: a change of a fiftieth of the tone curve is black or white.
-CHANGE_GAIN = 25
+CHANGE_GAIN = 25  # gain of the map of changes: a change of a fiftieth of the tone curve is black or white
 
 
 @dataclass(frozen=True)

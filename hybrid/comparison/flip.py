@@ -128,8 +128,7 @@ def _mix(image: Array, matrix: NDArray[np.float64]) -> Array:
 
 
 def _length(x: NDArray[Any], y: NDArray[Any]) -> Array:
-    # OpenCV's result differs in the last bit from call to call.
-    return np.asarray(np.sqrt(x * x + y * y), np.float32)
+    return np.asarray(np.sqrt(x * x + y * y), np.float32)  # OpenCV's result differs in the last bit from call to call
 
 
 def _power(x: Array, power: float) -> Array:

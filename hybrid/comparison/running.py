@@ -19,8 +19,7 @@ OnStep = Callable[[str], None]  # gets a description of each step as it starts
 P = ParamSpec("P")
 T = TypeVar("T")
 
-#: Seconds in total after which a method is not run again: disturbances average out within a long run.
-ENOUGH = 5.0
+ENOUGH = 5.0  # seconds in total after which a method is not run again: disturbances average out within a long run
 # Pixels per side of the warm-up crop: covers the whole frame of test shots, and a fourteenth of 1920×1080.
 WARM_UP = 384
 

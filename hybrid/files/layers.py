@@ -10,8 +10,7 @@ from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
 from hybrid.files.profile import ROLE_FACTS, ROLES, Profile, find_profile, plain_name
 
-# Blender's name for its compositor's result: graded, blurred, glowing.
-COMPOSITE = "Composite"
+COMPOSITE = "Composite"  # Blender's name for its compositor's result: graded, blurred, glowing
 # Blender's names for the picture that it has denoised, beside its Noisy Image: in a render, and in the files of a File
 # Output node.
 _DENOISED = ("combined", "image")
@@ -23,8 +22,7 @@ _LOOKS_LIKE = {
     "motion": re.compile("motion|velocity|vector|mvec|mv"),
 }
 _NO_GUIDE = re.compile("variance|mse|error|deviation|crypto")
-# Stands for every layer that is known to be a part of the light.
-ALL = "all"
+ALL = "all"  # stands for every layer that is known to be a part of the light
 # One lobe's direct or indirect light, as Cycles and others name it; and names of undivided parts.
 _LOBES = (
     "diff(?:use)?|gloss(?:y)?|trans(?:mission)?|volume|subsurface|sss|spec(?:ular)?|coat|sheen|reflect(?:ion)?s?|"

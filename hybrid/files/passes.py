@@ -11,8 +11,7 @@ from nlm.parts import few_differ, share_outside, sums_to
 
 Array = NDArray[np.float32]
 
-# Stands for the beauty among the names of AOVs.
-BEAUTY = ""
+BEAUTY = ""  # stands for the beauty among the names of AOVs
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from hybrid.runtime.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
 
-# Temporary files and folders of this process.
-_unfinished: set[Path] = set()
+_unfinished: set[Path] = set()  # temporary files and folders of this process
 # Length of a file's name that its temporary name repeats, so that this stays within the 255 bytes that folders allow.
 _KEPT = 24
 _TEMPORARY = re.compile(r"\..+\.ravg-[0-9a-f]{16}\.tmp", re.DOTALL)

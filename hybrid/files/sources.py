@@ -24,8 +24,7 @@ HASHED = 2**20
 _BLOCKS = 16
 # Packages that all pixels depend on.
 PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless", "scikit-image")
-# Archives and older file systems keep times in steps of up to two seconds.
-_SECONDS = 2.0
+_SECONDS = 2.0  # archives and older file systems keep times in steps of up to two seconds
 
 
 @dataclass(frozen=True)

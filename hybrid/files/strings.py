@@ -11,10 +11,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-# Bit of the version field: several parts, each with a header, and one more that is empty.
-_MULTI_PART = 0x1000
-# Headers and tables of offsets lie within so many bytes; reading headers needs nothing behind them.
-_HEADERS = 2**24
+_MULTI_PART = 0x1000  # bit of the version field: several parts, each with a header, and one more that is empty
+_HEADERS = 2**24  # headers and tables of offsets lie within so many bytes; reading headers needs nothing behind them
 
 
 def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:

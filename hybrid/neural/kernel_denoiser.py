@@ -12,8 +12,7 @@ from hybrid.stabilize import Denoised
 from network.paper.inputs import KernelWindow
 from network.paper.models import KernelModel, filter_window, for_inference
 
-# Bytes for each pixel of a tile in bfloat16; measured.
-SCRATCH = 2500
+SCRATCH = 2500  # bytes for each pixel of a tile in bfloat16; measured
 
 
 class KernelDenoiser(NetworkDenoiser):

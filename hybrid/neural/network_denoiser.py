@@ -52,12 +52,9 @@ class NetworkDenoiser(WindowDenoiser):
     """A network and its `Setup`."""
 
     packages = ("torch",)
-    #: Pixels of context around a tile.
-    halo: int
-    #: Default side of a tile, pixels.
-    default_tile: int
-    #: Threshold of predicted kernels, where it is not that of the training.
-    threshold: float | None = None
+    halo: int  # pixels of context around a tile
+    default_tile: int  # default side of a tile, pixels
+    threshold: float | None = None  # threshold of predicted kernels, where it is not that of the training
 
     def __init__(self, model: Any, setup: Setup, bytes_per_pixel: int) -> None:
         self.model = model.to(setup.torch_device)

@@ -8,8 +8,7 @@ import sys
 # grew with every frame. Features of a strip of all frames, allocated tens of times a frame, are no larger.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_ARENA_MAX = -3, -1, -8
 KEPT = 3 * 2**26
-# Blocks of at least so many bytes are returned in a run with a limit: planes of a 1280×720 frame.
-RETURNED = 2**22
+RETURNED = 2**22  # blocks of at least so many bytes are returned in a run with a limit: planes of a 1280×720 frame
 
 
 def reuse_freed_memory() -> None:

@@ -13,8 +13,7 @@ from hybrid.files.replace import remove_unfinished
 from hybrid.runtime.system import INTERRUPTS
 
 INTERRUPTED = 130  # what shells report for a command that Ctrl-C has ended
-# Seconds for Python to return from compiled code and to unwind.
-PATIENCE = 1.0
+PATIENCE = 1.0  # seconds for Python to return from compiled code and to unwind
 # If this variable is 1, the program that started ravg stops it by closing its standard input. On Windows no signal
 # reaches a process without a console of its own.
 STOP_WITH_STDIN = "RAVG_STOP_WITH_STDIN"

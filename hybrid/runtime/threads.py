@@ -5,12 +5,10 @@ import sys
 
 #: Where numba looks for a folder for compiled loops: its own list, and after that ours (`hybrid.runtime.compiled`).
 CACHE_LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,hybrid.runtime.compiled.Fallback"
-#: Spins of a waiting thread of GNU's OpenMP before it sleeps: 1,000 and 10,000 are nearly as good.
-SPINS = 3000
+SPINS = 3000  # spins of a waiting thread of GNU's OpenMP before it sleeps: 1,000 and 10,000 are nearly as good
 
 
-#: numba ends with a segmentation fault if it is to start a hundred thousand.
-MOST_THREADS = 1024
+MOST_THREADS = 1024  # numba ends with a segmentation fault if it is to start a hundred thousand
 
 
 def check_thread_counts() -> None:

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-#: Channels of a frame: color, albedo, normal, confidence (the paper's).
-CHANNELS = 10
+CHANNELS = 10  # channels of a frame: color, albedo, normal, confidence (the paper's)
 
 
 class KernelWindow(NamedTuple):

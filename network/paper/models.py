@@ -168,8 +168,7 @@ class KernelNetwork(nn.Module):
     def __init__(self, config: RAUNetConfig | RAResNetConfig | TKPCNConfig) -> None:
         super().__init__()
         self.config: Any = config
-        #: Length of the windows, T.
-        self.frames = config.kernel.frames
+        self.frames = config.kernel.frames  # length of the windows, T
 
     def forward(self, features: Tensor, confidence: Tensor, threshold: float | None = None) -> Tensor:
         """Predict ``(N, taps, H, W)`` kernels; see `KernelHead.forward`."""

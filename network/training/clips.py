@@ -27,10 +27,8 @@ VERSION = "4"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this, to which brighter values
 #: (fireflies only) are clipped.
 HALF_MAX = 65504.0
-#: Kinds of targets that are renders, whose noise is independent of the input's.
-RENDERS = ("noisy", "rendered")
-#: Bytes after which a shard is full: small enough to copy about, large enough that files are few.
-SHARD_BYTES = 1 << 28
+RENDERS = ("noisy", "rendered")  # kinds of targets that are renders, whose noise is independent of the input's
+SHARD_BYTES = 1 << 28  # bytes after which a shard is full: small enough to copy about, large enough that files are few
 
 
 class Layout(NamedTuple):
@@ -138,8 +136,7 @@ class Sample(NamedTuple):
     error: Tensor
 
 
-#: Fields of a clip that samples have.
-INPUTS = Sample._fields[:-2]
+INPUTS = Sample._fields[:-2]  # fields of a clip that samples have
 
 
 def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:

@@ -17,8 +17,7 @@ from torch.nn import functional
 
 from network.paper.kernels import Filtered
 
-#: Frames of a window, and the weight of the loss of their image.
-Term = tuple[tuple[int, ...], float]
+Term = tuple[tuple[int, ...], float]  # frames of a window, and the weight of the loss of their image
 
 #: Weight of the fallback in the image of a subset of frames. The kernels sum to 1 over all frames; a subset to
 #: which they give less than this is mostly its own unfiltered pixels, and dividing by its share stays harmless.
