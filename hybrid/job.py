@@ -188,12 +188,9 @@ if DenoiseOptions.__doc__:  # none with python -OO
 
 
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
-    """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist.
-
-    "estimate", the old name of `first_pass`, is accepted with a warning.
-    """
+    """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist."""
     given = dict(changes)
-    if "estimate" in given:
+    if "estimate" in given:  # the old name
         warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
         given["first_pass"] = given.pop("estimate") or ""
     if unknown := given.keys() - DEFAULTS.keys():
@@ -267,15 +264,12 @@ def open_denoiser(
 
 
 def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoiser) -> FirstPassSource:
-    """Return the first pass of a view; errors are those of `hybrid.first_pass.find_first_pass`.
-
-    With the option "none", a denoiser that needs a first pass has the classical one.
-    """
+    """Return the first pass of a view; errors are those of `hybrid.first_pass.find_first_pass`."""
     if not denoiser.needs_first_pass:
         return FirstPassSource("none", None, "the denoiser takes none")
     support = temporal_support(None, denoiser.radius, options.rules)
     return find_first_pass(
-        "nlm" if options.first_pass == "none" else options.first_pass,
+        "nlm" if options.first_pass == "none" else options.first_pass,  # the denoiser needs one
         view.with_neighbours(support * (options.passes - 1)),
         classical=CLASSICAL_PRESETS.get(options.preset, FINAL),
         kept=options.keep_first_pass,
@@ -325,10 +319,7 @@ def check_paths(
 
 
 def validate_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...], ValidationReport]:
-    """Return the views of a shot without layers that make no sense, and the findings; ValueError if `strict`.
-
-    Pairs of the shot's frames are read.
-    """
+    """Return a shot's views without layers that make no sense in pairs of frames, and findings, errors if `strict`."""
     reports = [validate_layers(view) for view in shot.views]
     findings = [finding for report in reports for finding in report.findings]
     report = replace(reports[0], findings=tuple(dict.fromkeys(findings)))

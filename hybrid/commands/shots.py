@@ -144,10 +144,7 @@ def log_findings(report: ValidationReport, views: Sequence[Shot]) -> None:
 
 
 def validate_renders(shots: Mapping[str, Shot], *, strict: bool) -> tuple[dict[str, Shot], list[str]]:
-    """Return renders of one shot without layers that make no sense in one of them, and the messages of the findings.
-
-    Findings are logged, and errors if `strict`. Of files with several views one has to be chosen.
-    """
+    """Return renders of one shot without layers that make no sense in one, and findings, logged, errors if `strict`."""
     reports = {name: validate_layers(shot) for name, shot in shots.items()}
     for name, report in reports.items():
         prefix = f"{name}: " if len(shots) > 1 else ""

@@ -39,15 +39,12 @@ class MethodImages:
 
 @dataclass(frozen=True)
 class ShotImages:
-    """Images of all methods in the order of the viewer, the reference, and the numbers of consecutive frames.
-
-    `exposure` is the factor e of the tone curve e·x / (1 + e·x) of the metrics.
-    """
+    """Images of all methods in the order of the viewer, the reference, and the numbers of consecutive frames."""
 
     methods: Sequence[MethodImages]
     reference: Callable[[int], Array]
     frames: Sequence[int]
-    exposure: float = 1.0
+    exposure: float = 1.0  # factor e of the tone curve e·x / (1 + e·x) of the metrics
     reference_maps: Mapping[str, Callable[[int], Array | None]] = field(default_factory=dict)  # as of a method
 
     @property

@@ -69,16 +69,13 @@ def external(other: Shot, seconds: float | None = None) -> Method:
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """How windows are aligned: radius, source of the first pass, forced stages, vectors, settings of TV-L1.
-
-    Without `vectors` the renderer's are ignored; with `solver` TV-L1 runs with these settings.
-    """
+    """How windows are aligned: radius, source of the first pass, forced stages, vectors, settings of TV-L1."""
 
     radius: int = 2
     source: str = "none"
     rules: Rules = field(default_factory=Rules)
-    vectors: bool = True
-    solver: Mapping[str, Any] = field(default_factory=dict)
+    vectors: bool = True  # whether the renderer's are read
+    solver: Mapping[str, Any] = field(default_factory=dict)  # of TV-L1, which runs then
 
     def stream(self, shot: Frames) -> FrameStream:
         frames = shot
