@@ -5,15 +5,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.movies import check_movie, write_movie
-from hybrid.files.png import encode_bytes, write_png
+from hybrid.files.png import Image8, encode_bytes, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import replace_nonfinite
-
-Image8 = NDArray[np.uint8]
 
 RATE = 24.0  # frames per second of a movie without --fps, as in film and Blender
 SWEEP = 4.0  # seconds of the divider's way from left to right and back

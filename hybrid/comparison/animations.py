@@ -7,15 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.comparison.embedding import Embedded, MethodImages, ShotImages
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
-from hybrid.files.png import encode_bytes
-
-Picture = NDArray[np.uint8]
+from hybrid.files.png import Image8, encode_bytes
 
 # Pixels of the longer side of an embedded frame, at most and at least, and of a WebP.
 LARGEST, SMALLEST, TALLEST = 480, 96, 16383
@@ -73,12 +70,12 @@ def write_movies(folder: Path, images: ShotImages, rate: float) -> dict[str, str
     return {source.name: write(index, source) for index, source in enumerate(images.sources)}
 
 
-def _encoder(images: ShotImages) -> Callable[[Array], Picture]:
+def _encoder(images: ShotImages) -> Callable[[Array], Image8]:
     """A function from radiance to 8-bit sRGB on the tone curve of the metrics."""
     level = measure_exposure(images.reference(images.middle))
     gain = np.float32(images.exposure * 2 ** mid_exposure(images.exposure, level))
 
-    def encode(radiance: Array) -> Picture:
+    def encode(radiance: Array) -> Image8:
         # x / (1 + x), written so that the largest float gives 1; non-finite pixels are black.
         light = 1 + gain * np.maximum(np.nan_to_num(radiance, nan=0.0, posinf=0.0, neginf=0.0), 0)
         return encode_bytes(1 - 1 / light)
@@ -86,7 +83,7 @@ def _encoder(images: ShotImages) -> Callable[[Array], Picture]:
     return encode
 
 
-def _sheet(frames: Iterable[Picture], rows: int, columns: int, size: tuple[int, int]) -> str:
+def _sheet(frames: Iterable[Image8], rows: int, columns: int, size: tuple[int, int]) -> str:
     """All frames in rows, from left to right and down, as a WebP in base64."""
     width, height = size
     sheet = np.zeros((rows * height, columns * width, 3), np.uint8)

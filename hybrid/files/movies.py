@@ -7,13 +7,10 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from hybrid.files.png import fit
+from hybrid.files.png import Image8, fit
 from hybrid.files.replace import replace_file
-
-Picture = NDArray[np.uint8]
 
 # The largest width or height of a picture: a movie fills a screen, a loop stands in a page.
 LARGEST = {".mp4": 1920, ".webp": 960}
@@ -27,7 +24,7 @@ def check_movie(path: Path) -> None:
         raise ImportError(f'{path} needs PyAV, which is not installed; expected: pip install "av"')
 
 
-def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
+def write_movie(path: Path, pictures: Iterable[Image8], rate: float) -> None:
     """Write sRGB pictures (H, W, 3) of one size as a movie, and make its folder; errors are those of `check_movie`.
 
     The name ends in .mp4 (H.264, for any player and browser) or .webp (loops in a page). Sizes above `LARGEST` are
@@ -44,7 +41,7 @@ def write_movie(path: Path, pictures: Iterable[Picture], rate: float) -> None:
             _write_webp(temporary, fitted, rate)
 
 
-def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
+def _write_mp4(path: Path, pictures: Iterator[Image8], rate: float) -> None:
     import av
     from av.video.reformatter import ColorRange, Colorspace
 
@@ -71,7 +68,7 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
         container.mux(stream.encode())
 
 
-def _write_webp(path: Path, pictures: Iterator[Picture], rate: float) -> None:
+def _write_webp(path: Path, pictures: Iterator[Image8], rate: float) -> None:
     first, *later = (Image.fromarray(picture) for picture in pictures)
     # Durations in whole milliseconds that add up to the exact time.
     ends = np.round(np.arange(len(later) + 2) * 1000 / rate).astype(int)

@@ -16,14 +16,12 @@ from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.decode import Window, data_window, display_size, place
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
-from hybrid.files.png import encode_srgb
+from hybrid.files.png import Image8, encode_srgb
 from hybrid.files.profile import find_profile
 from hybrid.files.sequences import find_files, parse_frames
 from hybrid.files.sources import MADE_FROM, parse_object
 from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
-
-Image8 = NDArray[np.uint8]
 
 # Cache of decoded layers, so that another exposure takes milliseconds.
 CACHE_BYTES = 512 * 2**20
