@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numba.core import codegen, event
+from numba.core import event
 from numba.core.caching import Cache, UserWideCacheLocator
 
 LOG = logging.getLogger("ravg")
@@ -161,16 +161,6 @@ def _save(save: Any) -> Any:
     return save_or_leave
 
 
-def _keep_functions(library: Any, module: Any) -> None:
-    """Leave the functions of a module as they are.
-
-    numba optimises each function, and after that the whole module; the first took a tenth of the compilation time, and
-    made no loop faster.
-    """
-    module.data_layout = library._codegen._data_layout
-
-
-codegen.CPUCodeLibrary._optimize_functions = _keep_functions  # type: ignore[method-assign]
 Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
 Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
 
