@@ -10,8 +10,10 @@ import pytest
 
 from hybrid import stabilize
 from hybrid.alignment.align import Stillness, align_results, measure_stillness
+from hybrid.alignment.prepare import prepare
 from hybrid.alignment.unfiltered import Unfiltered
 from hybrid.files.exr import read_exr
+from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.first_pass import PerFrame
@@ -576,3 +578,15 @@ class TestSamples:
 
         result = made(shot, soft, number, Rules(), first_pass=PerFrame(lambda frame: frame.color))
         assert np.std(result - right) < 1.1 * np.std(shot.read(number).color - right)
+
+
+def test_negative_light_follows_the_edges_of_the_guides():
+    """Light that only one of two surfaces has stays on it, though the picture is the same on both."""
+    albedo = np.full((40, 40, 3), 0.2, np.float32)
+    albedo[:, 20:] = 0.9
+    color = np.full_like(albedo, 0.5)
+    color[:, 20:, 2] = -0.1
+    prepared = prepare(Frame(1, color, albedo))
+    made = _with_unfiltered(Denoised(np.full_like(albedo, 0.5)), prepared).color
+    np.testing.assert_allclose(made[:, 17:20, 2], 0.5, atol=0.005)
+    np.testing.assert_allclose(made[:, 20:23, 2], 0.4, atol=0.005)
