@@ -123,16 +123,20 @@ def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confid
     """As `prefilter_guide`; `read` returns the window (T, h, W, F) of rows around noise that the guide shows."""
     spatial, filtered = variance_from_residual(centre), centre.copy()
     for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):
-        guides, trusted = check_window(read(rows), confidence[:, rows], "confidence")
-        temporal, trust = _temporal_variance(guides, trusted)
-        variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
-        run_bands(_lesser_variance, len(trust), temporal, spatial[rows], trust, variance, noisy)
-        filtered[rows] = joint_nlm(guides, variance, confidence=trusted, radius=1, patch_radius=1, k=1.0, where=noisy)
+        window = read(rows)
+        for columns in _around(spatial[rows].max(axis=0).max(axis=1) > _NOISELESS):
+            guides, trusted = check_window(window[:, :, columns], confidence[:, rows, columns], "confidence")
+            temporal, trust = _temporal_variance(guides, trusted)
+            variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
+            run_bands(_lesser_variance, len(trust), temporal, spatial[rows, columns], trust, variance, noisy)
+            filtered[rows, columns] = joint_nlm(
+                guides, variance, confidence=trusted, radius=1, patch_radius=1, k=1.0, where=noisy
+            )
     return filtered
 
 
 def _around(rows: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield runs of bands that hold one of these rows (H,), with a band on each side: more than all filters reach."""
+    """Yield runs of bands that hold one of these rows or columns, with a band on each side: more than filters reach."""
     bands = np.logical_or.reduceat(rows, np.arange(0, len(rows), BAND))
     wide = np.convolve(bands, np.ones(3), "same") > 0
     edges = np.flatnonzero(np.diff(wide, prepend=False, append=False))
