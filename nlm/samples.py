@@ -185,7 +185,8 @@ def blend_samples(
     spatial = spatial_variance(noisy, blended, rate)
     if variance is None:
         alone = np.float32(_ALONE) * spatial
-        lit = noisy.any(axis=-1)
+        red, green, blue = np.moveaxis(noisy != 0, -1, 0)
+        lit = red | green | blue  # `any` over the last axis takes ten times as long
         sure = lit & (neighbours.trust >= 1)
         if sure.any() and np.count_nonzero(sure) >= _MOSTLY * np.count_nonzero(lit):
             greatest = gaussian_mean(neighbours.trust * temporal, _SIGMA)[sure].max()
