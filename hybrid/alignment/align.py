@@ -267,12 +267,13 @@ def _warp_neighbours(
 
 def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, trust: Trust, rows: slice) -> None:
     """Write a neighbour's confidence and coverage, as far as its noise is its own."""
-    novelty: Array | np.float32 = np.float32(1)
+    coverage[index], confidence[index] = trust
     if window.repeated[index]:  # a frame nearer to the centre has the same samples
-        novelty = np.float32(0)
+        coverage[index] = confidence[index] = 0
     elif "fixed-noise" in window.stages and (link := window.links[index]) is not None:
         novelty = novelty_of(link.forward.vectors[rows])
-    coverage[index], confidence[index] = novelty * trust.coverage, novelty * trust.confidence
+        coverage[index] *= novelty
+        confidence[index] *= novelty
 
 
 def _warp_first_pass(
