@@ -91,7 +91,7 @@ def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, fir
     """
     covered = np.empty(valid.shape, np.bool_)
     given = (np.ascontiguousarray(layer) for layer in (flow, valid, measured))
-    run_bands(_cover, len(covered), *given, first_row, covered)
+    run_bands(_cover, len(covered), *given, bool(measured.all()), first_row, covered)
     return covered
 
 
@@ -102,12 +102,16 @@ def fill_uncovered(warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray)
 
 @njit(nogil=True, cache=True)
 def _cover(
-    first: int, last: int, flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, first_row: int, out: np.ndarray
-) -> None:
+    first: int, last: int, flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, whole: bool, first_row: int,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     height, width = measured.shape
     for y in range(first, last):
         for x in range(width):
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
+            if whole:
+                out[y, x] = valid[y, x] and place.inside
+                continue
             x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
             weights, share = weigh(place), np.float32(0)
             share += weights[0] if measured[y0, x0] else np.float32(0)
