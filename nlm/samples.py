@@ -281,6 +281,8 @@ def _limit_lamps(
             for c in range(channels):
                 brightest = least
                 for row in range(max(y - 2, 0), min(y + 3, height)):
+                    if brightest >= held[y, x, c]:
+                        break
                     for column in range(max(x - 2, 0), min(x + 3, width)):
                         brightest = max(brightest, max(samples[row, column, c], others[row, column, c]))
                 held[y, x, c] = min(held[y, x, c], brightest)
