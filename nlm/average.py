@@ -125,6 +125,13 @@ def check_strip(strip: Floats, window: Floats, top: int) -> None:
         raise ValueError(f"residuals: expected shape {expected} from row {top} on, got {strip.shape}")
 
 
+def check_colors(noisy: Floats, estimates: Floats) -> None:
+    """Raise ValueError unless a noisy image (H, W, 3) fits estimates (T, H, W, 3): loops are written for three."""
+    expected = (*estimates.shape[1:3], 3)
+    if noisy.shape != expected or estimates.shape[1:] != expected:
+        raise ValueError(f"noisy: expected shape {expected} like an estimate, got {noisy.shape}")
+
+
 def check_exposure(exposure: float) -> None:
     """Raise ValueError unless the exposure is positive and finite."""
     if not (exposure > 0 and np.isfinite(exposure)):

@@ -6,7 +6,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_exposure, check_window
+from nlm.average import check_colors, check_exposure, check_window
 from nlm.variance import gaussian_mean, ratio
 
 Floats = NDArray[np.float32]
@@ -51,8 +51,7 @@ def drift_weights(
     the part above 1.5 deviations of its own noise.
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
-    if noisy.shape != estimates.shape[1:]:
-        raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
+    check_colors(noisy, estimates)
     check_exposure(exposure)
     frames, height, width, _ = estimates.shape
     if frames < 5:
@@ -102,7 +101,7 @@ def _hold_out(
     sums: Floats,
 ) -> None:  # fmt: skip
     """Accumulate per cell: error increase with lag, Σ (lag² − 1), squared increase, confidence, disagreement."""
-    T, H, W, C = estimates.shape
+    T, H, W, _ = estimates.shape
     middle = T // 2
     for row in range(first, last):
         for y in range(max(row * _CELL - offset, 0), min((row + 1) * _CELL - offset, H)):
@@ -111,16 +110,16 @@ def _hold_out(
                 light = np.float32(0)
                 for t in range(T):
                     if t != middle:
-                        for c in range(C):
+                        for c in range(3):
                             light += max(estimates[t, y, x, c], np.float32(0))
-                light = light / np.float32((T - 1) * C) + exposure
+                light = light / np.float32((T - 1) * 3) + exposure
                 # of x / (x + exposure), as (e/l)·(1/l): e² would vanish in dark scenes
                 slope = exposure / light / light
                 limit = _LIMIT * light
                 for side in (-1, 1):
                     near = middle + side
                     close, away = np.float32(0), np.float32(0)
-                    for c in range(C):
+                    for c in range(3):
                         close += (slope * (min(noisy[y, x, c], limit) - estimates[near, y, x, c])) ** 2
                         away += (slope * (estimates[near, y, x, c] - estimates[middle, y, x, c])) ** 2
                     for lag in range(2, middle + 1):
@@ -129,7 +128,7 @@ def _hold_out(
                         if not both > 0:
                             continue
                         off = np.float32(0)
-                        for c in range(C):
+                        for c in range(3):
                             off += (slope * (min(noisy[y, x, c], limit) - estimates[far, y, x, c])) ** 2
                         off = both * (off - close)
                         if not np.isfinite(off + away):
@@ -144,7 +143,7 @@ def _hold_out(
 @njit(cache=True, nogil=True)
 def _pull(first: int, last: int, estimates: Floats, confidence: Floats, weight: Floats, top: int) -> None:
     """Write centre + m (estimate − centre) into the estimates of the rows from `top` on."""
-    T, _, W, C = estimates.shape
+    T, _, W, _ = estimates.shape
     middle = T // 2
     for y in range(top + first, top + last):
         for x in range(W):
@@ -158,6 +157,6 @@ def _pull(first: int, last: int, estimates: Floats, confidence: Floats, weight: 
             for t in range(T):
                 share = weight[t, y, x] * total / left
                 if t != middle:
-                    for c in range(C):
+                    for c in range(3):
                         centre = estimates[middle, y, x, c]
                         estimates[t, y, x, c] = centre + share * (estimates[t, y, x, c] - centre)

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import check_exposure, check_window
+from nlm.average import check_colors, check_exposure, check_window
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -79,8 +79,7 @@ def color_gates(
     """
     if estimates.ndim != 4 or estimates.shape[0] % 2 == 0:
         raise ValueError(f"estimates: expected (odd frames, height, width, channels), got {estimates.shape}")
-    if noisy.shape != estimates.shape[1:]:
-        raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
+    check_colors(noisy, estimates)
     check_exposure(exposure)
     centre_index = estimates.shape[0] // 2
     shape = noisy.shape
@@ -143,8 +142,7 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     Without V two lose 0.2 dB, without s² 0.2 to 0.6.
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
-    if noisy.shape != estimates.shape[1:]:
-        raise ValueError(f"noisy: expected shape {estimates.shape[1:]} like an estimate, got {noisy.shape}")
+    check_colors(noisy, estimates)
     check_exposure(exposure)
     sums = np.empty((5, *noisy.shape[:2]), np.float32)
     noisy = np.ascontiguousarray(noisy, np.float32)
@@ -162,13 +160,13 @@ def _compare_neighbours(
     first: int, last: int, estimates: Floats, noisy: Floats, confidence: Floats, exposure: np.float32, sums: Floats
 ) -> None:
     """Write Σ c (d − A)², Σ c, Σ c² / Σ c, Σ c · A² and (noisy − centre)² of each pixel."""
-    frames, _, width, channels = estimates.shape
-    zero, share = np.float32(0), np.float32(1) / np.float32(channels)
-    centre, mean = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    frames, _, width, _ = estimates.shape
+    zero, share = np.float32(0), np.float32(1) / np.float32(3)
+    centre, mean = np.empty(3, np.float32), np.empty(3, np.float32)
     for y in range(first, last):
         for x in range(width):
             total, squares, spread, level, noise = zero, zero, zero, zero, zero
-            for c in range(channels):
+            for c in range(3):
                 mean[c] = zero
                 centre[c] = exposure / (max(estimates[frames // 2, y, x, c], zero) + exposure)
                 d = centre[c] - exposure / (max(noisy[y, x, c], zero) + exposure)
@@ -178,7 +176,7 @@ def _compare_neighbours(
                 if t == frames // 2 or not weight > _LEAST_WEIGHT:
                     continue
                 square = zero
-                for c in range(channels):
+                for c in range(3):
                     d = centre[c] - exposure / (max(estimates[t, y, x, c], zero) + exposure)
                     mean[c] += weight * d
                     square += d * d
@@ -186,7 +184,7 @@ def _compare_neighbours(
                 squares += weight * weight
                 spread += weight * square
             rate = np.float32(1) / total if total > zero else zero
-            for c in range(channels):
+            for c in range(3):
                 level += mean[c] * mean[c] * rate
             finite = np.isfinite(spread + noise)
             sums[0, y, x] = max(spread - level, zero) * share if finite else zero
@@ -229,7 +227,7 @@ def _compare(
             flat[i] = here - there
         for x in range(image.shape[1]):
             finite = True
-            for c in range(image.shape[2]):
+            for c in range(3):
                 finite = finite and np.isfinite(image[y, x, c]) and np.isfinite(centre[y, x, c])
             both[y, x] = finite
             if not finite:
@@ -245,13 +243,12 @@ def _mean_square(x: Floats) -> Floats:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _square(first: int, last: int, x: Floats, mean: Floats) -> None:
-    channels = x.shape[2]
     for row in range(first, last):
         for column in range(x.shape[1]):
             total = np.float32(0)
-            for c in range(channels):
+            for c in range(3):
                 total += x[row, column, c] * x[row, column, c]
-            mean[row, column] = total / np.float32(channels)
+            mean[row, column] = total / np.float32(3)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

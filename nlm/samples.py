@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from loops.parallel import run_bands
-from nlm.average import channel_mean, check_strip, check_window
+from nlm.average import channel_mean, check_colors, check_strip, check_window
 from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
 from nlm.variance import gaussian_mean, ratio, second_differences
 
@@ -117,6 +117,7 @@ def average_neighbours(
     noisy : (H, W, 3) float32, radiance of the centre as rendered
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
+    check_colors(noisy, estimates)
     shape, noisy = estimates.shape[1:], np.ascontiguousarray(noisy, np.float32)
     mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
     for top, strip in [(0, estimates)] if residuals is None else residuals:
@@ -162,7 +163,7 @@ def blend_samples(
     ----------
     Firmino, Frisvad and Jensen, Progressive Denoising of Monte Carlo Rendered Images, 2022, doi:10.1111/cgf.14454
     """
-    if not picture.shape == noisy.shape == neighbours.mean.shape:
+    if not (*picture.shape[:2], 3) == picture.shape == noisy.shape == neighbours.mean.shape:
         raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     # Radiance per unit of relative error.
@@ -364,9 +365,9 @@ def _bin(light: np.float32, dark: np.float32, bins: int) -> tuple[int, np.float3
 def _level(image: Floats, y: int, x: int) -> np.float32:
     """Mean over channels of a pixel, at least 0."""
     total = np.float32(0)
-    for c in range(image.shape[2]):
+    for c in range(3):
         total += image[y, x, c]
-    return max(total / np.float32(image.shape[2]), np.float32(0))
+    return max(total / np.float32(3), np.float32(0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -452,7 +453,7 @@ def _average(
     modulation: Floats, noisy: Floats, out: SampleMean, top: int,
 ) -> None:  # fmt: skip
     mean, frames, trust, nearest = out
-    T, _, W, C = estimates.shape
+    T, _, W, _ = estimates.shape
     for row in range(first, last):
         y = top + row
         for x in range(W):
@@ -465,14 +466,14 @@ def _average(
                 if t == T // 2 or not weight > 0:
                     continue
                 level = np.float32(0)
-                for c in range(C):
+                for c in range(3):
                     level += estimates[t, y, x, c] + (residuals[t, row, x, c] if add else np.float32(0))
                 if not np.isfinite(level):
                     continue
                 total += weight
                 squares += np.float64(weight) ** 2
                 distance = np.float32(0)
-                for c in range(C):
+                for c in range(3):
                     value = estimates[t, y, x, c] + (residuals[t, row, x, c] if add else np.float32(0))
                     value *= modulation[y, x, c]
                     mean[y, x, c] += weight * value
@@ -484,7 +485,7 @@ def _average(
                 nearest[y, x] = second * np.float32(_SECOND * count - _FEW) if count > 1 else least / (1 + _WARPED)
                 centre = max(confidence[T // 2, y, x], geometry[T // 2, y, x])
                 trust[y, x] = min(greatest - centre, np.float32(1))
-                for c in range(C):
+                for c in range(3):
                     mean[y, x, c] /= np.float32(total)
 
 
@@ -494,7 +495,7 @@ def _multiply(first: int, last: int, noisy: Floats, neighbours: SampleMean, rate
     for y in range(first, last):
         for x in range(rate.shape[1]):
             together, alone = np.float32(0), np.float32(0)
-            for c in range(noisy.shape[2]):
+            for c in range(3):
                 together += noisy[y, x, c] * neighbours.mean[y, x, c]
                 alone += neighbours.mean[y, x, c] * neighbours.mean[y, x, c]
             weight = rate[y, x] * rate[y, x] * neighbours.trust[y, x]
@@ -508,7 +509,7 @@ def _energy(first: int, last: int, residual: Floats, rate: Floats, energy: Float
     for y in range(first, last):
         for x in range(rate.shape[1]):
             total = np.float32(0)
-            for c in range(residual.shape[2]):
+            for c in range(3):
                 total += (residual[y, x, c] * rate[y, x]) ** 2
             energy[y, x] = total / np.float32(36)
 
@@ -519,14 +520,14 @@ def _compare(
     rate: Floats, sums: tuple[Floats, ...],
 ) -> None:  # fmt: skip
     """Sum over channels, where neighbours are trusted: (n − p)(m − p), (m − p)², ((n − m)(m − p))², two variances."""
-    _, W, C = picture.shape
+    W = picture.shape[1]
     together, squares, products, temporal, nearest = sums
     for y in range(first, last):
         for x in range(W):
             if not neighbours.trust[y, x] > 0:
                 continue
             scale, product = rate[y, x], np.float32(0)
-            for c in range(C):
+            for c in range(3):
                 n, m, p = noisy[y, x, c], neighbours.mean[y, x, c] * factor[y, x], picture[y, x, c]
                 n_p = min(max(scale * (n - p), -_LIMIT), _LIMIT)
                 m_p = min(max(scale * (m - p), -_LIMIT), _LIMIT)
@@ -554,7 +555,7 @@ def _blend_shared(
             found = together[y, x] - np.float32(_DEVIATIONS) * np.sqrt(noise[y, x])
             share = found / squares[y, x] if squares[y, x] > zero else zero
             share = min(max(share, zero), one) * neighbours.trust[y, x]
-            for c in range(picture.shape[2]):
+            for c in range(3):
                 own = picture[y, x, c]
                 blended[y, x, c] = own + share * (neighbours.mean[y, x, c] * factor[y, x] - own)
 
@@ -568,7 +569,7 @@ def _compare_blended(
     for y in range(first, last):
         for x in range(rate.shape[1]):
             total = np.float32(0)
-            for c in range(blended.shape[2]):
+            for c in range(3):
                 difference = (noisy[y, x, c] - blended[y, x, c]) * rate[y, x]
                 total += min(max(difference, -_LIMIT), _LIMIT) ** 2
             error[y, x] = total
@@ -594,5 +595,5 @@ def _blend_centre(
             # Divided twice: the square of an error below 1e-19 would vanish.
             unsure = np.sqrt(fourths[y, x] / error / error / _PIXELS)
             share = min(max(one - (one + np.float32(_UNSURE) * unsure) * noise / error, zero), one)
-            for c in range(blended.shape[2]):
+            for c in range(3):
                 blended[y, x, c] += share * (noisy[y, x, c] - blended[y, x, c])
