@@ -111,9 +111,9 @@ def align(
             estimates /= modulation
             confidence = trust_light(confidence, warped.coverage, color_gate(estimates, own, bright.exposure), stages)
             if "gate" in stages:
-                confidence[np.arange(len(confidence)) != middle] *= agreement_weight(
-                    estimates, own, confidence, bright.exposure
-                )
+                agreement = agreement_weight(estimates, own, confidence, bright.exposure)
+                for neighbours in (confidence[:middle], confidence[middle + 1 :]):
+                    neighbours *= agreement
         elif "gate" in stages:
             confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
         weight = sides = found = residuals = None
@@ -197,9 +197,11 @@ def align_results(
         gates = color_gates(light, noisy, exposure, FINISHED, floor=FINISHED_FLOOR, detail=FINISHED_DETAIL)
         alike, confidence = (trust_light(confidence, coverage, gate, stages, agreeing=0.0) for gate in gates)
         local = stillness.local[padded]
-        confidence = alike + local * (confidence - alike)
+        confidence -= alike
+        confidence *= local
+        confidence += alike
         relight(results, alike, confidence, exposure, first_row=padded.start)
-        confidence[[0, 2]] *= stillness.whole * (1 + local) / 2
+        confidence[::2] *= stillness.whole * (1 + local) / 2
     return results[:, inner], confidence[:, inner]
 
 

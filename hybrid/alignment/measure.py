@@ -341,7 +341,7 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
     differences = []
     for guide, other in _guides(here, there):
         warped = other[grid] if vectors is None else _warp_block(other, vectors[0], grid)
-        differences.append(np.abs(guide[grid] - warped).max(axis=-1))
+        differences += [*np.moveaxis(np.abs(guide[grid] - warped), -1, 0)]
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
 
 
