@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -31,6 +32,10 @@ from hybrid.runtime.timing import Timings
 
 Array = NDArray[np.float32]
 Value = TypeVar("Value")
+Shown = TypeVar("Shown", PreparedFrame | None, Array | None)
+
+# A frame with less than this share of another's light is black beside it: half floats hold no more of it.
+FAINT = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +158,11 @@ class FrameStream:
         pairs = [(self.frame(n), self.denoised(n) if with_first_pass else None) for n in numbers]
         frames, denoised = zip(*pairs, strict=True)
         window = self._collect(number, numbers, frames, denoised if with_first_pass else None)
-        return replace(window, limited=tuple(map(self._limited, numbers))) if with_first_pass else window
+        if not with_first_pass:
+            return window
+        found = [(self._limited(n), np.float32(self._gain(n, number))) for n in numbers]
+        limited = (part and part._replace(exposure=part.exposure * gain) for part, gain in found)
+        return replace(window, limited=tuple(limited))
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
         """The window of a frame and its two neighbours, with these results (H, W, 3) in the place of a first pass."""
@@ -195,6 +204,9 @@ class FrameStream:
         repeated = tuple(
             n != number and self._repeats(n, n + (self.shot.step if n < number else -self.shot.step)) for n in numbers
         )
+        gains = [self._gain(n, number) for n in numbers]
+        frames = tuple(map(self._lit, frames, gains))
+        denoised = denoised and tuple(map(self._lit, denoised, gains))
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
 
     def _composed(
@@ -284,6 +296,19 @@ class FrameStream:
         """Whether one of two neighbouring frames is the other once more."""
         first, second = sorted((a, b))
         return self.shot.has(first) and self.shot.has(second) and self._pair_facts(first, second).repeated
+
+    def _gain(self, number: int, centre: int) -> float:
+        """Light of a centre over that of another frame of its window, where most of the picture changes; else 1."""
+        first, last = sorted((number, centre))
+        gain = math.prod(pair.gain for pair in self.measurements(range(first, last + 1, self.shot.step))[1])
+        gain = gain if number < centre else 1 / gain
+        return gain if FAINT < gain < 1 / FAINT else 1.0
+
+    def _lit(self, shown: Shown, gain: float) -> Shown:
+        """A frame, or the picture of one, in the light of the centre."""
+        if shown is None or gain == 1:
+            return shown
+        return self.keeper.keep(shown.lit(gain) if isinstance(shown, PreparedFrame) else shown * np.float32(gain))
 
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
         plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)

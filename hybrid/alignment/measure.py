@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from flow.guide import tone_map
 from flow.tvl1 import rough_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
-from hybrid.alignment.transfer import compress, measure_exposure, remodulate
+from hybrid.alignment.transfer import NO_LIGHT, compress, measure_exposure, remodulate
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
 
@@ -82,6 +82,7 @@ class PairFacts:
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
     cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
+    gain: float = 1.0  # light of the later frame over that of the earlier one, where that explains most of the change
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
+    gain = _gain(*smalls, reduced, unexplained)
     return PairFacts(
         numbers=(here.number, there.number),
         vectors=vectors is not None,
@@ -158,6 +160,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=changed > CUT and _is_cut(here, there, smalls, vectors),
         repeated=repeats(here.irradiance, there.irradiance),
+        gain=gain,
     )
 
 
@@ -285,6 +288,21 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
     # noise brings one in a thousand.
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
+
+
+def _gain(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None, changed: float) -> float:
+    """Median light of the second of two frames over that of the first, along `vectors`; 1 where that explains little.
+
+    Little is less than half of the `changed` share, or where the median pixel does not change.
+    """
+    other, inside = (there.light, here.valid) if vectors is None else warp(there.light, vectors[0])
+    first, second = channel_mean(here.light), channel_mean(other)
+    lit = inside & here.valid & (np.minimum(first, second) > NO_LIGHT)
+    if changed <= 0.5 or not lit.any():
+        return 1.0
+    gain = np.median(second[lit] / first[lit])
+    alike = replace(there, irradiance=there.irradiance / gain, light=there.light / gain)
+    return float(gain) if _changed(here, alike, vectors) < 0.5 * changed else 1.0
 
 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -62,6 +62,14 @@ class PreparedFrame:
     # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
+
+    def lit(self, gain: float) -> PreparedFrame:
+        """Return the frame with `gain` times its light, as a neighbour of a frame with that much more light."""
+        parts = {name for found in self.passes.sums for name in (*found.parts, found.whole)}
+        lights, factor = parts | {*self.passes.textured, *self.pass_colors}, np.float32(gain)
+        aovs = {name: layer * factor if name in lights else layer for name, layer in self.aovs.items()}
+        variance = None if self.variance is None else self.variance * factor * factor
+        return replace(self, irradiance=self.irradiance * factor, variance=variance, aovs=aovs)
 
     @cached_property
     def light(self) -> Array:

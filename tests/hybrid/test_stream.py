@@ -185,3 +185,26 @@ def test_a_window_is_planned_once(tmp_path, monkeypatch):
     context = Context(first_pass=False, radius=2)
     assert stream.plan(stream.around(1006), context).stages == window.stages
     assert decided.count(context) == 5  # the window, and the pairs of neighbours in it
+
+
+def test_neighbours_have_the_light_of_the_centre(tmp_path):
+    """They were left out where light changes as a whole: fades lost 4 dB against what went in."""
+
+    def fade(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32(8.0**index)
+
+    shot = open_shot(Scene(frames=4, noise=0.1).write(tmp_path, edit=fade))
+    frames = FrameStream(shot, Rules(), radius=1).window(1003).frames
+    means = [there.irradiance.mean() for there in frames]
+    np.testing.assert_allclose(means, means[1], rtol=0.05)  # other parts of the wall
+    assert means[1] == pytest.approx(FrameStream(shot, Rules()).frame(1003).irradiance.mean())
+
+
+def test_a_part_that_changes_leaves_the_light_of_others_alone(tmp_path):
+    def blink(index, layers):
+        layers["ViewLayer.Combined"][:, :8] *= np.float32(1 + 3 * (index % 2))
+
+    stream = FrameStream(open_shot(Scene(step=(0, 0)).write(tmp_path, edit=blink)), Rules(), radius=1)
+    assert all(
+        there is stream.frame(n) for n, there in zip((1001, 1002, 1003), stream.window(1002).frames, strict=True)
+    )
