@@ -167,7 +167,7 @@ def blend_samples(
         raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     # Radiance per unit of relative error.
-    light = gaussian_mean(channel_mean(picture), 2.0) + np.float32(_DARK * exposure)
+    light = _light_around(picture, noisy, exposure) + np.float32(_DARK * exposure)
     rate, height = np.divide(1, light, out=np.zeros_like(light), where=light > 0), len(picture)
     factor, near = _relative_light(noisy, neighbours, rate)
     sums = tuple(np.zeros_like(light) for _ in range(5))
@@ -200,6 +200,18 @@ def blend_samples(
     certainty = gaussian_mean(error, _SIGMA), fourth, gaussian_mean(alone, _SIGMA)
     run_bands(_blend_centre, height, noisy, certainty, spatial, neighbours.trust, blended)
     return blended
+
+
+def _light_around(picture: Floats, noisy: Floats, exposure: float) -> Floats:
+    """Mean light of a picture (H, W) over σ = 2 pixels, and of lamps beyond 64 exposures their own.
+
+    A lamp excuses no error of the pixels beside it, of which a picture may make lamps.
+    """
+    level, bright = channel_mean(picture), np.float32(_GLARE * exposure)
+    level = np.where(level > bright, np.minimum(level, channel_mean(noisy)), level)
+    lamp = level > bright
+    around, counted = (gaussian_mean(np.where(lamp, np.float32(0), part), 2.0) for part in (level, np.float32(1)))
+    return np.where(lamp, level, ratio(around, counted))
 
 
 def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list[Floats]:

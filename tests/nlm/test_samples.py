@@ -229,6 +229,17 @@ def test_the_variance_of_noise_that_a_pixel_filter_spreads_is_measured(spread: f
         assert found.mean() == pytest.approx(3 * 0.05**2 * noise.var(), rel=0.2)
 
 
+def test_light_of_a_lamp_in_the_pixels_beside_it_is_taken_back() -> None:
+    """Beside a sun of 5,000 any error counted as small, and lit rings of two pixels stayed."""
+    truth = np.full_like(ONES, 0.5)
+    truth[40:46, 60:66] = 5000
+    spilt = truth.copy()
+    spilt[38:48, 58:68] = np.maximum(truth[38:48, 58:68], 3)
+    own, sides = window(truth, 0.01)
+    beside = np.abs(blend_samples(spilt, own, sides, 0.5) - own)[truth < 1]
+    assert beside.max() < 0.1
+
+
 def test_a_wrong_outline_is_mended_where_the_alignment_is_off_too() -> None:
     """Along an outline frames differ by more than their noise; the noise beside it is the same."""
     truth = np.where(np.arange(SHAPE[1]) < SHAPE[1] // 2, 0.2, 1.0).astype(np.float32)
