@@ -280,7 +280,9 @@ class FrameDenoiser:
                 if not counted.all():
                     fresh = counted if moving is None else counted & ~moving[1]
                     sides = sides._replace(nearest=sides.nearest * fresh)
-                color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance)
+                # Noise that the albedo shares with the color is none of their quotient.
+                albedo = frame.albedo if frame.demodulated and "prefilter" not in result.plan.stages else None
+                color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance, albedo)
         color = limit_lamps(color, shown, exposure)
         if moving is not None:
             color = _where(~moving[0], color, rendered)

@@ -79,6 +79,8 @@ _SECOND, _FEW = 0.33, 0.28
 # changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
+# Albedo below that of any surface, by which light is divided in place of black.
+_BLACK = np.float32(1e-3)
 # Rows whose second differences are made at a time.
 _STRIP = 64
 # Cells per deviation of a mean.
@@ -128,7 +130,12 @@ def average_neighbours(
 
 
 def blend_samples(
-    picture: Floats, noisy: Floats, neighbours: SampleMean, exposure: float, variance: Floats | None = None
+    picture: Floats,
+    noisy: Floats,
+    neighbours: SampleMean,
+    exposure: float,
+    variance: Floats | None = None,
+    albedo: Floats | None = None,
 ) -> Floats:
     """Blend samples into a denoised picture where the picture is wrong beyond doubt.
 
@@ -141,6 +148,7 @@ def blend_samples(
     neighbours : SampleMean
     exposure : float
     variance : (H, W, 3) float32, optional, variance of `noisy` from the renderer, used where no neighbour is trusted
+    albedo : (H, W, 3) float32, optional, at least 0, without noise
 
     Notes
     -----
@@ -183,7 +191,7 @@ def blend_samples(
     del together, squares, products, scatter, noise, means, factor
     around, nearest = gaussian_mean(temporal, _SIGMA), gaussian_mean(nearest, _SIGMA)
     temporal *= np.divide(np.minimum(nearest, around), around, out=np.ones_like(around), where=around > 0)
-    spatial = spatial_variance(noisy, blended, rate)
+    spatial = spatial_variance(noisy, blended, rate, albedo)
     if variance is None:
         alone = np.float32(_ALONE) * spatial
         red, green, blue = np.moveaxis(noisy != 0, -1, 0)
@@ -225,34 +233,48 @@ def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list
     return factors
 
 
-def spatial_variance(noisy: Floats, picture: Floats, rate: Floats) -> Floats:
+def spatial_variance(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats | None = None) -> Floats:
     """Variance (H, W) of a frame's noise, relative to the light (`rate` is one over that), summed over channels.
 
-    The lesser of the high-pass energies of ``noisy`` and ``noisy − picture``: detail of the frame adds to the first,
-    detail that the picture has lost or invented to the second (Immerkær, as `nlm.variance.variance_from_residual`).
+    The least of the high-pass energies of ``noisy``, ``noisy − picture`` and, times the albedo, ``noisy / albedo``:
+    detail of the frame adds to the first, detail that the picture has lost or invented to the second, that of the
+    light to the third (Immerkær, as `nlm.variance.variance_from_residual`).
     A renderer's pixel filter makes noise smooth, and these energies up to 150 times too small; the median over the
     frame of the same energies at pixels 6 apart, over these, is the factor.
     """
-    some, less = np.s_[::_APART, ::_APART], (None, picture)
-    near = np.minimum(*(gaussian_mean(_energy_of(noisy, rate, part), _SIGMA) for part in less))
-    few = noisy[some], np.ascontiguousarray(rate[some])
-    far = np.minimum(*(gaussian_mean(_energy_of(*few, part), 2.0) for part in (None, picture[some])))
+    some = np.s_[::_APART, ::_APART]
+    near = _least_energy(noisy, picture, rate, albedo)
+    few, shown, rates = (np.ascontiguousarray(layer[some]) for layer in (noisy, picture, rate))
+    far = _least_energy(few, shown, rates, None if albedo is None else albedo[some], 2.0)
     around = gaussian_mean(near[some], 2.0)
     factors = np.divide(far, around, out=np.zeros_like(far), where=around > 0)
     return near * np.float32(max(np.median(factors[factors > 0]), 1) if factors.any() else 1)
 
 
-def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None) -> Floats:
+def _least_energy(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats | None, sigma: float = _SIGMA) -> Floats:
+    """Least Gaussian mean of the energies of a frame, of its difference from a picture, and of its light."""
+    ways = [(None, None), (picture, None), *([] if albedo is None else [(None, albedo)])]
+    least = np.full_like(rate, np.inf)
+    for way in ways:
+        np.minimum(least, gaussian_mean(_energy_of(noisy, rate, *way), sigma), out=least)
+    return least
+
+
+def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floats | None) -> Floats:
     """Squares of second differences relative to the light, summed over channels: of white noise its variance.
 
-    Of an image, or of its difference from a picture; in strips, which stay in the caches.
+    Of an image, of its difference from a picture, or of its light; in strips, which stay in the caches.
     """
     energy = np.empty(rate.shape, np.float32)
     for top in range(0, len(rate), _STRIP):
         rows, bottom = slice(top, top + _STRIP), min(top + _STRIP, len(rate))
         outer = slice(max(top - 1, 0), bottom + 1)
         strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
+        if albedo is not None:
+            strip = strip / np.maximum(albedo[outer], _BLACK)
         found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
+        if albedo is not None:
+            found = found[: bottom - top] * np.maximum(albedo[rows], _BLACK)
         run_bands(_energy, bottom - top, found, rate[rows], energy[rows])
     return energy
 
