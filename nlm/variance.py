@@ -128,7 +128,8 @@ def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confid
             guides, trusted = check_window(window[:, :, columns], confidence[:, rows, columns], "confidence")
             temporal, trust = _temporal_variance(guides, trusted)
             variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
-            run_bands(_lesser_variance, len(trust), temporal, spatial[rows, columns], trust, variance, noisy)
+            lone = np.ascontiguousarray(spatial[rows, columns])  # a view would be compiled for once more
+            run_bands(_lesser_variance, len(trust), temporal, lone, trust, variance, noisy)
             filtered[rows, columns] = joint_nlm(
                 guides, variance, confidence=trusted, radius=1, patch_radius=1, k=1.0, where=noisy
             )
