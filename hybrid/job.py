@@ -20,7 +20,15 @@ from hybrid.files.replace import check_outputs, temporary_folder
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import PACKAGES, versions
-from hybrid.first_pass import OIDN_MODE_OF_PRESET, OIDN_MODES, SPECS, FirstPassSource, PerFrame, find_first_pass
+from hybrid.first_pass import (
+    NETWORKS,
+    OIDN_MODE_OF_NETWORKS,
+    OIDN_MODES,
+    SPECS,
+    FirstPassSource,
+    PerFrame,
+    find_first_pass,
+)
 from hybrid.memory import MemoryPlan, parse_size, plan_memory
 from hybrid.oidn import find_device
 from hybrid.option_texts import option_texts
@@ -38,7 +46,7 @@ LOG = logging.getLogger("ravg")
 
 # Presets of each method, the default first.
 PRESETS: dict[str, tuple[str, ...]] = {
-    "network": ("fast", "balanced", "quality", "auto"),
+    "network": (*NETWORKS, "auto"),
     "classical": ("standard", "draft", "final"),
     "pooled": ("pooled",),
 }
@@ -47,7 +55,7 @@ FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-
 CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
 LEAST = {"passes": 1, "tile": 16, "threads": 1}
 OF_NETWORKS = ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile")  # options that only a network has
-MEASURED = tuple(reversed(OIDN_MODE_OF_PRESET))  # presets that a budget chooses from, the most accurate first
+MEASURED = tuple(reversed(NETWORKS))  # presets that a budget chooses from, the most accurate first
 
 
 @dataclass(frozen=True)
@@ -166,8 +174,8 @@ class DenoiseOptions:
 
     @property
     def oidn_mode(self) -> str:
-        """The mode of OIDN in the first pass "auto"."""
-        return "oidn-clean" if self.weights is not None else OIDN_MODE_OF_PRESET.get(self.preset, "oidn-clean")
+        """The mode of OIDN in the first pass "auto": the same for given weights and for those that ship."""
+        return OIDN_MODE_OF_NETWORKS if self.method == "network" else "oidn-clean"
 
 
 DEFAULTS = {entry.name: entry.default for entry in fields(DenoiseOptions)}

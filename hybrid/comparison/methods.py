@@ -11,7 +11,14 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Array, Frame, Frames, MappedShot
 from hybrid.files.shots import Shot
-from hybrid.first_pass import OIDN_MODE_OF_PRESET, Backends, denoise_frame_oidn, named_first_pass, read_denoised
+from hybrid.first_pass import (
+    NETWORKS,
+    OIDN_MODE_OF_NETWORKS,
+    Backends,
+    denoise_frame_oidn,
+    named_first_pass,
+    read_denoised,
+)
 from hybrid.oidn import Quality
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
@@ -87,7 +94,7 @@ class WindowSettings:
             from hybrid.neural import denoise_bundled  # torch may be absent
 
             backends = Backends(bundled=denoise_bundled)
-        chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_PRESET["fast"], backends=backends)
+        chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
         refine = partial(refine_flow, **self.solver)
         return FrameStream(frames, rules, chosen.first_pass, radius=self.radius, refine=refine)
 
@@ -228,7 +235,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "pooled": _aligned("Gated averages", pool_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("fast", "bundled"),
-    **{f"network {preset}": _network(preset, mode) for preset, mode in OIDN_MODE_OF_PRESET.items()},
+    **{f"network {preset}": _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast"),
     "OIDN high": _oidn("high"),

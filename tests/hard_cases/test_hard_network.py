@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from hybrid.alignment.transfer import measure_exposure  # noqa: E402
 from hybrid.comparison import metrics  # noqa: E402
-from hybrid.first_pass import OIDN_MODE_OF_PRESET  # noqa: E402
+from hybrid.first_pass import NETWORKS  # noqa: E402
 from network import robust_unet  # noqa: E402
 from network.checkpoint import load_model, shipped_weights  # noqa: E402
 from network.paper import models as paper  # noqa: E402
@@ -159,7 +159,7 @@ def test_the_gradient_of_the_whole_network_is_finite(level, preset):
 
 
 @pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
-@pytest.mark.parametrize("preset", [None, *OIDN_MODE_OF_PRESET], ids=["unet", *OIDN_MODE_OF_PRESET])
+@pytest.mark.parametrize("preset", [None, *NETWORKS], ids=["unet", *NETWORKS])
 def test_a_firefly_changes_little_around_it_and_nothing_far_away(preset, bfloat16):
     """92 pixels are what a unet can see in theory, 112 what a trunk can."""
     torch.manual_seed(0)

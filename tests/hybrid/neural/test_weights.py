@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 
 from hybrid.comparison.metrics import mean_bias, psnr
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import OIDN_MODE_OF_PRESET, Classical
+from hybrid.first_pass import NETWORKS, Classical
 from hybrid.neural import open_network
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
@@ -52,7 +52,7 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
     assert final > robust + 2
 
 
-@pytest.mark.parametrize("preset", [*OIDN_MODE_OF_PRESET, "tkpcn"])
+@pytest.mark.parametrize("preset", [*NETWORKS, "tkpcn"])
 def test_weights_reach_what_their_card_says(reference, preset):
     path = TKPCN_WEIGHTS if preset == "tkpcn" else shipped_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
