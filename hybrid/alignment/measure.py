@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -52,6 +52,9 @@ TILE = 32
 # optical flow leaves more than this share of the change. A change of light does as much, but leaves the guides as they
 # are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
 CUT = 0.5
+# Logarithm of a gain that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
+# lost 1.5 dB where the noise is 1 %.
+SLIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
-    gain = _gain(*smalls, reduced, unexplained)
+    gain = _gain(*smalls, reduced)
     return PairFacts(
         numbers=(here.number, there.number),
         vectors=vectors is not None,
@@ -290,19 +293,25 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
 
 
-def _gain(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None, changed: float) -> float:
+def _gain(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Median light of the second of two frames over that of the first, along `vectors`; 1 where that explains little.
 
-    Little is less than half of the `changed` share, or where the median pixel does not change.
+    Changes are medians of logarithms in 4×6 areas, which average noise. A gain that leaves less than half of them, or a
+    quarter of slight ones, is one of the whole picture: on rendered shots of 8 to 512 samples 0.56 to 1.5 are left
+    where light moves, and 0.04 to 0.5 of fades by 0.7.
     """
     other, inside = (there.light, here.valid) if vectors is None else warp(there.light, vectors[0])
     first, second = channel_mean(here.light), channel_mean(other)
     lit = inside & here.valid & (np.minimum(first, second) > NO_LIGHT)
-    if changed <= 0.5 or not lit.any():
+    change = np.log(np.divide(second, first, out=np.ones_like(first), where=lit))
+    strips = zip(np.array_split(change, 4), np.array_split(lit, 4), strict=True)
+    parts = [zip(*(np.array_split(half, 6, axis=1) for half in strip), strict=True) for strip in strips]
+    areas = np.array([np.median(part[known]) for row in parts for part, known in row if known.any()])
+    gain = np.median(areas) if len(areas) else 0.0
+    most = 0.25 if abs(gain) < SLIGHT else 0.5
+    if len(areas) < 6 or np.median(np.abs(areas - gain)) >= most * np.median(np.abs(areas)):
         return 1.0
-    gain = np.median(second[lit] / first[lit])
-    alike = replace(there, irradiance=there.irradiance / gain, light=there.light / gain)
-    return float(gain) if _changed(here, alike, vectors) < 0.5 * changed else 1.0
+    return float(np.exp(gain))
 
 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:

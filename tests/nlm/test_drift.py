@@ -109,6 +109,7 @@ def test_pulling_is_averaging_with_other_weights(rng):
     [
         ("window", (np.zeros((4, 8, 8, 3)), np.zeros((8, 8, 3)), np.ones((4, 8, 8)), 1.0)),
         ("noisy", (np.zeros((5, 8, 8, 3)), np.zeros((8, 9, 3)), np.ones((5, 8, 8)), 1.0)),
+        ("noisy", (np.zeros((5, 8, 8, 1)), np.zeros((8, 8, 1)), np.ones((5, 8, 8)), 1.0)),
         ("exposure", (np.zeros((5, 8, 8, 3)), np.zeros((8, 8, 3)), np.ones((5, 8, 8)), 0.0)),
     ],
 )

@@ -80,6 +80,7 @@ def test_hard_values_do_not_spread(rng):
     [
         ("estimates", (np.zeros((2, 8, 8, 3)), np.zeros((8, 8, 3)), 1.0)),
         ("noisy", (np.zeros((3, 8, 8, 3)), np.zeros((8, 9, 3)), 1.0)),
+        ("noisy", (np.zeros((3, 8, 8, 1)), np.zeros((8, 8, 1)), 1.0)),
         ("exposure", (np.zeros((3, 8, 8, 3)), np.zeros((8, 8, 3)), 0.0)),
     ],
 )
@@ -204,6 +205,7 @@ def test_a_pixel_that_is_not_finite_changes_only_what_is_near(outlines, value):
     [
         ({"noisy": np.zeros((3, 4, 3))}, "noisy: expected shape"),
         ({"confidence": np.zeros((3, 2, 4))}, "confidence: expected shape"),
+        ({"estimates": np.zeros((3, 4, 4, 2)), "noisy": np.zeros((4, 4, 2))}, "noisy: expected shape"),
         ({"exposure": 0.0}, "exposure: expected a positive number"),
     ],
 )
