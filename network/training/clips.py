@@ -368,10 +368,7 @@ def split_by_shot(clips: Clips, validation: Sequence[str]) -> tuple[Clips, Clips
 
 
 class _Variation(NamedTuple):
-    """How a sample varies: flips, transposition, permuted and scaled channels; normals get a signed permutation.
-
-    Light is scaled by up to 2^±s in each channel, surfaces by 2^−2s to 1: neutral rooms also stand for saturated ones.
-    """
+    """How a sample varies: flips, transposition, permuted channels; normals, of any space, get a signed permutation."""
 
     flips: tuple[int, ...]
     transpose: bool
@@ -379,29 +376,19 @@ class _Variation(NamedTuple):
     axes: Tensor
     signs: Tensor
     stops: float
-    light: Tensor
-    surface: Tensor
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, exposure_stops: float, color_stops: float) -> "_Variation":
+    def draw(cls, rng: np.random.Generator, exposure_stops: float) -> "_Variation":
         across, down, transpose = rng.random(3) < 0.5
         channels = torch.from_numpy(rng.permutation(3))
         axes, signs = torch.from_numpy(rng.permutation(3)), torch.from_numpy(rng.choice((-1.0, 1.0), (3, 1, 1))).float()
         flips = tuple(axis for axis, flipped in ((-1, across), (-2, down)) if flipped)
-        stops = rng.uniform(-exposure_stops, exposure_stops)
-        # Half of all samples keep their colors, as most pictures are of about neutral colors.
-        reach = color_stops * (rng.random() < 0.5)
-        light, surface = (
-            torch.from_numpy(2 ** (reach * rng.uniform(*span, (3, 1, 1)))).float() for span in ((-1, 1), (-2, 0))
-        )
-        return cls(flips, bool(transpose), channels, axes, signs, stops, light, surface)
+        return cls(flips, bool(transpose), channels, axes, signs, rng.uniform(-exposure_stops, exposure_stops))
 
     def apply(self, value: Tensor, kind: str) -> Tensor:
         """Vary a layer of a kind, ``(..., C, H, W)``, or a number."""
-        if kind == "exposure":
-            return value * self.light.mean() * 2**self.stops
-        if kind == "gain":
-            return value / (self.light * self.surface).mean() * 2**-self.stops
+        if kind in ("exposure", "gain"):
+            return value * 2 ** (self.stops if kind == "exposure" else -self.stops)
         value = value.flip(self.flips)
         value = value.transpose(-2, -1) if self.transpose else value
         if kind == "normal":
@@ -411,8 +398,7 @@ class _Variation(NamedTuple):
             value = value * torch.tensor(signs)[:, None, None]
             value = value.flip(0) if self.transpose else value
         elif kind != "share":
-            scales = {"irradiance": self.light, "radiance": self.light * self.surface, "color": self.surface}
-            value = value[..., self.channels, :, :] * scales[kind]
+            value = value[..., self.channels, :, :]
         return value.contiguous()
 
 
@@ -464,7 +450,7 @@ class Samples(Dataset[Sample]):
         assert members is not None  # clips without neighbours are left out
         clips = [self.clips.read(member, level, target) for member in members]
         y, x = self._place(clips[0], rng)
-        variation = _Variation.draw(rng, config.exposure_stops, config.color_stops)
+        variation = _Variation.draw(rng, config.exposure_stops)
         samples = [self._varied(clip, y, x, variation) for clip in clips]
         frames = len(clips[0].color)
         if frames > 1 and rng.random() < config.drop_frames:

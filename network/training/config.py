@@ -18,7 +18,6 @@ class SamplerConfig:
     pseudo: float = 0.5
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure given to the network is off by up to this, either way
-    color_stops: float = 2.0  # in half of all samples each channel of the light is scaled by up to this, either way
 
     def __post_init__(self) -> None:
         for name in ("crop", "sets"):

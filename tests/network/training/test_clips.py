@@ -36,7 +36,7 @@ from network.training.config import SamplerConfig
 pytestmark = pytest.mark.neural
 
 #: Nothing random but the clip, the level, the target and the orientation.
-PLAIN = SamplerConfig(crop=16, sets=1, drop_frames=0, fireflies=0, exposure_stops=0, color_stops=0)
+PLAIN = SamplerConfig(crop=16, sets=1, drop_frames=0, fireflies=0, exposure_stops=0)
 SPP = (8, 8, 2)
 
 
@@ -383,29 +383,6 @@ def test_variations_do_what_they_say(tmp_path: Path) -> None:
     assert float(bright.max()) > 2  # without, below 1.1 / 2
     away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n].exposure) for n in range(20)]
     assert 0.25 * 0.25 <= min(away) < max(away) <= 4
-
-
-def test_scaled_colors_keep_the_relations_of_light_and_surface(tmp_path: Path) -> None:
-    clip = make_clip()
-    ones = torch.ones_like(clip.modulation)
-    radiance = 0.8 * ones
-    clip = replace(
-        clip, color=0.8 * torch.ones_like(clip.color), modulation=ones, clean_albedo=ones, pseudo_reference=radiance
-    )
-    write_shards(tmp_path, "s", SPP, [replace(clip, pseudo_reference=None, reference=radiance)])
-    samples = [Samples(open_clips(tmp_path), replace(PLAIN, color_stops=2), 0)[number] for number in range(40)]
-    tinted = [sample for sample in samples if float(sample.target.std((1, 2)).max()) == 0 and sample.target.std() > 0]
-    assert 10 < len(tinted) < 30  # about half
-    for sample in samples:
-        # Radiance is light times surface; the whole of a clip is scaled alike.
-        torch.testing.assert_close(sample.color * sample.modulation, sample.target.expand_as(sample.color))
-        torch.testing.assert_close(sample.clean_albedo, sample.modulation)
-    assert max(float(sample.target.max() / sample.target.min()) for sample in samples) > 8
-    assert max(float(sample.modulation.max()) for sample in samples) <= 1
-    # Scaled as a whole, irradiance and exposure stay in proportion.
-    shares = [float(sample.color.mean() / sample.exposure) for sample in samples]
-    levels = {round(share, 2) for share in shares}
-    assert levels == {0.4, 0.8, 1.6}  # 0.8 over the levels' exposures over the last: 2 / 2, 1 / 2, 0.5 / 2
 
 
 def test_a_target_is_a_pseudo_reference_as_often_as_is_asked_for(tmp_path: Path) -> None:

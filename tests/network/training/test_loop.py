@@ -137,7 +137,7 @@ def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> Non
         pair = [replace(clip, reference=target, linked=torch.ones(2)) for target in targets]
         pair[1] = replace(pair[1], linked=torch.zeros(2))
         write_shards(folder, "s", (4, 4), pair)
-        sampler = replace(config.sampler, fireflies=0, drop_frames=0, exposure_stops=0, color_stops=0)
+        sampler = replace(config.sampler, fireflies=0, drop_frames=0, exposure_stops=0)
         samples = Samples(open_clips(folder), sampler, 0, image_loss(config), neighbours=True)
         batch = torch.utils.data.default_collate([samples[0]])
         plain = Sample(*(pair.flatten(0, 1) for pair in batch))
