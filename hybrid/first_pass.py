@@ -39,7 +39,7 @@ OIDN_MODES: dict[str, dict[str, Any]] = {
 SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
 # Presets of networks that ship, the fastest first, and the mode of OIDN that "auto" takes for all networks: with "oidn"
 # none gains more than 0.2 dB. With "oidn-clean", whose network is the large one, `fast` gains 0.8 to 1.1 dB and
-# `balanced` 0.5 to 0.6; `quality`, which has that network itself, is better still and costs less.
+# `balanced` 0.5 to 0.6; `quality`, which has that network itself, is 0.3 to 0.5 dB better still.
 NETWORKS = ("fast", "balanced", "quality")
 OIDN_MODE_OF_NETWORKS = "oidn-fast"
 

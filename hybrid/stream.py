@@ -298,7 +298,7 @@ class FrameStream:
         return self.shot.has(first) and self.shot.has(second) and self._pair_facts(first, second).repeated
 
     def _gain(self, number: int, centre: int) -> float:
-        """Light of a centre over that of another frame of its window, where most of the picture changes; else 1."""
+        """Light of a centre over that of another frame of its window, where one factor explains the change; else 1."""
         first, last = sorted((number, centre))
         gain = math.prod(pair.gain for pair in self.measurements(range(first, last + 1, self.shot.step))[1])
         gain = gain if number < centre else 1 / gain

@@ -152,7 +152,6 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
-    gain = _gain(*smalls, reduced)
     return PairFacts(
         numbers=(here.number, there.number),
         vectors=vectors is not None,
@@ -163,7 +162,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=changed > CUT and _is_cut(here, there, smalls, vectors),
         repeated=repeats(here.irradiance, there.irradiance),
-        gain=gain,
+        gain=_gain(*smalls, reduced),
     )
 
 
