@@ -32,7 +32,7 @@ from hybrid.runtime.timing import Timings
 
 Array = NDArray[np.float32]
 Value = TypeVar("Value")
-Shown = TypeVar("Shown", PreparedFrame | None, Array | None)
+Shown = TypeVar("Shown", PreparedFrame, PreparedFrame | None, Array | None)
 
 # A frame with less than this share of another's light is black beside it: half floats hold no more of it.
 FAINT = 1e-6
@@ -160,8 +160,8 @@ class FrameStream:
         window = self._collect(number, numbers, frames, denoised if with_first_pass else None)
         if not with_first_pass:
             return window
-        found = [(self._limited(n), np.float32(self._gain(n, number))) for n in numbers]
-        limited = (part and part._replace(exposure=part.exposure * gain) for part, gain in found)
+        found = [(self._limited(n), np.float32(self._fade(n, number, window.stages))) for n in numbers]
+        limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in found)
         return replace(window, limited=tuple(limited))
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
@@ -204,9 +204,9 @@ class FrameStream:
         repeated = tuple(
             n != number and self._repeats(n, n + (self.shot.step if n < number else -self.shot.step)) for n in numbers
         )
-        gains = [self._gain(n, number) for n in numbers]
-        frames = tuple(map(self._lit, frames, gains))
-        denoised = denoised and tuple(map(self._lit, denoised, gains))
+        fades = [self._fade(n, number, plan.stages) for n in numbers]
+        frames = tuple(map(self._relit, frames, fades))
+        denoised = denoised and tuple(map(self._relit, denoised, fades))
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
 
     def _composed(
@@ -297,26 +297,29 @@ class FrameStream:
         first, second = sorted((a, b))
         return self.shot.has(first) and self.shot.has(second) and self._pair_facts(first, second).repeated
 
-    def _gain(self, number: int, centre: int) -> float:
-        """Light of a centre over that of another frame of its window, where one factor explains the change; else 1."""
+    def _fade(self, number: int, centre: int, stages: Collection[str]) -> float:
+        """Factor of light from a frame of a window to its centre, with the stage "fade"; else 1."""
+        if "fade" not in stages:
+            return 1.0
         first, last = sorted((number, centre))
-        gain = math.prod(pair.gain for pair in self.measurements(range(first, last + 1, self.shot.step))[1])
-        gain = gain if number < centre else 1 / gain
-        return gain if FAINT < gain < 1 / FAINT else 1.0
+        fade = math.prod(pair.fade for pair in self.measurements(range(first, last + 1, self.shot.step))[1])
+        fade = fade if number < centre else 1 / fade
+        return fade if FAINT < fade < 1 / FAINT else 1.0
 
-    def _lit(self, shown: Shown, gain: float) -> Shown:
-        """A frame, or the picture of one, in the light of the centre."""
-        if shown is None or gain == 1:
+    def _relit(self, shown: Shown, fade: float) -> Shown:
+        """A frame, or the picture of one, with `fade` times its light."""
+        if shown is None or fade == 1:
             return shown
-        return self.keeper.keep(shown.lit(gain) if isinstance(shown, PreparedFrame) else shown * np.float32(gain))
+        return self.keeper.keep(shown.relit(fade) if isinstance(shown, PreparedFrame) else shown * np.float32(fade))
 
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
         plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)
         if facts.cut:
             return PairFlows(None, None)
         stages = plan.stages - {"warp"} if facts.repeated else plan.stages
+        relit = self._relit(self._there(later), self._fade(later, earlier, stages))
         with self.timings.stage("flow"):
-            return measure_flows(self._there(earlier), self._there(later), stages, self._refine)
+            return measure_flows(self._there(earlier), relit, stages, self._refine)
 
     def _there(self, number: int) -> PreparedFrame:
         frame = self.frame(number)

@@ -52,7 +52,7 @@ TILE = 32
 # optical flow leaves more than this share of the change. A change of light does as much, but leaves the guides as they
 # are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
 CUT = 0.5
-# Logarithm of a gain that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
+# Logarithm of a fade that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
 # lost 1.5 dB where the noise is 1 %.
 SLIGHT = 0.1
 
@@ -85,7 +85,8 @@ class PairFacts:
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
     cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
-    gain: float = 1.0  # light of the later frame over that of the earlier one, where that explains most of the change
+    # factor of light from the earlier frame to the later, where one explains most of the change; else 1
+    fade: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         flow = vectors[0][factor // 2 :: factor, factor // 2 :: factor]
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
+    fade = _fade(*smalls, reduced)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
     return PairFacts(
         numbers=(here.number, there.number),
@@ -160,9 +162,9 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
         fixed_noise=fixed_noise(here, there, moves=changed > 0),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
-        cut=changed > CUT and _is_cut(here, there, smalls, vectors),
+        cut=changed > CUT and fade == 1 and _is_cut(here, there, smalls, vectors),
         repeated=repeats(here.irradiance, there.irradiance),
-        gain=_gain(*smalls, reduced),
+        fade=fade,
     )
 
 
@@ -292,25 +294,32 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
 
 
-def _gain(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
+def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Median light of the second of two frames over that of the first, along `vectors`; 1 where that explains little.
 
-    Changes are medians of logarithms in 4×6 areas, which average noise. A gain that leaves less than half of them, or a
-    quarter of slight ones, is one of the whole picture: on rendered shots of 8 to 512 samples 0.56 to 1.5 are left
-    where light moves, and 0.04 to 0.5 of fades by 0.7.
+    Changes are medians of logarithms in 4×6 areas of the lit part, which average noise. A fade that leaves less than
+    half of them, or a quarter of slight ones, is one of the whole picture: on rendered shots of 8 to 512 samples 0.56
+    to 1.5 are left where light moves, and 0.04 to 0.5 of fades by 0.7.
     """
-    other, inside = (there.light, here.valid) if vectors is None else warp(there.light, vectors[0])
+    other, known = there.light, here.valid & there.valid
+    if vectors is not None:
+        other, inside = warp(there.light, vectors[0])
+        known = here.valid & inside & vectors[1]
     first, second = channel_mean(here.light), channel_mean(other)
-    lit = inside & here.valid & (np.minimum(first, second) > NO_LIGHT)
+    lit = known & (np.minimum(first, second) > NO_LIGHT)
+    if not lit.any():
+        return 1.0
     change = np.log(np.divide(second, first, out=np.ones_like(first), where=lit))
+    extent = tuple(slice(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
+    change, lit = change[extent], lit[extent]
     strips = zip(np.array_split(change, 4), np.array_split(lit, 4), strict=True)
     parts = [zip(*(np.array_split(half, 6, axis=1) for half in strip), strict=True) for strip in strips]
     areas = np.array([np.median(part[known]) for row in parts for part, known in row if known.any()])
-    gain = np.median(areas) if len(areas) else 0.0
-    most = 0.25 if abs(gain) < SLIGHT else 0.5
-    if len(areas) < 6 or np.median(np.abs(areas - gain)) >= most * np.median(np.abs(areas)):
+    fade = np.median(areas)
+    most = 0.25 if abs(fade) < SLIGHT else 0.5
+    if len(areas) < 6 or np.median(np.abs(areas - fade)) >= most * np.median(np.abs(areas)):
         return 1.0
-    return float(np.exp(gain))
+    return float(np.exp(fade))
 
 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:

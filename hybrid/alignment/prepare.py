@@ -63,10 +63,10 @@ class PreparedFrame:
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
 
-    def lit(self, gain: float) -> PreparedFrame:
-        """Return the frame with `gain` times its light, as a neighbour of a frame with that much more light."""
+    def relit(self, fade: float) -> PreparedFrame:
+        """Return the frame with `fade` times its light, as a neighbour of a frame with that much more light."""
         parts = {name for found in self.passes.sums for name in (*found.parts, found.whole)}
-        lights, factor = parts | {*self.passes.textured, *self.pass_colors}, np.float32(gain)
+        lights, factor = parts | {*self.passes.textured, *self.pass_colors}, np.float32(fade)
         aovs = {name: layer * factor if name in lights else layer for name, layer in self.aovs.items()}
         variance = None if self.variance is None else self.variance * factor * factor
         return replace(self, irradiance=self.irradiance * factor, variance=variance, aovs=aovs)

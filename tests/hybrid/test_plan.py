@@ -191,3 +191,58 @@ def test_a_cut_is_seen_in_the_texture_where_both_sides_are_lit_alike(tmp_path):
     fast = Scene(frames=4, height=64, width=96, noise=0.2, step=(9, 4))
     assert plan_shot(open_shot(fast.write(tmp_path / "fast"))).cuts == ()
     assert plan_shot(open_shot(fast.write(tmp_path / "searched", without={"Vector"}))).cuts == ()
+
+
+def faded(factor):
+    """An edit that multiplies the light by `factor` from frame to frame."""
+
+    def edit(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32(factor**index)
+
+    return edit
+
+
+@pytest.mark.parametrize("factor", [0.5, 4])
+def test_a_fade_is_a_decision_with_its_stops(tmp_path, factor):
+    shot = open_shot(Scene().write(tmp_path, edit=faded(factor)))
+    decision = next(d for d in plan_shot(shot).decisions if d.stage == "fade")
+    assert decision.on
+    assert decision.figure == pytest.approx(abs(np.log2(factor)), abs=0.05)
+    assert "stops" in decision.reason
+    window = FrameStream(shot, Rules(off=frozenset({"fade"})), radius=1).window(1002)
+    means = [frame.irradiance.mean() for frame in window.frames]
+    np.testing.assert_allclose(np.divide(means[1:], means[:-1]), factor, rtol=0.1)  # each as it was rendered
+    assert "fade" not in plan_shot(open_shot(Scene().write(tmp_path / "plain"))).stages
+
+
+def test_a_flash_of_pictures_alone_is_no_cut(tmp_path):
+    """Pictures ten times as bright share no pixel, and there are no guides that do."""
+
+    def flash(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32(10 if index == 2 else 1)
+
+    scene, alone = Scene(frames=4, height=64, width=96), {"Vector", "Denoising Albedo", "Denoising Normal", "Depth"}
+    plan = plan_shot(open_shot(scene.write(tmp_path, edit=flash, without=alone)))
+    assert plan.cuts == ()
+    assert "fade" in plan.stages
+
+
+def test_a_fade_of_a_small_thing_without_vectors_around_it_is_found(tmp_path):
+    def small(index, layers):
+        item = np.zeros((64, 96, 1), np.float32)
+        item[20 + index : 44 + index, 30 + 2 * index : 54 + 2 * index] = 0.5**index
+        layers["ViewLayer.Combined"] *= item
+        layers["ViewLayer.Vector"][item[..., 0] == 0] = np.nan
+
+    scene = Scene(height=64, width=96, noise=0.1)
+    stream = FrameStream(open_shot(scene.write(tmp_path, edit=small)), Rules(), radius=1)
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == pytest.approx([0.5, 0.5], rel=0.05)
+
+
+def test_light_of_pixels_without_vectors_is_no_fade(tmp_path):
+    def blink(index, layers):
+        layers["ViewLayer.Combined"][:, :64] *= np.float32(3 ** (index % 2))
+        layers["ViewLayer.Vector"][:, :64] = np.nan
+
+    stream = FrameStream(open_shot(Scene(height=64, width=96).write(tmp_path, edit=blink)), Rules(), radius=1)
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
