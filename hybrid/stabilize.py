@@ -426,5 +426,6 @@ def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
         # Shared out of the picture, which had no negative light, parts have none.
         aovs[name] = np.maximum(aovs[name], 0) + unfiltered.smooth_negative(name, denoised.color, frame.guide)
     aovs = {name: unfiltered.without_outside(layer) for name, layer in aovs.items()}
+    aovs |= {name: unfiltered.without_empty(aovs[name]) for name in aovs.keys() & denoised.parts}
     guide = frame.guide if unfiltered.negative else None
     return replace(denoised, color=unfiltered.restore(denoised.color, guide), aovs=aovs)

@@ -1,7 +1,8 @@
 """Parts of a frame's color that are not filtered: removed before denoising, and restored in the finished picture.
 
-Filters would mix the black outside a render region into its edges, and spread a sun beyond the range of half; every
-denoiser would clip the negative light of a color outside of the gamut, and tint a gray picture.
+Filters would mix the black outside a render region into its edges, and an object into the black around it, and spread
+a sun beyond the range of half; every denoiser would clip the negative light of a color outside of the gamut, and tint a
+gray picture.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ _MIRRORED = 32
 _LEAST, _EDGE = 16, 0.9
 # Fewer connected pixels of +Inf are fireflies: one bright sample covers a pixel, with a renderer's filter up to 2×2.
 _LIGHT = 5
+# Side, pixels, of the least square without samples of anything: few samples leave single pixels of a volume black.
+_EMPTY = 15
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class Unfiltered:
     negative: Mapping[str, Array] = field(default_factory=dict)
     gray: frozenset[str] = frozenset()  # names, "color" or AOVs, whose three channels are equal everywhere
     region: Region | None = None  # rows and columns of a render region, outside which the frame is black
+    empty: Mask | None = None  # (H, W): where no sample hit anything, and the color is 0
 
     @property
     def lights(self) -> Mask | None:
@@ -60,13 +64,17 @@ class Unfiltered:
             picture = picture + self.smooth_negative("color", picture, guide)
         if self.beyond is not None:
             picture = np.where(np.isnan(self.beyond), picture, self.beyond)
-        return np.asarray(self.without_outside(picture), np.float32)
+        return np.asarray(self.without_outside(self.without_empty(picture)), np.float32)
 
     def smooth_negative(self, name: str, picture: Array, guide: Array | None) -> Array:
         """Return the local mean of a layer's negative radiance, which follows edges of `picture` and `guide`."""
         shown = compress(picture, measure_exposure(picture))
         shown = shown if guide is None else np.concatenate([shown, guide], axis=-1)
         return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
+
+    def without_empty(self, light: Array) -> Array:
+        """Return the color or a part of it (H, W, 3) set to 0 where nothing is, if such pixels are known."""
+        return light if self.empty is None else np.where(self.empty[..., None], np.float32(0), light)
 
     def without_outside(self, layer: Array) -> Array:
         """Return a layer (H, W, ...) set to 0 outside the render region, if there is one."""
@@ -126,7 +134,7 @@ def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
     negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}
     color = frame.color - negative["color"] if "color" in negative else frame.color
     gray = frozenset(name for name, layer in layers.items() if _is_gray(layer))
-    return color, Unfiltered(_lights(frame), negative, gray)
+    return color, Unfiltered(_lights(frame), negative, gray, empty=_empty(frame))
 
 
 def as_gray(picture: Array) -> Array:
@@ -142,6 +150,24 @@ def _is_gray(layer: Array) -> bool:
     return all(
         np.array_equal(part[..., 0], part[..., c], equal_nan=True) for part in (layer[::16], layer) for c in (1, 2)
     )
+
+
+def _empty(frame: Frame) -> Mask | None:
+    """Where color and alpha, or color and all guides, are 0 in whole squares of pixels; None if nowhere."""
+    black = _is_zero(frame.color)
+    guides = [layer for layer in (frame.albedo, frame.normal) if layer is not None]
+    if not black.any() or (frame.alpha is None and not guides):
+        return None
+    transparent = np.False_ if frame.alpha is None else frame.alpha == 0
+    bare = np.logical_and.reduce([_is_zero(layer) for layer in guides]) if guides else np.False_
+    missed = np.asarray(black & (transparent | bare), np.uint8)
+    empty = cv2.morphologyEx(missed, cv2.MORPH_OPEN, np.ones((_EMPTY, _EMPTY), np.uint8)) > 0
+    return empty if empty.any() else None
+
+
+def _is_zero(layer: Array) -> Mask:
+    """The pixels (H, W) of a layer that are 0 in all channels."""
+    return np.asarray(np.logical_and.reduce([plane == 0 for plane in np.moveaxis(layer, -1, 0)]))
 
 
 def _negative(layer: Array) -> Array | None:

@@ -236,3 +236,44 @@ class TestRegion:
         outside = np.ones((48, 64), bool)
         outside[12:36, 16:48] = False
         assert not color[outside].any()
+
+
+def object_on_nothing(frames: int = 3) -> tuple[Scene, np.ndarray]:
+    """A scene, and where a disk is in all of its frames."""
+    y, x = np.mgrid[:48, :64]
+    return Scene(height=48, width=64, frames=frames, step=(0, 0), noise=0.1), np.hypot(y - 24, x - 30) < 12
+
+
+@pytest.mark.parametrize("told_by", ["guides", "alpha"])
+def test_black_stays_black_where_nothing_is(tmp_path, told_by):
+    """A denoiser spreads the light of an object over the pixels beside it."""
+    scene, disk = object_on_nothing()
+
+    def cut_out(index, layers):
+        layers["ViewLayer.Combined"] *= disk[..., None]
+        if told_by == "guides":
+            for name in ("Denoising Albedo", "Denoising Normal"):
+                layers[f"ViewLayer.{name}"] *= disk[..., None]
+        else:
+            layers["ViewLayer.Combined"] = np.dstack([layers["ViewLayer.Combined"], disk.astype(np.float32)])
+
+    shot = open_shot(scene.write(tmp_path, edit=cut_out))
+    blur = PerFrame(lambda frame: cv2.blur(frame.color, (5, 5)))
+    maker = FrameDenoiser(FrameStream(shot, Rules(), first_pass=blur), lambda aligned: Denoised(gated_average(aligned)))
+    color = maker.make(scene.first + 1).denoised.color
+    assert not color[~disk].any()
+    assert (color[disk] > 0).all()
+
+
+def test_pixels_that_few_samples_leave_black_are_not_empty():
+    rng = np.random.default_rng(4)
+    smoke = (rng.random((48, 64, 1)) < 0.1) * np.ones(3, np.float32)
+    smoke = smoke.astype(np.float32)
+    assert split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty is None
+    smoke[:, 40:] = 0
+    empty = split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty
+    assert empty[:, 41:].all()
+    assert not empty[:, :30].any()
+    surface = np.ones((48, 64, 3), np.float32)  # black because no light reaches it
+    assert split_unfiltered(Frame(1, smoke, albedo=surface, normal=smoke))[1].empty is None
+    assert split_unfiltered(Frame(1, smoke))[1].empty is None
