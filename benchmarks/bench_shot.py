@@ -131,7 +131,6 @@ def write_shot(name: str, folder: Path, frames: int, scale: int) -> str:
 
 
 def run_oidn(pattern: str, out: Path, mode: str) -> None:
-    """Denoise a shot frame by frame by OIDN alone."""
     from hybrid.oidn import denoise_oidn
 
     shot = open_shot(pattern)

@@ -63,7 +63,6 @@ UNCOMPARED = ("ravg/versions", "ravg/settings", "ravg/command", "ravg/made-from"
 
 
 def write_shots(folder: Path) -> None:
-    """Write all shots that configurations read."""
     frames = [_cropped(8 + index, slice(60, 124), slice(100, 196)) for index in range(5)]
     tall = [_cropped(8 + index, slice(0, 180), slice(60, 260)) for index in range(2)]
     tall = [{name: np.concatenate([layer] * 8) for name, layer in frame.items()} for frame in tall]
@@ -160,7 +159,6 @@ def _read_all(folder: Path) -> dict[str, tuple[dict[str, np.ndarray], dict[str, 
 
 
 def results_of(checkout: Path, folder: Path, names: list[str]) -> dict:
-    """Run a checkout on the shots of `folder`."""
     work = folder / "work"
     work.mkdir()
     for shot in (folder / "shots").iterdir():

@@ -130,7 +130,6 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """The warnings in the log."""
         marked = (line.partition("warning: ") for line in self.log.splitlines())
         return [text for before, mark, text in marked if mark and not before.strip()]
 

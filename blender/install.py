@@ -16,8 +16,6 @@ _NO_NETWORK = re.compile(
 
 
 class Source(NamedTuple):
-    """The source that ravg is installed from."""
-
     version: str  # of this extension, such as 0.2.0
     wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder
     online: bool  # whether requirements may come from the package index too

@@ -25,7 +25,6 @@ class Entry(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """The first line of the help."""
         return self.help.partition("\n")[0]
 
 
@@ -68,7 +67,6 @@ class Command(TyperCommand):
 
 
 def _note_renamed(ctx: Any, old: str, new: str) -> None:
-    """Have a line logged that an old name was used."""
     ctx.meta.setdefault(RENAMED, []).append(f"{old} is now {new}; the old name goes in the next release")
 
 
@@ -105,7 +103,6 @@ class Commands(TyperGroup):
         return LazyCommand(cmd_name, COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command that the arguments begin with."""
         if args and args[0] in OLD_COMMANDS:
             old, (new, options) = args[0], OLD_COMMANDS[args[0]]
             _note_renamed(ctx, f"ravg {old}", f"ravg {new}{''.join(f' {option}' for option in options)}")

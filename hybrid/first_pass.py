@@ -105,8 +105,6 @@ NO_BACKENDS = Backends()
 
 @dataclass(frozen=True)
 class FirstPassSource:
-    """The first pass of a shot."""
-
     name: str  # what was taken; written to the header of the output
     first_pass: FirstPass | None  # for a `FrameStream`; None for none
     reason: str  # why this one

@@ -125,7 +125,6 @@ class DenoiseOptions:
         self._check_combinations()
 
     def _check_values(self) -> None:
-        """Refuse values that an option cannot have."""
         for name, expected in CHOICES.items():
             if (value := getattr(self, name)) not in expected:
                 raise ValueError(f"{name.replace('_', '-')} is {value!r}, expected one of {', '.join(expected)}")

@@ -77,7 +77,6 @@ def _as_input(image: NDArray[Any], name: str, color: NDArray[Any]) -> NDArray[np
 def _execute(
     images: dict[str, NDArray[np.float32]], quality: str, where: str, scale: float | None = None, **flags: bool
 ) -> NDArray[np.float32]:
-    """Run one filter over `images`."""
     oidn, device = _device(where)
     qualities = {"high": oidn.OIDN_QUALITY_HIGH, "balanced": oidn.OIDN_QUALITY_BALANCED,
                  "fast": oidn.OIDN_QUALITY_FAST}  # fmt: skip

@@ -53,8 +53,6 @@ Borders = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class RobustUNetConfig:
-    """Sizes of a `RobustUNet`."""
-
     frames: int = 5  # T, odd; the window
     size: str = "base"  # of network.unet.ENCODERS
     ra_scales: tuple[int, ...] = (0,)  # 0: behind the first convolution; s: behind the convolutions of scale s

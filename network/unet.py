@@ -37,8 +37,6 @@ DECODERS: dict[str, tuple[tuple[int, ...], ...]] = {
 
 @dataclass(frozen=True)
 class OidnUNetConfig:
-    """Sizes of an `OidnUNet`."""
-
     inputs: int = 9  # channels: color, then albedo, then normal
     size: str = "base"  # of ENCODERS
 
@@ -65,12 +63,10 @@ class OidnUNet(nn.Module):
 
     @property
     def first(self) -> nn.Conv2d:
-        """The first convolution."""
         return cast(nn.Conv2d, cast(nn.Sequential, self.encoder[0])[0])
 
     @property
     def convolutions(self) -> Iterator[nn.Conv2d]:
-        """All convolutions, in the order in which they run."""
         return (module for module in self.modules() if isinstance(module, nn.Conv2d))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -154,7 +150,6 @@ class Stage(nn.Sequential):
             setattr(self, name, convert(taps).contiguous(memory_format=torch.channels_last))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Run all layers."""
         return self._run(x, list(self))
 
     @staticmethod

@@ -35,8 +35,6 @@ FRAMES = "frames"  # folder next to the page
 
 @dataclass(frozen=True)
 class _Report:
-    """Options of what is written and printed."""
-
     output: Path | None = None
     clock: Literal["wall", "cpu"] = "wall"  # the time that is drawn and printed
     markdown: bool = False
@@ -47,7 +45,6 @@ class _Report:
 
     @property
     def cost(self) -> Cost:
-        """The time that is drawn and printed."""
         return "seconds_per_megapixel" if self.clock == "wall" else "cpu_seconds_per_megapixel"
 
     def check(self) -> None:
@@ -81,7 +78,6 @@ class _Report:
         self.show(others, joined)
 
     def write(self, comparison: Comparison, images: ShotImages | None) -> None:
-        """Write the page and its files."""
         from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
 
         assert self.output is not None

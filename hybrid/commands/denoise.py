@@ -335,7 +335,6 @@ def _print_weights(job: Job) -> None:
 
 
 def _write_pictures(request: Request, shot: Shot) -> None:
-    """Write the preview and the contact sheet that are asked for."""
     if request.preview is not None:
         write_preview(shot, request.output, request.preview, rate=request.fps)
         LOG.info(f"wrote {request.preview}")

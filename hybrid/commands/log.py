@@ -47,7 +47,6 @@ class Progress:
         self._record(task, {})
 
     def advance(self, by: float = 1, message: str = "", **facts: object) -> None:
-        """Log that `by` more steps are done, with a message and facts."""
         self.done += by
         left = self.elapsed / self.done * (self.total - self.done) if self.done else None
         self._record(message or self.task, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
@@ -84,7 +83,6 @@ def start_log(
 
 
 def log_file() -> Path | None:
-    """Return the file of records, if any."""
     names = [handler.stream.name for handler in LOG.handlers if isinstance(handler, _Lines) and handler.owns_stream]
     return Path(names[0]) if names else None
 
@@ -241,7 +239,6 @@ def _time(record: logging.LogRecord) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time in s, min or h."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -20,8 +20,6 @@ from network.training.config import SamplerConfig, TrainConfig
 
 
 class Levels(NamedTuple):
-    """Noise levels of a shot."""
-
     name: str  # of the shot
     shots: dict[str, Shot]
     samples: list[float]  # per pixel

@@ -85,7 +85,6 @@ def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, l
 
 
 def _is_drawable(result: MethodResult, metric: Metric) -> bool:
-    """Whether the axis can show the value of a result."""
     mean = result.metrics[metric.key].mean if metric.key in result.metrics else math.nan
     return math.isfinite(mean) and (mean > 0 or not metric.logarithmic)
 

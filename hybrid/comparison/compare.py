@@ -26,8 +26,6 @@ LARGE = 1 << 20  # pixels of a frame; above, maps of all frames would take longe
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """Options of a comparison."""
-
     title: str = "shot"  # name of the shot
     # factor before the tone curve, and on the radiance of relMSE and SMAPE, one for the whole shot
     exposure: float = 1.0

@@ -49,8 +49,6 @@ CHANGE_GAIN = 25  # gain of the map of changes: a change of a fiftieth of the to
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Evaluates the frames of methods in a store."""
-
     store: FrameStore  # holds the methods' frames, the reference, and the flow of each pair
     numbers: Sequence[int]  # frames to evaluate
     pairs: Sequence[tuple[int, int]]  # neighbouring frames with a flow between them, from `store_flows`

@@ -36,8 +36,6 @@ WindowFilter = Callable[[AlignedWindow], Array]  # to (H, W, 3) radiance
 
 @dataclass(frozen=True)
 class Method:
-    """A denoiser of a comparison."""
-
     # from a shot to (number, (H, W, 3) radiance) of each of its frames. It runs in another process and must be
     # picklable. An `ImportError` lists the method as absent.
     run: Run
@@ -101,8 +99,6 @@ class WindowSettings:
 
 @dataclass(frozen=True)
 class Classical:
-    """Denoise every aligned window with a function."""
-
     denoise: WindowFilter
     window: WindowSettings = field(default_factory=WindowSettings)
 

@@ -44,8 +44,6 @@ FILES = ("report.html", "results.json", "chart.png", "ladder.png")
 
 
 class Report(NamedTuple):
-    """Content of a report."""
-
     # the shot of the page, methods in the order of the tables. Gains are relative to the method "noisy".
     comparison: Comparison
     images: ShotImages | None = None  # frames and maps for the viewer

@@ -34,8 +34,6 @@ class Statistic:
 
 @dataclass(frozen=True)
 class Metric:
-    """Name and number format of a measure."""
-
     key: str
     label: str
     unit: str = ""
@@ -234,7 +232,6 @@ def _goodness(value: float, metric: Metric) -> float:
 
 
 def _tied(a: Statistic, b: Statistic) -> bool:
-    """Whether the difference of two statistics is not significant."""
     if a.values and len(a.values) == len(b.values) and a.shots == b.shots:
         with np.errstate(invalid="ignore"):  # two perfect scores: inf − inf
             difference = np.subtract(a.values, b.values)
@@ -244,7 +241,6 @@ def _tied(a: Statistic, b: Statistic) -> bool:
 
 
 def present_metrics(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list[Metric]:
-    """Return those of the metrics that at least one result has."""
     return [m for m in metrics if any(m.key in r.metrics for r in results)]
 
 

@@ -50,7 +50,6 @@ class NoiseLaw:
         return n * e / rest / self.samples
 
     def describe(self) -> str:
-        """Describe the measured levels, and whether the error follows 1/n."""
         measured = ", ".join(f"{n:g}: {decibels(e)}" for n, e in self.levels)
         if self.slope is None:
             return "By the 1/n law from the error of the noisy render; not verified, no other level was given."

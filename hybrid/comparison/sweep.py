@@ -29,7 +29,6 @@ def sweep_methods(plan: Plan) -> dict[str, Method]:
 
 
 def _variant(sweep: str, base: str, settings: Mapping[str, object], run: Run) -> tuple[str, Method]:
-    """Name and method of a variant of the method `base`."""
     words = " ".join(f"{key} {value}" for key, value in settings.items())
     return f"{base}, {words}", Method(run, METHODS[base].family, settings=settings, sweep=sweep, base=base)
 

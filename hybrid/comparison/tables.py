@@ -64,7 +64,6 @@ def format_factor(factor: Factor | None) -> str:
 
 
 def column_title(metric: Metric) -> str:
-    """Return the metric's label with its unit."""
     return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
 
 
@@ -132,7 +131,6 @@ def ladder_rows(ladder: Ladder) -> list[list[str]]:
 
 
 def ladder_table(rows: Sequence[Sequence[str]]) -> Table:
-    """Build the terminal's table of `ladder_rows`."""
     (first, *titles), *cells = rows
     table = Table(first, box=SIMPLE_HEAD, padding=0, show_edge=False)
     for index, title in enumerate(titles):

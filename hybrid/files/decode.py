@@ -28,7 +28,6 @@ class Window(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width."""
         return self.bottom - self.top + 1, self.right - self.left + 1
 
 

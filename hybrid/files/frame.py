@@ -97,7 +97,6 @@ class MappedShot:
         self._shot, self._change = shot, change
 
     def read(self, number: int) -> Frame:
-        """Read and change a frame."""
         return self._change(self._shot.read(number))
 
 

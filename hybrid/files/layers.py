@@ -92,7 +92,6 @@ class Layers:
         return replace(self, **dict.fromkeys(gone), motion_convention=convention)  # type: ignore[arg-type]
 
     def without_aovs(self, names: Collection[str]) -> Self:
-        """Return the layers without some AOVs."""
         aovs = {name: layer for name, layer in self.aovs.items() if name not in names}
         pass_colors = {name: layer for name, layer in self.pass_colors.items() if name not in names}
         return replace(self, aovs=aovs, pass_colors=pass_colors)
@@ -292,7 +291,6 @@ def _is_light(layer: Layer) -> bool:
 
 
 def _find_lights(image: ExrImage, color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
-    """All layers that have a name for light."""
     used = {channel for layer in written for channel in layer.channels}
     lights = [x for x in _same_group(image, color) if _is_light(x) and not used & {*x.channels}]
     fitting = {without_view(x): _fit(image, "color", x, named=True) for x in lights}

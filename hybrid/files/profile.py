@@ -168,7 +168,6 @@ def _refuse_others(table: Mapping[str, Any], where: str, known: Sequence[str]) -
 
 
 def user_folder() -> Path:
-    """Return the folder of the user's own profiles."""
     import typer
 
     return Path(typer.get_app_dir("ravg")) / "profiles"

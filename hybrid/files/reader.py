@@ -33,7 +33,6 @@ class Interpretation:
     estimate_factors: tuple[float, float, float] | None = None  # factors of the denoised picture, by channel
 
     def apply(self, layers: Layers) -> Layers:
-        """Return the layers with this interpretation."""
         found = layers.without(self.left_out).without_aovs(self.passes.kept)
         if found.motion is not None and self.motion is not None:
             found = replace(found, motion_convention=self.motion)
@@ -57,13 +56,11 @@ class ShotFiles:
     canvas: Window | None = None  # None: the smallest window that holds the color of every frame
 
     def path(self, number: int) -> Path:
-        """Return the file of a frame; raise FileNotFoundError if it is missing."""
         if number not in self.files:
             raise FileNotFoundError(f"frame {number} is not there; the shot has {format_frames(self.files)}")
         return self.files[number]
 
     def paths(self, number: int) -> tuple[Path, ...]:
-        """Return the files that a frame is read from, its own first."""
         return (self.path(number), *dict.fromkeys(other.files[number] for other in self.sidecars.values()))
 
 
@@ -77,11 +74,9 @@ class ShotHeaders:
         self._layers_of_kind: dict[object, Layers] = {}
 
     def open(self, path: Path, *, pixels: bool = True) -> ExrImage:
-        """Read a file."""
         return read_exr(path, pixels=pixels, max_pixels=self.files.max_pixels)
 
     def header(self, number: int) -> ExrImage:
-        """Read parts and channels of a frame's file, without pixels."""
         return self.open(self.files.path(number), pixels=False)
 
     def layers_at(self, number: int) -> Layers:
@@ -165,7 +160,6 @@ class ShotReader:
 
     @cached_property
     def first_layers(self) -> Layers:
-        """Layers of the first frame."""
         return self.interpretation.apply(self.headers.layers_at(self.files.first))
 
     def layers(self, number: int) -> Layers:
@@ -220,7 +214,6 @@ class ShotReader:
         return image, layers
 
     def read(self, number: int) -> Frame:
-        """Read a frame, or return it from memory."""
         if number in self._frames:
             self._frames.move_to_end(number)
             return self._frames[number]

@@ -28,7 +28,6 @@ class Pattern:
     after: str = ""
 
     def path(self, number: int) -> Path:
-        """Return the file of a frame."""
         return self._names(number)[0] if self.digits else self.single
 
     def _names(self, number: int) -> list[Path]:
@@ -154,7 +153,6 @@ def _ignores_case(names: list[Path]) -> bool:
 
 
 def _names(folder: Path) -> list[Path]:
-    """The EXR files of a folder."""
     if not folder.is_dir():
         return []
     with os.scandir(folder) as entries:
@@ -209,7 +207,6 @@ def name_view(text: str, view: str) -> str:
 
 
 def list_patterns(folder: Path) -> list[Pattern]:
-    """Return the sequences and single files of a folder."""
     return _patterns(_names(folder))
 
 

@@ -234,8 +234,6 @@ class _Sequence(NamedTuple):
 
 
 class _Selection(NamedTuple):
-    """The frames of a range."""
-
     files: Mapping[int, Path]
     numbers: tuple[int, ...]
     step: int

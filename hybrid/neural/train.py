@@ -18,8 +18,6 @@ from network.training.loop import train
 
 
 class TrainInputs(NamedTuple):
-    """Clips and initial weights of a training."""
-
     clips: Path  # from `write_clips`
     preset: str  # of `network.presets.PRESETS`; not used with a file or a preset as init
     init: str | None = None  # initial weights: a file, a preset that ships, or "oidn": the preset's, on OIDN's backbone
@@ -58,7 +56,6 @@ def train_network(
 
 
 def _initial_model(inputs: TrainInputs, training: Clips, seed: int) -> Model:
-    """The model that training begins with."""
     init, preset = inputs.init, inputs.preset
     if init in (None, "oidn"):
         if inputs.window is None and preset in PRESETS and PRESETS[preset].frames != training.frames:

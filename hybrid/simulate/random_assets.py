@@ -206,7 +206,6 @@ def material(rng: assets.Rng, surface: str | None = None, in_world: bool = False
 
 
 def set_emission(surface: Any, rgba: assets.Point, strength: float) -> None:
-    """Set the emission of a material with a Principled shader."""
     inputs = surface.node_tree.nodes["Principled BSDF"].inputs
     inputs["Emission Color"].default_value, inputs["Emission Strength"].default_value = rgba, strength
 

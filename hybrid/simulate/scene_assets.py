@@ -151,7 +151,6 @@ def grid_faces(rows: int, columns: int, closed: bool = False) -> np.ndarray:
 
 
 def add_box(center: Point, size: Point, surface: Any, name: str = "box") -> Any:
-    """Add an axis-aligned box."""
     item = add_mesh(name, np.array(CUBE) * size, CUBE_FACES, surface)
     item.location = center
     return item
@@ -230,7 +229,6 @@ def gear(teeth: int, radius: float, depth: float, surface: Any, spokes: int = 5)
 
 
 def wire(points: Sequence[Point], radius: float, surface: Any, name: str = "wire") -> Any:
-    """Add a round wire through `points`."""
     data = bpy.data.curves.new(name, "CURVE")
     data.dimensions, data.bevel_depth, data.bevel_resolution, data.use_fill_caps = "3D", radius, 4, True
     spline = data.splines.new("NURBS")
@@ -295,8 +293,6 @@ def add_strands(path: np.ndarray, radii: np.ndarray, surface: Any) -> Any:
 
 
 class Hair(NamedTuple):
-    """The shape of hair."""
-
     strands: int
     length: float
     radius: float = 0.00004

@@ -17,7 +17,6 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(channels, channels, kernel_size, padding=kernel_size // 2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Run the block on ``(N, C, H, W)``."""
         return x + cast(Tensor, self.second(torch.relu(self.first(torch.relu(x)))))
 
 

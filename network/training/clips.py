@@ -247,8 +247,6 @@ def _pack(clip: Clip) -> dict[str, Tensor]:
 
 
 class _Shard(NamedTuple):
-    """Metadata of a shard."""
-
     path: Path
     shot: str
     samples: tuple[float, ...]
@@ -274,7 +272,6 @@ class Clips:
 
     @property
     def shots(self) -> list[str]:
-        """Names of the shots, sorted."""
         return sorted({shard.shot for shard in self._shards})
 
     @property
@@ -434,7 +431,6 @@ class Samples(Dataset[Sample]):
         self._cycle: tuple[int, np.ndarray] | None = None
 
     def clip_of(self, number: int) -> int:
-        """Index of the clip that a sample is drawn from."""
         cycle, place = divmod(number, sum(map(len, self._sets)))
         if self._cycle is None or self._cycle[0] != cycle:
             rng = np.random.default_rng((self.seed, 1, cycle))
