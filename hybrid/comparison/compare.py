@@ -5,9 +5,10 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from hybrid.comparison.evaluation import Evaluator, Level, find_static_pixels, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
@@ -39,7 +40,7 @@ class CompareOptions:
     # returns further findings; called in the background while reference and motion are read. An exception ends the
     # comparison before any method runs.
     check_shot: Callable[[], Sequence[str]] | None = None
-    maps: bool = False  # store the methods' maps of the frames of `mapped_frames`
+    maps: bool = False  # store the methods' maps
 
 
 def compare_shot(
@@ -80,9 +81,9 @@ def compare_shot(
         statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, on_step)
         law, law_facts = _noise_law(evaluator, statistics, options)
         results = [
-            replace(_result_of(name, method), absent_reason=timed.absent[name])
-            if name in timed.absent
-            else _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
+            _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
+            if name in timed.runs
+            else MethodResult(name, **_asked(method), absent_reason=timed.absent[name])
             for name, method in methods.items()
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
@@ -223,8 +224,9 @@ def _measure_ladder(
     return build_ladder(measured)
 
 
-def _result_of(name: str, method: Method) -> MethodResult:
-    return MethodResult(name, method.settings, method.family, method.sweep, method.base)
+def _asked(method: Method) -> dict[str, Any]:
+    """Fields of a method that its result has too."""
+    return {name: getattr(method, name) for name in ("settings", "family", "sweep", "base")}
 
 
 def _measured(
@@ -239,8 +241,9 @@ def _measured(
     seconds = summarize_runs(runs) if method.cost == "measured" else None
     unmeasured = 0.0 if method.cost == "free" else None
     stated = unmeasured if method.seconds is None else method.seconds / megapixels
-    return replace(
-        _result_of(name, method),
+    return MethodResult(
+        name,
+        **_asked(method),
         seconds_per_megapixel=seconds.median if seconds else stated,
         spread=(seconds.least, seconds.most) if seconds and len(runs) > 1 else None,
         cpu_seconds_per_megapixel=seconds.cpu if seconds else unmeasured,
@@ -250,16 +253,13 @@ def _measured(
     )
 
 
-def mapped_frames(numbers: Sequence[int], pixels: int) -> list[int]:
-    """Return the frames whose maps, slower than denoising, are stored: all, or the middle of large ones (`LARGE`)."""
-    return list(numbers) if pixels <= LARGE else [numbers[len(numbers) // 2]]
-
-
 def _store_all_maps(
     store: FrameStore, shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep
 ) -> dict[str, str]:
-    """Store the maps of methods; return a fact if some frames are left out."""
-    numbers = mapped_frames(evaluator.numbers, evaluator.static.size)
+    """Store the maps of methods, of `LARGE` frames those of the middle one; return a fact if some are left out."""
+    numbers = evaluator.numbers
+    if evaluator.static.size > LARGE:
+        numbers = [numbers[len(numbers) // 2]]
     for name, method in methods.items():
         on_step(f"maps of {name}")
         run_in_process(_store_maps, method, shot, numbers, name, store)

@@ -125,14 +125,10 @@ class Evaluator:
         From the PSNR of the noisy frames and of renders at other samples per pixel. If the samples of the noisy frames
         are unknown, `worth` is a ratio without a scale in samples.
         """
-        errors = [(samples or 1.0, mean_error(noisy.values))]
+        errors, psnr = [(samples or 1.0, mean_error(noisy.values))], partial(metrics.psnr, exposure=self.exposure)
         for shot, count in levels:
-            common = [number for number in self.numbers if shot.has(number)]
-            references = map(self.store.load_reference, common)
-            pairs = zip(common, references, strict=True)
-            errors.append(
-                (count, mean_error([metrics.psnr(shot.read(n).color, r, exposure=self.exposure) for n, r in pairs]))
-            )
+            scores = [psnr(shot.read(n).color, self.store.load_reference(n)) for n in self.numbers if shot.has(n)]
+            errors.append((count, mean_error(scores)))
         errors.sort()
         floor, words = self._find_floor(errors, samples, reference_samples)
         return NoiseLaw(tuple(errors), samples or 1.0, floor), words

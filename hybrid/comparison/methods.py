@@ -9,7 +9,7 @@ import numpy as np
 
 from flow.tvl1 import refine_flow
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.frame import Array, Frame, Frames, MappedShot
+from hybrid.files.frame import Array, Frames, MappedShot
 from hybrid.files.shots import Shot
 from hybrid.first_pass import (
     NETWORKS,
@@ -186,11 +186,9 @@ def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None =
 
 def oidn_then_average(shot: Frames) -> Iterator[tuple[int, Array]]:
     """Run OIDN's best mode on each frame, then take the aligned robust average of the results."""
-
-    def denoised(frame: Frame) -> Frame:
-        return replace(frame, color=denoise_frame_oidn(frame, prefilter="high"), variance=None)
-
-    stream = FrameStream(MappedShot(shot, denoised), Rules())
+    best = partial(denoise_frame_oidn, prefilter="high")
+    denoised = MappedShot(shot, lambda frame: replace(frame, color=best(frame), variance=None))
+    stream = FrameStream(denoised, Rules())
     for number in shot.numbers:
         yield number, aligned_robust_average(stream.align(number))
 

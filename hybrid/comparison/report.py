@@ -127,8 +127,6 @@ def _page(
     return page.render(
         "report.html",
         comparison=comparison,
-        style=page.style(),
-        script=page.script(),
         verdict=_verdict(results, metrics, pair),
         curves=[(m, curve) for m in charted if (curve := chart.draw_curves(present, m, pair))],
         metrics=metrics,

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -314,21 +314,14 @@ def read_comparison(path: Path) -> Comparison:
 
 def _read_result(entry: Mapping[str, Any]) -> MethodResult:
     """A result of `to_document`."""
-
-    def pair(values: Sequence[Any]) -> tuple[float, float]:
-        low, high = map(float, values)
-        return low, high
-
-    optional: dict[str, Callable[[Any], Any]] = {
-        **dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel", "worth"), float),
-        "spread": pair,
-        "peak_bytes": int,
-        "absent_reason": str,
-    }
     metrics = {}
     for key, found in entry["metrics"].items():
         numbers = {name: float(found[name]) for name in ("mean", "minimum", "maximum", "low", "high")}
         metrics[key] = Statistic(**numbers, values=tuple(map(float, found["values"])), shots=tuple(found["shots"]))
     values: dict[str, Any] = {name: str(entry[name]) for name in ("name", "family", "sweep", "base")}
-    values |= {name: None if entry[name] is None else convert(entry[name]) for name, convert in optional.items()}
+    numbers_or_text = dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel", "worth"), float)
+    for name, kind in {**numbers_or_text, "peak_bytes": int, "absent_reason": str}.items():
+        values[name] = None if entry[name] is None else kind(entry[name])
+    if (spread := entry["spread"]) is not None:
+        values["spread"] = float(spread[0]), float(spread[1])
     return MethodResult(settings=dict(entry["settings"]), metrics=metrics, **values)

@@ -123,11 +123,8 @@ def ladder_rows(ladder: Ladder) -> list[list[str]]:
         for label, table in tables.items()
         if name in table
     ]
-    return (
-        [[f"times its samples that {RIVAL} needs to equal", "by", *(f"{n:g} spp" for n in counts)], *rows]
-        if rows
-        else []
-    )
+    head = [f"times its samples that {RIVAL} needs to equal", "by", *(f"{n:g} spp" for n in counts)]
+    return [head, *rows] if rows else []
 
 
 def ladder_table(rows: Sequence[Sequence[str]]) -> Table:

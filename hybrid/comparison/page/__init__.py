@@ -33,11 +33,7 @@ _templates.filters |= {
 
 def render(template: str, **values: object) -> Markup:
     """Fill a template of this folder; text is escaped, and a missing value raises `jinja2.UndefinedError`."""
-    return Markup(_templates.get_template(template).render(values))
-
-
-def style() -> Markup:
-    return _source("report.css")
+    return Markup(_templates.get_template(template).render(values, style=_source("report.css"), script=script()))
 
 
 def script() -> Markup:
