@@ -10,7 +10,15 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from itertools import pairwise
 
+import numpy as np
 from numba import get_num_threads
+from numpy.typing import NDArray
+
+# Arrays that compiled loops read and write.
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Places = NDArray[np.intp]
 
 
 def run_bands(loop: Callable[..., None], count: int, *arguments: object) -> None:

@@ -1,16 +1,10 @@
 """Averages over an aligned window; replacement of outliers and of non-finite pixels."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
-
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from loops.parallel import Floats, Mask, run_bands
 
 # How many robust scales above the median an outlier lies.
 _FAR_ABOVE = np.float32(16)

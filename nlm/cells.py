@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
-Places = NDArray[np.intp]
+from loops.parallel import Floats, Places
 
 
 class Axis(NamedTuple):

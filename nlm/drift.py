@@ -3,13 +3,10 @@
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 from nlm.average import check_colors, check_exposure, check_window
 from nlm.variance import gaussian_mean, ratio
-
-Floats = NDArray[np.float32]
 
 # Cells of 8×8 pixels, smoothed by σ = 2 of them: σ of 8, 16 and 32 pixels are as good to 0.05 dB.
 _CELL, _SIGMA = 8, 2.0

@@ -12,13 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Doubles, Floats, Mask, Places, run_bands
 from nlm.average import channel_mean
 
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Places = NDArray[np.intp]
-Points = NDArray[np.float64]
+Points = Doubles
 
 # A firefly is so many times as bright as the brightest pixel of the ring around it, and as the ring's mean. Half of
 # this is two stops above what denoisers of single frames take for noise; below they remove it themselves.
@@ -232,7 +229,7 @@ def _blocks(pixels: Places, shape: tuple[int, ...], side: int = 5) -> tuple[Plac
     return np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1), inside
 
 
-def _around(block: NDArray[np.float64], inside: Mask) -> NDArray[np.float64]:
+def _around(block: Doubles, inside: Mask) -> Doubles:
     """Mean (K, C) of the rings of 5×5 pixels (K, 5, 5, C) without their brightest pixel; 0 without a ring."""
     ring = inside.copy()
     ring[:, 1:4, 1:4] = False
@@ -242,7 +239,7 @@ def _around(block: NDArray[np.float64], inside: Mask) -> NDArray[np.float64]:
     return np.asarray(np.einsum("kyxc,kyx->kc", block, ring) / np.maximum(ring.sum(axis=(1, 2)), 1)[:, None])
 
 
-def _significant(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
+def _significant(pattern: Doubles) -> Doubles:
     """Zero the part of patterns (K, 3, 3) that is noise of the surroundings."""
     return np.where(pattern > DIM * pattern.max(axis=(1, 2), keepdims=True), pattern, 0)
 

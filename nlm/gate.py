@@ -1,19 +1,13 @@
 """Weights of aligned frames by whether they show the same light and the same detail as the centre."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, Mask, run_bands
 from nlm.average import check_colors, check_exposure, check_window
-
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)

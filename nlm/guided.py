@@ -3,13 +3,9 @@
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Doubles, Floats, run_bands
 from nlm.average import replace_nonfinite
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 # Rows filtered with the same running sums.
 _STRIP = 64

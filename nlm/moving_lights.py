@@ -4,10 +4,8 @@ import itertools
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from loops.parallel import Floats, Mask, Places
 
 # A bright pixel exceeds the picture by half of the light, and by eight robust deviations of the excess.
 _ABOVE, _DEVIATIONS = 0.5, 8.0
@@ -141,7 +139,7 @@ def _confirmed(
     return found, left
 
 
-def _busiest(counts: NDArray[np.intp]) -> slice:
+def _busiest(counts: Places) -> slice:
     """Return the `_BLOCK` rows or columns with the most bright pixels."""
     length = min(_BLOCK, len(counts))
     sums = np.convolve(counts, np.ones(length), "valid")

@@ -4,12 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
-
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from loops.parallel import Floats, Mask, run_bands
 
 # The image is cut into tiles whose planes stay in the cache. Long rows, because every pass over a row
 # costs as much again before its first pixel (64 wide: 2.5 times slower than 512).

@@ -1,19 +1,14 @@
 """Layers that are parts of a picture: found by adding up noisy pixels, denoised so that their sum is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Doubles, Floats, run_bands
 from nlm.guided import guided_filter
 from nlm.variance import second_differences
-
-Floats = NDArray[np.float32]
 
 # Guided filter: 9×9 pixels hold the samples of a window 400 times, and shares of light change slowly.
 _RADIUS, _EPS = 4, 1e-2
@@ -151,9 +146,7 @@ def _search(values: Sequence[Floats], target: Floats, slack: Floats) -> list[tup
     return found
 
 
-def filter_layers(
-    layers: Sequence[Floats], guide: Floats, *, moments: NDArray[np.float64] | None = None
-) -> list[Floats]:
+def filter_layers(layers: Sequence[Floats], guide: Floats, *, moments: Doubles | None = None) -> list[Floats]:
     """Denoise layers, averaged over time, each within its range and with its mean, by `nlm.guided.guided_filter`."""
     if not layers:
         return []

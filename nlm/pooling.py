@@ -6,12 +6,9 @@ from typing import NamedTuple, Self
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 from nlm.average import check_exposure, check_strip, check_window
-
-Floats = NDArray[np.float32]
 
 # A residual counts up to so many times the pixel's light and the exposure. Noise of a few samples seldom exceeds this
 # limit; a firefly exceeds it hundreds of times, and no denoiser removes such a value: at 15 to 30 samples pictures

@@ -3,13 +3,10 @@
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 from nlm.average import check_exposure, check_window
 from nlm.variance import gaussian_mean, ratio
-
-Floats = NDArray[np.float32]
 
 _CELL, _SIGMA = 4, 1.5  # means over σ = 1.5 cells of 4×4 pixels; 4 to 10 pixels are alike to 0.03 dB
 

@@ -4,22 +4,17 @@ A denoiser errs by more than the noise where there is next to no noise, or where
 of a window show where, as samples of one frame are independent of those of another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, Mask, run_bands
 from nlm.average import channel_mean, check_colors, check_strip, check_window
 from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
 from nlm.variance import gaussian_mean, ratio, second_differences
-
-Floats = NDArray[np.float32]
 
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
 # costs up to 1.3 dB of a rendered shot at 8 samples.
@@ -279,7 +274,7 @@ def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floa
     return energy
 
 
-def beside_lamps(picture: Floats, exposure: float) -> NDArray[np.bool_]:
+def beside_lamps(picture: Floats, exposure: float) -> Mask:
     """Return the pixels (H, W) within two of a light that a picture shows beyond 64 exposures."""
     lamp = (channel_mean(picture) > _GLARE * exposure).astype(np.uint8)
     return np.asarray(cv2.dilate(lamp, np.ones((5, 5), np.uint8)) > 0)
@@ -305,7 +300,7 @@ def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> 
 
 @njit(cache=True, nogil=True)
 def _limit_lamps(
-    first: int, last: int, lamp: NDArray[np.bool_], samples: Floats, others: Floats, least: np.float32, held: Floats
+    first: int, last: int, lamp: Mask, samples: Floats, others: Floats, least: np.float32, held: Floats
 ) -> None:
     """Clamp a picture in place, where there are lamps, to the brightest of two samples within two pixels."""
     height, width, channels = held.shape

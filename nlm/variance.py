@@ -1,19 +1,14 @@
 """Variance of a pixel's value: from half buffers, from the aligned window, from the image alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, Mask, run_bands
 from nlm.average import check_window
 from nlm.nonlocal_means import BAND, joint_nlm
-
-Floats = NDArray[np.float32]
 
 # How far above its surroundings' median a pixel's variance may lie before it is cut. A variance from five
 # Gaussian samples stays below 4 times its mean in 997 of 1000 cases; Monte Carlo noise has longer tails.
@@ -136,7 +131,7 @@ def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confid
     return filtered
 
 
-def _around(rows: NDArray[np.bool_]) -> Iterator[slice]:
+def _around(rows: Mask) -> Iterator[slice]:
     """Yield runs of bands that hold one of these rows or columns, with a band on each side: more than filters reach."""
     bands = np.logical_or.reduceat(rows, np.arange(0, len(rows), BAND))
     wide = np.convolve(bands, np.ones(3), "same") > 0
@@ -179,7 +174,7 @@ def _centre_deviation(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lesser_variance(
-    first: int, last: int, temporal: Floats, spatial: Floats, trust: Floats, variance: Floats, noisy: NDArray[np.bool_]
+    first: int, last: int, temporal: Floats, spatial: Floats, trust: Floats, variance: Floats, noisy: Mask
 ) -> None:
     """Write the lesser of both variances, the temporal one as `_fade` has it, and where there is noise."""
     # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.

@@ -7,14 +7,13 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.measure import MOVED_NOISE, equal_noise, repeats, same_noise_at
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.runtime.timing import Timings
+from loops.parallel import Mask, Places
 from nlm.fireflies import (
     Highlights,
-    Places,
     Points,
     average_highlights,
     find_bright_samples,
@@ -27,8 +26,6 @@ from nlm.fireflies import (
     same_highlight,
     without_strangers,
 )
-
-Mask = NDArray[np.bool_]
 
 # A highlight of a pixel has to be in so many frames beside its own, at most so many frames away.
 WITNESSES, REACH = 2, 2
