@@ -13,8 +13,6 @@ and C CPU seconds has 2 W − C serial ones. It predicts C seconds on one core, 
 measured. Seconds on 16 and 64 cores are computed, not measured.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

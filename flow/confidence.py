@@ -1,7 +1,5 @@
 """Confidence of warped pixels, and the mix with the centre where confidence is low."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numba import njit

@@ -1,7 +1,5 @@
 """Detect the convention of motion vectors by testing candidate conventions on pairs of frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Guides for optical flow: planes comparable between frames, and little disturbed by noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

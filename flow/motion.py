@@ -1,7 +1,5 @@
 """Renderers' motion vectors: converted into one convention, composed, inverted, checked."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 

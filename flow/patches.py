@@ -1,7 +1,5 @@
 """Costs of motion vectors on patches of a pair of frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Choice, pixel by pixel, of the flow that explains the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """TV-L1 optical flow: refinement of a given flow, and a flow from the pictures alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

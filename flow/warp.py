@@ -1,7 +1,5 @@
 """Backward warp of images and whole AOV stacks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

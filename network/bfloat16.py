@@ -1,7 +1,5 @@
 """U-Nets with weights in bfloat16, for processors that compute in it (AVX-512 bf16, AMX)."""
 
-from __future__ import annotations
-
 import copy
 from typing import cast
 

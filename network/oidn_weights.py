@@ -3,8 +3,6 @@
 They are those of RenderKit/oidn-weights, Apache-2.0 (see NOTICE). None of them is part of this module.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import mmap

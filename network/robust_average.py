@@ -3,8 +3,6 @@
 Frames are stacked along the batch, ``(T·N, C, H, W)``, all samples of the first frame first: splitting them is a view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import log
 from typing import Any

@@ -4,8 +4,6 @@ Each frame of the window enters as a noisy image of the centre; Robust Average (
 convolution at full resolution, fuse the frames; one decoder makes the image of the centre.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

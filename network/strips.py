@@ -1,7 +1,5 @@
 """Run local operations on a few rows of a frame at a time: the features of a strip fit the caches of a processor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

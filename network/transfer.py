@@ -1,7 +1,5 @@
 """Transfer curves of Intel Open Image Denoise: perceptually uniform (PU) for radiance, sRGB for albedo."""
 
-from __future__ import annotations
-
 from math import log
 
 import torch

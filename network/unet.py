@@ -4,8 +4,6 @@
 of ``training/`` in RenderKit/oidn, Apache-2.0 (see NOTICE).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast

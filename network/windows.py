@@ -1,7 +1,5 @@
 """Windows as the final stage takes them: aligned frames, and the inputs of its convolutions."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor
