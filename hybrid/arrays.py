@@ -131,23 +131,18 @@ def denoise_arrays(
     wanted = shot.numbers if numbers is None else tuple(sorted(numbers))
     if missing := [number for number in wanted if not shot.has(number)]:
         raise ValueError(f"numbers: frame {missing[0]} is not there, expected some of {shot.numbers}")
-    return _denoise(shot, wanted, chosen, progress)
 
+    def results() -> Iterator[ArrayResult]:
+        prepare_process(chosen)
+        denoiser = open_denoiser(chosen)
+        source = choose_first_pass(cast("Shot", shot), chosen, denoiser)
+        stream = FrameStream(shot, chosen.rules, source.first_pass, radius=denoiser.radius)
+        denoise = FrameDenoiser(stream, denoiser)
+        for number in wanted:
+            made = denoise.make(number)
+            result = ArrayResult(number, {"color": made.denoised.color, **made.denoised.aovs}, made.plan)
+            yield result
+            if progress is not None and progress(result) is False:
+                return
 
-def _denoise(
-    shot: ArrayFrames,
-    numbers: Sequence[int],
-    options: DenoiseOptions,
-    progress: Callable[[ArrayResult], bool | None] | None,
-) -> Iterator[ArrayResult]:
-    prepare_process(options)
-    denoiser = open_denoiser(options)
-    source = choose_first_pass(cast("Shot", shot), options, denoiser)
-    stream = FrameStream(shot, options.rules, source.first_pass, radius=denoiser.radius)
-    denoise = FrameDenoiser(stream, denoiser)
-    for number in numbers:
-        made = denoise.make(number)
-        result = ArrayResult(number, {"color": made.denoised.color, **made.denoised.aovs}, made.plan)
-        yield result
-        if progress is not None and progress(result) is False:
-            return
+    return results()

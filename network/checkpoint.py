@@ -69,18 +69,12 @@ def _build_paper(description: Mapping[str, Any]) -> Model:
             raise ValueError("expected scales of a network that has one, got scales of scales")
         base: Any = _build_paper(description["base"])
         return paper.MultiScale(paper.MultiScaleConfig(base.config, description["scales"]))
-    kinds: dict[str, tuple[Any, Any]] = {
-        "RAUNet": (paper.RAUNet, paper.RAUNetConfig),
-        "RAResNet": (paper.RAResNet, paper.RAResNetConfig),
-        "TKPCN": (paper.TKPCN, paper.TKPCNConfig),
-    }
-    if name not in kinds:
-        raise ValueError(f"expected model RobustUNet, MultiScale, {', '.join(kinds)}, got {name!r}")
-    network, configuration = kinds[name]
+    if name not in ("RAUNet", "RAResNet", "TKPCN"):
+        raise ValueError(f"expected model RobustUNet, MultiScale, RAUNet, RAResNet or TKPCN, got {name!r}")
     values = dict(description["config"])
     if "kernel" in values:
         values["kernel"] = _configure(paper.KernelConfig, values["kernel"])
-    model: Model = network(_configure(configuration, values))
+    model: Model = getattr(paper, name)(_configure(getattr(paper, f"{name}Config"), values))
     return model
 
 

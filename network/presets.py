@@ -1,27 +1,14 @@
 """Networks by name, with initial weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 
-from network.paper.models import (
-    TKPCN,
-    KernelConfig,
-    KernelModel,
-    MultiScale,
-    MultiScaleConfig,
-    RAResNet,
-    RAResNetConfig,
-    RAUNet,
-    RAUNetConfig,
-    TKPCNConfig,
-)
+from network.paper import models as paper
 from network.robust_unet import RobustUNet, RobustUNetConfig
 
-Model = RobustUNet | KernelModel
+Model = RobustUNet | paper.KernelModel
 
 
 class Preset(NamedTuple):
@@ -31,9 +18,9 @@ class Preset(NamedTuple):
     frames: int = 5
 
 
-def _multiscale(frames: int) -> MultiScale:
-    base = RAUNetConfig(KernelConfig(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
-    return MultiScale(MultiScaleConfig(base))
+def _multiscale(frames: int) -> paper.MultiScale:
+    base = paper.RAUNetConfig(paper.KernelConfig(frames), widths=(32, 64, 96, 128), ra_scales=(0, 1, 2, 3))
+    return paper.MultiScale(paper.MultiScaleConfig(base))
 
 
 PRESETS: dict[str, Preset] = {
@@ -43,10 +30,10 @@ PRESETS: dict[str, Preset] = {
     "quality": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True)), frames=7),
     # From noisy frames alone: a small U-Net of 0.24 M parameters; a four-scale U-Net with RA blocks at every scale and
     # kernels at three resolutions; the paper's network of 24 blocks of width 80; the paper's baseline of that size.
-    "unet": Preset(lambda frames: RAUNet(RAUNetConfig(KernelConfig(frames)))),
+    "unet": Preset(lambda frames: paper.RAUNet(paper.RAUNetConfig(paper.KernelConfig(frames)))),
     "multiscale": Preset(_multiscale),
-    "paper": Preset(lambda frames: RAResNet(RAResNetConfig(KernelConfig(frames)))),
-    "tkpcn": Preset(lambda frames: TKPCN(TKPCNConfig(KernelConfig(frames)))),
+    "paper": Preset(lambda frames: paper.RAResNet(paper.RAResNetConfig(paper.KernelConfig(frames)))),
+    "tkpcn": Preset(lambda frames: paper.TKPCN(paper.TKPCNConfig(paper.KernelConfig(frames)))),
 }
 
 

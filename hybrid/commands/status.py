@@ -29,10 +29,7 @@ def status(output: str, frames: str | None = None, as_json: bool = False) -> Non
     left = found.asked - found.finished
     if as_json:
         document = {
-            "asked": sorted(found.asked),
-            "finished": sorted(found.finished),
-            "running": sorted(found.running),
-            "missing": sorted(found.missing),
+            **{name: sorted(getattr(found, name)) for name in ("asked", "finished", "running", "missing")},
             "failed": {str(number): found.failed[number] for number in sorted(found.failed)},
             "workers": found.workers,
             "seconds_per_frame": found.seconds_per_frame,

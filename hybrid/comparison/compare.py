@@ -88,7 +88,7 @@ def compare_shot(
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
         mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
-        map_facts = _store_all_maps(store, shot, mapped, evaluator, on_step)
+        map_facts = _store_all_maps(shot, mapped, evaluator, on_step)
     height, width = static.shape
     facts = {
         "Frames": f"{_span(numbers)}, {width} × {height} pixels",
@@ -254,7 +254,7 @@ def _measured(
 
 
 def _store_all_maps(
-    store: FrameStore, shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep
+    shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep
 ) -> dict[str, str]:
     """Store the maps of methods, of `LARGE` frames those of the middle one; return a fact if some are left out."""
     numbers = evaluator.numbers
@@ -262,7 +262,7 @@ def _store_all_maps(
         numbers = [numbers[len(numbers) // 2]]
     for name, method in methods.items():
         on_step(f"maps of {name}")
-        run_in_process(_store_maps, method, shot, numbers, name, store)
+        run_in_process(_store_maps, method, shot, numbers, name, evaluator.store)
     if methods and len(numbers) < len(evaluator.numbers):
         return {"Maps": f"confidence and contribution of frame {numbers[0]} only, because the frames are large"}
     return {}

@@ -24,11 +24,11 @@ from hybrid.comparison.results import (
     MethodResult,
     Metric,
     best_and_ties,
-    is_comparison,
     join,
     leading_pair,
     pareto_front,
     present_metrics,
+    read_comparison,
     stage_values,
     to_document,
     to_json,
@@ -74,9 +74,12 @@ def write_report(folder: Path | str, report: Report) -> Path:
 def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
     """Raise ValueError or OSError if a report would overwrite an input, or files of another origin."""
     check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
-    there = [folder / name for name in (*FILES, MOVIES) if (folder / name).exists()]
-    if there and not is_comparison(folder / "results.json"):
-        raise ValueError(f"{there[0]} exists and was not written by ravg compare: expected another folder")
+    if there := [folder / name for name in (*FILES, MOVIES) if (folder / name).exists()]:
+        try:
+            read_comparison(folder / "results.json")
+        except (OSError, ValueError):
+            words = f"{there[0]} exists and was not written by ravg compare: expected another folder"
+            raise ValueError(words) from None
 
 
 def report_images(

@@ -287,14 +287,6 @@ def to_json(document: object, indent: int | None = None) -> str:
     return json.dumps(to_plain_numbers(document), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def is_comparison(path: Path) -> bool:
-    try:
-        read_comparison(path)
-    except (OSError, ValueError):
-        return False
-    return True
-
-
 def read_comparison(path: Path) -> Comparison:
     """Read a ``results.json``, settings as text; ValueError if the file holds anything else."""
     text = path.read_text(encoding="utf-8")

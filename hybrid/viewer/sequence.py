@@ -5,6 +5,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,8 @@ class Sequence:
         """Return a version of each file, by frame number, that changes when the file is replaced."""
         found = {}
         for number, path in self.files().items():
-            try:
-                status = path.stat()
-            except OSError:  # deleted since the folder was listed
-                continue
-            found[number] = _version(status)
+            with suppress(OSError):  # deleted since the folder was listed
+                found[number] = _version(path.stat())
         return found
 
     def layers(self, number: int) -> tuple[list[str], str]:

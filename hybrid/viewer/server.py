@@ -9,6 +9,7 @@ import json
 import secrets
 import socket
 import sys
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
@@ -73,14 +74,10 @@ class ViewServer(ThreadingHTTPServer):
     @property
     def exposure(self) -> float:
         """Divisor of radiance at 0 EV for all sequences, from the middle frame of the last sequence that has frames."""
-        if self._exposure is None:
-            for sequence in reversed(self.sequences):
-                numbers = sorted(sequence.files())
-                if numbers:
-                    try:
-                        self._exposure = sequence.exposure(numbers[len(numbers) // 2])
-                    except (OSError, ExrError):  # incomplete so far
-                        continue
+        for sequence in reversed(self.sequences) if self._exposure is None else ():
+            if numbers := sorted(sequence.files()):
+                with suppress(OSError, ExrError):  # incomplete so far
+                    self._exposure = sequence.exposure(numbers[len(numbers) // 2])
                     break
         return self._exposure or 1.0
 
@@ -97,11 +94,9 @@ class ViewServer(ThreadingHTTPServer):
         layers: list[str] = []
         first = ""
         for number in versions:
-            try:
+            with suppress(OSError, ExrError):
                 layers, first = sequence.layers(number)
-            except (OSError, ExrError):
-                continue
-            break
+                break
         record = sequence.record() if sequence.finished else {}
         return {"frames": versions, "layers": layers, "layer": first, "record": record}
 

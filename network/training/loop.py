@@ -175,7 +175,9 @@ def train(
     average = copy.deepcopy(model).requires_grad_(False)
     groups = _groups(model, config.backbone_rate)
     optimizer = torch.optim.AdamW(groups, lr=config.rate, weight_decay=config.weight_decay)
-    identity = json.dumps({"model": describe(model), "training": _identity(config)}, sort_keys=True)
+    # These settings may change between an interruption and its resumption.
+    fixed = {name: value for name, value in asdict(config).items() if name not in ("validate_minutes", "workers")}
+    identity = json.dumps({"model": describe(model), "training": fixed}, sort_keys=True)
     # Where a processor has no bfloat16, torch computes it in loops that take ten times as long as float32.
     config = replace(config, float32=config.float32 or not has_bfloat16(device))
     step, before = 0, 0.0
@@ -297,14 +299,6 @@ def _rate(config: TrainConfig, step: int, done: float) -> float:
 @torch.no_grad()
 def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
     torch._foreach_lerp_(list(average.parameters()), list(model.parameters()), 1 - decay)
-
-
-def _identity(config: TrainConfig) -> dict[str, Any]:
-    """The configuration without settings that may change between an interruption and its resumption."""
-    values = asdict(config)
-    for name in ("validate_minutes", "workers"):
-        del values[name]
-    return values
 
 
 def _write_state(
