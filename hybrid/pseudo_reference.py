@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybrid.alignment.transfer import compress, measure_gain
-from hybrid.alignment.window import AlignedWindow, Array
+from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.oidn import denoise_oidn
 from hybrid.runtime.timing import Timings
 from nlm.average import average, robust_average

@@ -4,11 +4,9 @@ The errors of denoisers change from frame to frame more than the frames do, so r
 The samples restore light that few samples carry and detail that looks like noise, as far as they are certain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +85,7 @@ class WindowResult:
     fireflies: int
     outliers: int
 
-    def as_neighbour(self) -> WindowResult:
+    def as_neighbour(self) -> Self:
         """The result without what only the average of its own frame reads."""
         alone = Denoised(self.denoised.color)
         return replace(self, denoised=alone, neighbour_samples=None, trust=(), drift_weight=None)

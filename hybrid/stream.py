@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import ClassVar, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.tvl1 import refine_flow
 from hybrid.alignment.align import align, expect_equal_layers
@@ -23,14 +22,13 @@ from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
 from hybrid.alignment.residual import Limited, measure_limited
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
-from hybrid.files.frame import Frame, Frames
+from hybrid.files.frame import Array, Frame, Frames
 from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
 from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 
-Array = NDArray[np.float32]
 Value = TypeVar("Value")
 Shown = TypeVar("Shown", PreparedFrame, PreparedFrame | None, Array | None)
 

@@ -1,12 +1,9 @@
 """Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.confidence import fill_uncovered
 from flow.warp import warp
@@ -14,6 +11,7 @@ from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, tr
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import demodulate, remodulate
 from hybrid.alignment.window import AlignedWindow, Trust, WarpSources, Window, clean_guide
+from hybrid.files.frame import Array
 from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
@@ -22,8 +20,6 @@ from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import average_neighbours
-
-Array = NDArray[np.float32]
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
 # their mean difference (`nlm.relight`), where the light stands still as far as samples tell (`nlm.drift`). The second

@@ -1,7 +1,5 @@
 """Remove single bright samples from a frame; those that neighbouring frames show as well are highlights, and stay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product

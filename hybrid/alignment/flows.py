@@ -1,12 +1,9 @@
 """Flows between neighbouring frames: the renderer's, corrected or estimated by TV-L1, and their composition."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.guide import GuidePair, make_guide, pair_guides
 from flow.motion import compose_flow, forward_backward_error
@@ -14,9 +11,8 @@ from flow.selection import select_flow
 from flow.tvl1 import dense_flow
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.alignment.transfer import measure_exposure
-
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from hybrid.files.frame import Array
+from loops.parallel import Mask
 
 # A pixel that is visible in both frames misses its start by less than this after its flow there and back, pixels.
 HIDDEN = 3.0

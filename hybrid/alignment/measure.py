@@ -1,23 +1,20 @@
 """Measurements of frames and pairs, from which stages are chosen alike in every part of a shot (`hybrid.plan`)."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.guide import tone_map
 from flow.tvl1 import rough_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import NO_LIGHT, compress, measure_exposure, remodulate
+from hybrid.files.frame import Array
+from loops.parallel import Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
-
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
 # cost. Frames below twice this are not reduced.
@@ -100,12 +97,12 @@ class SmallFrame:
     albedo: Array | None  # (h, w, 3): divisor of the irradiance
     valid: Mask  # (h, w): where the frame has been rendered
 
-    def textured(self) -> SmallFrame:
+    def textured(self) -> Self:
         """Return the frame times its albedo: motion shows in texture first."""
         if self.albedo is None:
             return self
         irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
-        return SmallFrame(self.factor, irradiance, light, None, self.valid)
+        return replace(self, irradiance=irradiance, light=light, albedo=None)
 
 
 # `cv2.remap`, faster than `flow.warp`, refuses images of more pixels on a side.
@@ -270,7 +267,7 @@ def repeats(here: Array, there: Array) -> bool:
     return bool(grainy >= FEW and equal >= REPEATED * grainy)
 
 
-def same_noise_at(grainy: Array, equal: Array, pixels: NDArray[np.intp]) -> Mask:
+def same_noise_at(grainy: Array, equal: Array, pixels: Places) -> Mask:
     """Return whether two frames, by `equal_noise`, have the same noise around each of some pixels, (K,) bool."""
     share = float(equal.sum() / max(grainy.sum(), 1))
     rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))

@@ -1,21 +1,17 @@
 """Warp the layers of a neighbour to the centre of a window, and measure how far they can be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from flow.confidence import estimate_confidence, find_coverage
 from flow.warp import warp
 from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.window import Trust
+from hybrid.files.frame import Array
 from loops.parallel import run_bands
-
-Array = NDArray[np.float32]
 
 # The confidence that geometry leaves at least to denoised frames of one color: outlines, whose albedo and normals
 # are mixed anew in each frame, flicker most. Worth 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB

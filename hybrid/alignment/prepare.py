@@ -1,26 +1,21 @@
 """Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import ALBEDO_FLOOR, compress, demodulate, measure_exposure, remodulate
 from hybrid.alignment.unfiltered import Unfiltered, split_unfiltered
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
+from loops.parallel import Doubles, Mask, Places
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
-
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # Name of the alpha channel among the AOVs; unlike the others it is no light, and is not demodulated.
 ALPHA = "alpha"
@@ -30,7 +25,7 @@ class Brightness(NamedTuple):
     """Exposure of a frame's irradiance; mean and deviation (2, G + 1) of `PreparedFrame.guide` and irradiance."""
 
     exposure: float
-    moments: NDArray[np.float64]
+    moments: Doubles
 
 
 @dataclass(frozen=True)
@@ -58,12 +53,12 @@ class PreparedFrame:
     fireflies: int = 0  # number of fireflies that were removed
     removed_radiance: float = 0.0  # their mean radiance, which belongs to the picture in expectation
     # indices where fireflies were removed from `irradiance`, and its values there, (K, 3), as rendered
-    removed_samples: tuple[tuple[NDArray[np.intp], ...], Array] | None = None
+    removed_samples: tuple[tuple[Places, ...], Array] | None = None
     # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
 
-    def relit(self, fade: float) -> PreparedFrame:
+    def relit(self, fade: float) -> Self:
         """Return the frame with `fade` times its light, as a neighbour of a frame with that much more light."""
         parts = {name for found in self.passes.sums for name in (*found.parts, found.whole)}
         lights, factor = parts | {*self.passes.textured, *self.pass_colors}, np.float32(fade)
@@ -98,7 +93,7 @@ class PreparedFrame:
         guides = [layer for layer in (self.albedo, self.normal) if layer is not None]
         return np.concatenate(guides, axis=-1) if guides else None
 
-    def divisor_at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array | None:
+    def divisor_at(self, rows: Places, columns: Places) -> Array | None:
         """Radiance per irradiance (..., 3) at some pixels (...); None if both are the same."""
         if self.albedo is None or not self.demodulated:
             return None

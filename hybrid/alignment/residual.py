@@ -1,21 +1,17 @@
 """Noise of a neighbour at the pixels of the centre: its samples minus its first pass."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from flow.warp import locate
 from hybrid.alignment.transfer import ALBEDO_FLOOR
+from hybrid.files.frame import Array
 from loops.parallel import run_bands
 from nlm.cells import Axis, cell_axis
 from nlm.pooling import RESIDUAL_LIMIT
 from nlm.variance import gaussian_mean
-
-Array = NDArray[np.float32]
 
 _FLOOR = np.float32(ALBEDO_FLOOR)
 # Light that the limit of residuals takes is spread over a Gaussian of this deviation, pixels, in cells of so many: the

@@ -1,18 +1,13 @@
 """Transfer curves, each a forward and an inverse function."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from loops.parallel import run_bands
-
-Array = NDArray[np.float32]
-Edges = NDArray[np.intp]
-Sums = NDArray[np.float64]
+from hybrid.files.frame import Array
+from loops.parallel import Doubles, Mask, Places, run_bands
 
 # Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely specular
 # surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a neighbour's light
@@ -141,7 +136,7 @@ def autoexposure(radiance: Array, *, dark: float = 1e-8, exposure: float = 1.0) 
     return float(0.18 / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
 
 
-def _edges(length: int) -> Edges:
+def _edges(length: int) -> Places:
     """Limits of bins of at most 16 pixels."""
     bins = max(-(-length // 16), 1)
     return np.asarray(np.arange(bins + 1) * length // bins, np.intp)
@@ -149,7 +144,7 @@ def _edges(length: int) -> Edges:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _bin_levels(
-    first: int, last: int, image: Array, rows: Edges, columns: Edges, level: Array, sums: Sums, counts: Sums
+    first: int, last: int, image: Array, rows: Places, columns: Places, level: Array, sums: Doubles, counts: Doubles
 ) -> None:
     """Write the mean over channels, NaN where it is not finite; in each bin the sum and number of finite means."""
     for row in range(first, last):
@@ -170,7 +165,7 @@ def _bin_levels(
 
 
 @njit(nogil=True, cache=True)
-def _find_greatest(bits: NDArray[np.uint32], rows: Edges, columns: Edges, lit: NDArray[np.bool_], rank: int) -> int:
+def _find_greatest(bits: NDArray[np.uint32], rows: Places, columns: Places, lit: Mask, rank: int) -> int:
     """Bits of the level of this rank, the greatest first, in the lit bins; NaN is left out."""
     # Two digits of 16 bits each, in an order of integers that is that of floats.
     prefix, left = np.uint32(0), rank
@@ -201,8 +196,8 @@ def _find_greatest(bits: NDArray[np.uint32], rows: Edges, columns: Edges, lit: N
 
 @njit(nogil=True, cache=True)
 def _bin_limited(
-    first: int, last: int, level: Array, rows: Edges, columns: Edges, lit: NDArray[np.bool_], limit: np.float32,
-    sums: Sums,
+    first: int, last: int, level: Array, rows: Places, columns: Places, lit: Mask, limit: np.float32,
+    sums: Doubles,
 ) -> None:  # fmt: skip
     """Sum in each lit bin the levels, each up to the limit."""
     for row in range(first, last):
@@ -218,7 +213,7 @@ def _bin_limited(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _bin_luminances(
-    first: int, last: int, image: Array, exposure: np.float32, rows: Edges, columns: Edges, means: Sums
+    first: int, last: int, image: Array, exposure: np.float32, rows: Places, columns: Places, means: Doubles
 ) -> None:
     """Mean luminance of each bin, without values that are not finite; NaN for a bin without others."""
     zero = np.float32(0)

@@ -5,22 +5,18 @@ a sun beyond the range of half; every denoiser would clip the negative light of 
 gray picture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid.alignment.transfer import compress, measure_exposure
 from hybrid.files.exr import HALF_MAX
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
+from loops.parallel import Mask
 from nlm.guided import guided_filter
 
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Region = tuple[slice, slice]
 
 # Pixels by which a frame is mirrored beyond the edges of a render region: the support of most weights of a filter.

@@ -1,27 +1,23 @@
 """A window of frames: the frames with the flows between them, and the same aligned to the centre."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.residual import Limited, warp_residual
+from hybrid.files.frame import Array
 from hybrid.files.passes import NO_PASSES, Passes
+from loops.parallel import Doubles, Mask
 from nlm.pooling import SampleRange, find_range
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
-
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # Rows of a strip of residuals: those of five frames fit the caches of a processor.
 STRIP = 64
@@ -144,7 +140,7 @@ class AlignedWindow:
     outliers: int  # samples of the window, within `inner`, rejected as fireflies
     exposure: float  # brightness of the centre's irradiance
     # (2, G + 1): mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light
-    moments: NDArray[np.float64]
+    moments: Doubles
     inner: slice  # the requested rows; those around them are there because the result depends on them
     stages: frozenset[str]  # the stages that run
     # the share of the picture, in [0, 1], on which a stage ran that runs only in places

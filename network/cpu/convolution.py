@@ -4,8 +4,6 @@ torch's compiler fuses the three on CPUs. Called without it, the fused operation
 the time, in bfloat16 to the bit in two thirds: the ReLU alone reads and writes all features once more.
 """
 
-from __future__ import annotations
-
 from typing import cast
 
 import torch

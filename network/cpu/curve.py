@@ -4,8 +4,6 @@ A power or a logarithm takes 14 ns, and torch computes both for each value; a ta
 float32 are the index of its entry.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -16,10 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 from network.transfer import PU_LINE, PU_LOG, PU_WHITE, pu_forward, pu_inverse
-
-Floats = NDArray[np.float32]
 
 _A, _WHITE = np.float32(PU_LINE), np.float32(PU_WHITE)
 _E, _F, _G = map(np.float32, PU_LOG)

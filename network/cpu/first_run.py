@@ -1,7 +1,5 @@
 """Compile the loops of this package: a program that the first run of a user starts beside itself."""
 
-from __future__ import annotations
-
 import gc
 
 import torch

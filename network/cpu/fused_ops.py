@@ -9,8 +9,6 @@
 Each pixel is read once and written once; bfloat16 is widened to float32 in between.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 
 _VALUES = 512  # processed together, about: the values of all frames fit the fastest cache
 _UNROLLED = (3, 5, 7)  # lengths of windows that `_blend` is written for
@@ -120,9 +118,7 @@ def _round(bits: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _split(
-    first: int, stop: int, source: NDArray[np.float32], bits: NDArray[np.uint32], result: NDArray[np.uint16]
-) -> None:
+def _split(first: int, stop: int, source: Floats, bits: NDArray[np.uint32], result: NDArray[np.uint16]) -> None:
     _, width, channels = source.shape
     pair = np.empty(2, np.float32)
     pair_bits = pair.view(np.uint32)
@@ -188,7 +184,7 @@ def _add(x: Any, y: Any) -> None:
 @njit(cache=True, nogil=True)
 def _blend(
     first: int, stop: int, source: NDArray[Any], result: NDArray[Any], added: NDArray[Any], order: NDArray[Any],
-    returned: NDArray[Any], share: NDArray[np.float32],
+    returned: NDArray[Any], share: Floats,
 ) -> None:  # fmt: skip
     # Input and result are bits of float32, or of bfloat16, which is the upper half of a float32.
     T, _, row = source.shape
@@ -255,8 +251,8 @@ def _add_taps(red: Any, green: Any, blue: Any, above: Any, centre: Any, below: A
 
 @njit(cache=True, nogil=True)
 def _convolve_to_rgb(
-    first: int, stop: int, source: NDArray[Any], taps: NDArray[np.float32], bias: NDArray[np.float32],
-    image: NDArray[np.float32],
+    first: int, stop: int, source: NDArray[Any], taps: Floats, bias: Floats,
+    image: Floats,
 ) -> None:  # fmt: skip
     height, row = source.shape
     width = image.shape[1]

@@ -5,8 +5,6 @@ passes over the frames for it, and copies of them that are mirrored beyond their
 where it lies, and each input of a convolution is written once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,12 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from loops.parallel import run_bands
+from loops.parallel import Floats, run_bands
 from network.cpu.curve import encoding_table, on_curve
 from network.windows import FRAME_CHANNELS, SHARED_CHANNELS, STATIC_CHANNELS, PackedInputs, UNetWindow
 from nlm.pooling import RESIDUAL_LIMIT
 
-Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 

@@ -4,8 +4,6 @@ Of features enlarged by repetition, the nine taps of a pixel read only four diff
 value are added beforehand. That leaves four ninths of the work, and nothing is enlarged or concatenated.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch
