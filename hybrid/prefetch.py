@@ -14,7 +14,8 @@ class Prefetcher:
     def __init__(self, shot: Frames, thread: Executor, timings: Timings) -> None:
         self.numbers, self.step = shot.numbers, shot.step
         self.has = shot.has
-        self._shot, self._thread, self._timings = shot, thread, timings
+        self._shot, self._thread = shot, thread
+        self._read = timings.background("read")(shot.read)
         self._expected: list[int] = []
         self._last = -math.inf
         self._begun: dict[int, Future[Frame]] = {}  # one at most
@@ -41,7 +42,3 @@ class Prefetcher:
         following = next((n for n in self._expected if n > self._last), None)
         if following is not None and not self._begun:
             self._begun[following] = self._thread.submit(self._read, following)
-
-    def _read(self, number: int) -> Frame:
-        with self._timings.background("read"):
-            return self._shot.read(number)

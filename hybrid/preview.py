@@ -1,6 +1,7 @@
 """Previews of noisy and denoised frames side by side: one frame, a movie, a contact sheet."""
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -103,13 +104,7 @@ def _wipe(pairs: _Pairs, rate: float) -> Iterator[Image8]:
     rounds = max(1, SHORTEST // len(numbers))
     total = rounds * len(numbers)
     sweeps = max(1, round(total / rate / SWEEP))
-    cache: dict[int, tuple[Image8, Image8]] = {}
+    read = cache(pairs.read) if rounds > 1 else pairs.read
     for index in range(total):
-        number = numbers[index % len(numbers)]
-        if number in cache:
-            noisy, denoised = cache[number]
-        else:
-            noisy, denoised = pairs.read(number)
-            if rounds > 1:
-                cache[number] = noisy, denoised
+        noisy, denoised = read(numbers[index % len(numbers)])
         yield divide(noisy, denoised, 0.5 + 0.5 * float(np.sin(2 * np.pi * sweeps * index / total)))

@@ -169,9 +169,7 @@ def is_running(document: Mapping[str, Any]) -> bool:
     """Return whether a run that has not recorded its end is alive; a run on another machine counts as alive."""
     if document["state"] != "running":
         return False
-    if document["host"] != platform.node():
-        return True
-    return process_lives(document["process"])
+    return document["host"] != platform.node() or process_lives(document["process"])
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybrid.comparison.methods import Method
 from hybrid.comparison.store import FrameStore
-from hybrid.files.frame import Frame, Frames, cut_middle
+from hybrid.files.frame import Frames, cut_middle
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import start_context
 from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
@@ -54,11 +54,7 @@ class _TimedFrames:
 
     def __init__(self, shot: Frames, timings: Timings) -> None:
         self.numbers, self.step, self.shape, self.has = shot.numbers, shot.step, shot.shape, shot.has
-        self._shot, self._timings = shot, timings
-
-    def read(self, number: int) -> Frame:
-        with self._timings.stage("read"):
-            return self._shot.read(number)
+        self.read = timings.stage("read")(shot.read)
 
 
 def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore | None = None) -> RunCost:

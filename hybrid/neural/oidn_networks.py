@@ -107,9 +107,7 @@ def _bundled(preset: str) -> OidnUNet:
 
 def _for_inference(unet: OidnUNet) -> OidnUNet:
     """In bfloat16 where the processor computes in it; elsewhere oneDNN may refuse it."""
-    if has_bfloat16(torch.device("cpu")):
-        return round_unet(unet)
-    return unet.eval().requires_grad_(False)
+    return round_unet(unet) if has_bfloat16(torch.device("cpu")) else unet.eval().requires_grad_(False)
 
 
 def _exposure(color: Array) -> float:
