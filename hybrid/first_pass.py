@@ -27,6 +27,9 @@ from nlm.average import replace_nonfinite
 from nlm.fireflies import Highlights, clamp_halos
 
 GUIDE_RADIUS = 1  # frames on each side that tell whether a frame's guides hold noise
+# Each frame is denoised in one of eight orientations, by its number: the errors of a network in an image and in the
+# image turned differ, and average out over a window.
+ORIENTATIONS = 8
 
 # Quality of each mode of OIDN, and of the filters that its guides go through first.
 OIDN_MODES: dict[str, dict[str, Any]] = {
@@ -175,7 +178,7 @@ def named_first_pass(
     if spec == "bundled" or (spec == "auto" and backends.bundled is not None):
         if backends.bundled is None:
             raise ImportError("first pass bundled: torch is needed, which this command does without; expected another")
-        run = partial(denoise_frame_oidn, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
+        run = partial(_denoise_turned, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
         reason = "asked for" if spec == "bundled" else f"{why_no_oidn()}; a network comes with ravg"
         return FirstPassSource("bundled", PerFrame(run), reason)
     reason = "asked for" if spec == "nlm" else f"no denoised picture in the file, and {why_no_oidn()}"
@@ -236,7 +239,14 @@ class _KeptPictures:
         # Neighbours of the requested frames are kept too.
         self.places = {number: output_path(path, shot, number, include_context=True) for number in shot.files}
         self._shot = shot
-        self._facts = {"estimate": mode, "quicker": in_torch, "device": device, "forced": forced, **versions("pyoidn")}
+        self._facts = {
+            "estimate": mode,
+            "orientations": ORIENTATIONS,
+            "quicker": in_torch,
+            "device": device,
+            "forced": forced,
+            **versions("pyoidn"),
+        }
         # Frames on each side by which fireflies are found, and those that show whether guides hold noise.
         self._support = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
 
@@ -265,7 +275,20 @@ def _folder_name(picture: str) -> str:
 def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array]) -> Array:
     """Run a mode of OIDN; guides without noise are declared clean as they are."""
     settings = OIDN_MODES[mode] if noisy_guides else {**OIDN_MODES[mode], "prefilter": None, "clean": True}
-    return denoise_frame_oidn(frame, denoise, **settings)
+    return _denoise_turned(frame, denoise, **settings)
+
+
+def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) -> Array:
+    """Run OIDN on a frame in the orientation of its number."""
+    mirrored, turns = divmod(frame.number % ORIENTATIONS, 4)
+
+    def turn(image: Array) -> Array:
+        return np.ascontiguousarray(np.rot90(image[:, ::-1] if mirrored else image, turns))
+
+    albedo, normal = (None if layer is None else turn(layer) for layer in (frame.albedo, frame.normal))
+    turned = Frame(frame.number, turn(frame.color), albedo=albedo, normal=normal)
+    image = np.rot90(denoise_frame_oidn(turned, denoise, **mode), -turns)
+    return np.ascontiguousarray(image[:, ::-1] if mirrored else image)
 
 
 def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:

@@ -15,7 +15,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.files import sources
 from hybrid.files.reader import ShotReader
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import Classical, GuideAware, PerFrame, find_first_pass
+from hybrid.first_pass import Backends, Classical, GuideAware, PerFrame, find_first_pass
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
 from hybrid.records import read_records
 from hybrid.stream import FrameStream, plan_shot
@@ -443,3 +443,24 @@ def test_pictures_that_are_alike_are_taken(tmp_path, by, step):
         "1002-1007",
     ]
     assert main([*words, "--first-pass", str(tmp_path / "done")]) == 0
+
+
+def test_eight_frames_are_denoised_in_eight_orientations(tmp_path):
+    """The errors of a network in an image and in the image turned differ, and average out."""
+    seen = []
+
+    def denoise(color, albedo, normal, **_):
+        seen.append(color)
+        np.testing.assert_array_equal(normal, albedo[..., ::-1])  # guides are turned with the color
+        return color
+
+    rng = np.random.default_rng(2)
+    color, albedo = rng.random((2, 12, 17, 3), np.float32)
+    layers = {"color": color, "albedo": albedo, "normal": albedo[..., ::-1]}
+    for number in range(-3, 5):
+        write_layers(tmp_path / f"a.{number:05d}.exr", layers, half=False)
+    shot = open_shot(tmp_path)
+    source = find_first_pass("bundled", shot, backends=Backends(bundled=denoise))
+    made = [source.first_pass.function(shot.read(number)) for number in shot.numbers]
+    np.testing.assert_array_equal(made, [color] * 8)
+    assert len({image.tobytes() for image in seen}) == 8
