@@ -3,8 +3,6 @@
 `FrameStream` alone owns it: each value is made when first read, and dropped with one of the frames it belongs to.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +47,7 @@ class FirstPass:
         """Count the frames on each side of the centre that are read for a window of this radius."""
         return radius
 
-    def make(self, stream: FrameStream, number: int) -> Array | None:
+    def make(self, stream: "FrameStream", number: int) -> Array | None:
         """Denoise frame `number` of the stream: radiance (H, W, 3), finite; None where there is nothing to read."""
         raise NotImplementedError
 
